@@ -19,7 +19,7 @@ from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.monitor.causes import conjuncts_of, find_causes
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_unfinished
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.stream import NEVER, SeriesBlock, join_blocks
@@ -32,7 +32,6 @@ from spatial_replay.monitor.witness.path import (
     deciding_path,
     missed_response,
 )
-from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
@@ -43,7 +42,6 @@ from spatial_replay.spec.formula import (
     SignedDistance,
     Term,
     TrackedName,
-    iter_nodes,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import (
@@ -51,6 +49,8 @@ from spatial_replay.spec.walks import (
     iter_expressions,
     leaf_key,
     looks_back,
+    nodes_of,
+    nodes_with_operands,
     operand_signs,
     substitute,
 )
@@ -105,18 +105,14 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
         leaves: the program's leaves, of which equal ones are one.
     """
     numbers = {leaf_key(leaf): index for index, leaf in enumerate(leaves)}
-    nodes = list(iter_nodes(formula))
+    nodes = nodes_with_operands(formula)
     found: list[dict[tuple[int, int], None]] = [{} for _ in nodes]
-    operands: list[list[int]] = [[] for _ in nodes]
-    for identifier, parent, _ in nodes:
-        if parent is not None:
-            operands[parent].append(identifier)
-    for identifier, _, node in reversed(nodes):
+    for own_leaves, (node, operands) in zip(found[::-1], nodes[::-1], strict=True):
         if isinstance(node, Atom | Quantified):
-            found[identifier] = {(numbers[leaf_key(node)], 1): None}
-        for place, operand in enumerate(operands[identifier]):
+            own_leaves[numbers[leaf_key(node)], 1] = None
+        for place, operand in enumerate(operands):
             for sign in operand_signs(node, place):
-                found[identifier].update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
+                own_leaves.update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
     return [_columns(list(each)) for each in found]
 
 
@@ -254,7 +250,7 @@ class LeafHistory:
         self._bindings = bindings or {}
         self._formula = formula
         self._order = order
-        self._nodes = [node for _, _, node in iter_nodes(formula)]
+        self._nodes = nodes_of(formula)
         numbers = {leaf_key(leaf): index for index, leaf in enumerate(order)}
         self._leaf_of = [
             numbers[leaf_key(node)] if isinstance(node, Atom | Quantified) else None for node in self._nodes
@@ -290,11 +286,10 @@ class LeafHistory:
         if samples is None:
             return None
         if verdict is Verdict.VIOLATED:
-            conjuncts = (node + each.node for each in conjuncts_of(self._nodes[node], ""))
-            node = next(each for each in conjuncts if series[each, 3] < 0.0)
+            conjuncts = conjuncts_of(self._nodes[node], "", node)
+            node = next(each.node for each in conjuncts if series[each.node, 3] < 0.0)
         done = evaluate_unfinished(self._formula, self._order, samples.leaves, samples.times_ns)
-        path = deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict], goes_on=True)
-        return self._leaf(path, samples, done, verdict, goes_on=True)
+        return self._leaf(deciding_path(done, node, _END_OF[verdict]), samples, done, verdict)
 
     def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return what decides a node that was pending up to the end of the log; None beyond the bound.
@@ -310,13 +305,10 @@ class LeafHistory:
         if samples is None or verdict not in _END_OF:
             return None
         if verdict is Verdict.VIOLATED:
-            pending = np.full((len(final) - node, 2), NEVER, np.int64)
-            conjuncts = conjuncts_of(self._nodes[node], "")
-            first, *_ = find_causes(conjuncts, values[node:], final[node:], pending)
-            node += first.node
+            pending, conjuncts = np.full(final.shape, NEVER), conjuncts_of(self._nodes[node], "", node)
+            node = find_causes(conjuncts, values, final, pending)[0].node
         done = evaluate_offline(self._formula, self._order, samples.leaves, samples.times_ns)
-        path = deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict])
-        return self._leaf(path, samples, done, verdict)
+        return self._leaf(deciding_path(done, node, _END_OF[verdict]), samples, done, verdict)
 
     def _until(self, time_ns: int | None) -> SeriesBlock | None:
         """Return the samples up to a time, or all."""
@@ -326,27 +318,14 @@ class LeafHistory:
         return self._blocks[0] if time_ns is None else self._blocks[0].between(0, time_ns + 1)
 
     def _leaf(
-        self,
-        path: DecidingPath,
-        samples: SeriesBlock,
-        done: OfflineNodes | UnfinishedNodes,
-        verdict: Verdict,
-        *,
-        goes_on: bool = False,
+        self, path: DecidingPath, samples: SeriesBlock, done: OfflineNodes, verdict: Verdict
     ) -> DecidingLeaf | None:
         """Return the leaf at the end of a path, with what was missed; None if it has no finite number."""
         found = self._end_of(path, samples)
         if found is None or verdict is not Verdict.VIOLATED:
             return found
-        nodes = [substitute(each, self._bindings) for each in self._nodes]
-        missed = missed_response(path, nodes, done, samples.times_ns)
-        response = None
-        if missed is not None and missed.is_condition:
-            at = missed.node, End.HIGH
-            best = deciding_path(
-                self._formula, done, samples.times_ns, *at, goes_on=goes_on, sample=missed.sample
-            )
-            response = self._end_of(best, samples)
+        missed, closest = missed_response(path, done, self._bindings)
+        response = None if closest is None else self._end_of(closest, samples)
         return found._replace(missed=missed, response=response)
 
     def _end_of(self, path: DecidingPath, samples: SeriesBlock) -> DecidingLeaf | None:

@@ -163,11 +163,11 @@ class AnnotatedEvaluation:
         """
         from spatial_replay.annotate.foxglove_layout import layout_attachment
 
-        extent, outcomes = self.annotator.extent, self.annotator.standing.outcomes
+        extent, standing = self.annotator.extent, self.annotator.standing
         contents = self.contents(extent, topics, axes, images)._replace(planned_for=planned_for)
         if not self.annotator.has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
-        return layout_attachment(contents._replace(outcomes=outcomes))
+        return layout_attachment(contents._replace(outcomes=standing.outcomes, order=standing.order))
 
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:

@@ -29,7 +29,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.sentences import amount_text, uncertain_text
+from spatial_replay.monitor.sentences import amount_text, how_text, uncertain_text
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
@@ -222,22 +222,6 @@ _NOW: Final[Mapping[int, str]] = {
     SATISFIED: "is permanently satisfied",
     VIOLATED: "is permanently violated",
 }
-
-
-def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> str:
-    """Return a leaf and its number in words, as in "`a closeto[1] b` fails by 3.2".
-
-    Args:
-        amount: the number without its sign, in words.
-    """
-    if math.isnan(number):
-        return f"`{text}` {'was' if past else 'is'} unknown"
-    holds, fails = ("held", "failed") if past else ("holds", "fails")
-    how = holds if number >= 0.0 else fails
-    if math.isinf(number):
-        return f"`{text}` {how}"
-    is_residue = amount.split(" ")[0] == "0"
-    return f"`{text}` just {how}" if is_residue else f"`{text}` {how} by {amount}"
 
 
 def change_sentence(title: str, after: Period, witness: str, unit: str = "") -> str:
@@ -587,8 +571,10 @@ class EventReporter:
         if found is None:
             return ""
         leaf, number = self._leaf(found, now_ns)
-        amount = amount_text(abs(number), leaf, self._units)
-        return leaf_words(self._leaf_text(leaf), number, amount, past=past)
+        how = f"{'was' if past else 'is'} unknown"
+        if not math.isnan(number):
+            how = how_text(number, leaf, self._units, past=past)
+        return f"`{self._leaf_text(leaf)}` {how}"
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}

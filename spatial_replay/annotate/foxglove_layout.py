@@ -13,7 +13,7 @@ from spatial_replay.annotate.robustness import curved_nodes
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_template import FRAMES, SceneBounds
 from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
-from spatial_replay.annotate.standing import FinalStanding, named_parts, part_title, worst_first
+from spatial_replay.annotate.standing import FinalStanding, named_parts, part_title
 from spatial_replay.logs.messages import (
     CAMERA_ANNOTATIONS,
     CAMERA_CALIBRATION,
@@ -326,7 +326,7 @@ class LayoutContents(NamedTuple):
 
     def worst_first(self) -> LayoutContents:
         """Return the same with the worst results first, which then have lights and curves if not all can."""
-        order = self.order or worst_first(self.outcomes) or range(len(self.trees))
+        order = self.order or range(len(self.trees))
         return self._replace(
             trees=[self.trees[place] for place in order],
             has_states=[self.has_states[place] for place in order],

@@ -11,10 +11,10 @@ specification that this is in, are permanently violated. A goal that is not reac
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from types import MappingProxyType
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
     Boolean,
-    Earlier,
     Formula,
     Group,
     Quantified,
@@ -35,10 +34,9 @@ from spatial_replay.spec.formula import (
     TrackedName,
     Variable,
     iter_nodes,
-    operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import base_of, operand_signs
+from spatial_replay.spec.walks import base_of, is_spatial, iter_bound, operand_signs
 
 
 class Obligation(NamedTuple):
@@ -172,9 +170,6 @@ class Requirement(NamedTuple):
         return np.where(low >= 0.0, low, np.where(fails, high, np.nan))
 
 
-_Bindings: TypeAlias = Mapping[str, Group]
-
-
 def requirements_of(
     formula: Formula, object: str | None = None, *, settles: bool = True, splits: bool = False
 ) -> tuple[Requirement, ...]:
@@ -186,14 +181,11 @@ def requirements_of(
         settles: whether the semantics has verdicts that stay; without, a goal is pending up to the end.
     """
     places = _places(formula)
-    temporal = [isinstance(place.formula, Temporal) for place in places]
-    for identifier, parent, _ in reversed(list(iter_nodes(formula))):
-        if parent is not None:
-            temporal[parent] |= temporal[identifier]
+    is_plain = [is_spatial(place.formula) for place in places]
     found = [
         (identifier, place)
         for identifier, place in enumerate(places)
-        if place.sign and not temporal[identifier] and (place.parent is None or temporal[place.parent])
+        if place.sign and is_plain[identifier] and (place.parent is None or not is_plain[place.parent])
     ]
     if splits:
         found = [(each, places[each]) for identifier, _ in found for each in _conjuncts(places, identifier)]
@@ -302,12 +294,15 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
     objects: set[str] = set()
     regions: set[str] = set()
     groups: set[ClassMembers] = set()
-    for node, bindings in _with_bindings(place.formula):
+    for node, around in iter_bound(place.formula):
+        bindings = {name: base_of(each.group) for each in around for name in each.variables}
         terms: tuple[Term, ...] = node.terms if isinstance(node, Atom) else ()
         if isinstance(node, Quantified):
             terms = (node.group,)
         for term in terms:
-            match _referred(term, bindings):
+            # what it is about, without its delay and enlargement
+            base = base_of(term)
+            match bindings.get(base.name, base) if isinstance(base, Variable) else base:
                 case TrackedName(name):
                     objects.add(name)
                 case RegionName(name):
@@ -333,26 +328,6 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
         is_condition=place.is_condition,
         is_invariant=place.is_invariant and place.obligation is not None,
     )
-
-
-def _with_bindings(formula: Formula) -> Iterator[tuple[Formula, _Bindings]]:
-    """Yield a formula and all below it, each with what the quantifiers above it bind."""
-    stack: list[tuple[Formula, _Bindings]] = [(formula, {})]
-    while stack:
-        node, bindings = stack.pop()
-        yield node, bindings
-        if isinstance(node, Quantified):
-            group = node.group.term if isinstance(node.group, Earlier) else node.group
-            if isinstance(group, Group):
-                bindings = {**bindings, **dict.fromkeys(node.variables, group)}
-            stack.append((node.body, bindings))
-        stack.extend((operand, bindings) for operand in operands_of(node))
-
-
-def _referred(term: Term, bindings: _Bindings) -> TrackedName | RegionName | Variable | Group:
-    """Return what a term is about, without its delay and enlargement."""
-    base = base_of(term)
-    return bindings.get(base.name, base) if isinstance(base, Variable) else base
 
 
 def _excluded(group: Group, object: str | None) -> frozenset[str]:

@@ -19,7 +19,7 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES, used_modules
 from spatial_replay.spec.tokens import written_name
-from spatial_replay.spec.walks import Unit, iter_formulas, per_second, units_of
+from spatial_replay.spec.walks import Unit, iter_atoms, per_second, units_of
 from spatial_replay.text import names_of, plain_unit
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     found = {_declared(unit, units) for unit in units_of(formula)}
     if len(found) > 1:
         return MIXED
-    if not found and any(isinstance(node, Atom) for node in iter_formulas(formula)):
+    if not found and any(iter_atoms(formula)):
         return DIMENSIONLESS  # comparisons of modes alone are infinite
     return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 

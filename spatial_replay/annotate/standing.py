@@ -80,34 +80,15 @@ class FinalStanding(NamedTuple):
 
     Attributes:
         standing: satisfied, violated or unknown, a number of `Standing`.
-        since_s: of a violation, since when it is certain, in seconds after the first sample.
         by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
         at_s: since when it is that, in seconds after the first sample.
         unit: of the robustness.
-        over: what decided it; "" if that is not known.
-        is_late: whether only the end of the log decided it.
     """
 
     standing: int
-    since_s: float
     by: float
     at_s: float
     unit: str
-    over: str
-    is_late: bool = False
-
-
-def worst_first(outcomes: Sequence[FinalStanding]) -> list[int]:
-    """Return the places of results, the worst first: of those violated, the one that was so first."""
-
-    def key(place: int) -> tuple[int, bool, float]:
-        outcome = outcomes[place]
-        since_s, is_late = (
-            (outcome.since_s, outcome.is_late) if outcome.standing == VIOLATED else (0.0, False)
-        )
-        return int(_RANKS[outcome.standing]), is_late, since_s
-
-    return sorted(range(len(outcomes)), key=key)
 
 
 class StandingEncoder:
@@ -117,6 +98,7 @@ class StandingEncoder:
 
     Attributes:
         outcomes: of each result, once the log has ended.
+        order: then the places of results, the worst first: of those violated, the one that was so first.
     """
 
     def __init__(
@@ -146,6 +128,7 @@ class StandingEncoder:
         self._written_ns: int | None = None
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         self.outcomes: tuple[FinalStanding, ...] = ()
+        self.order: Sequence[int] = ()
 
     def encode(
         self, times_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
@@ -219,14 +202,14 @@ class StandingEncoder:
             ended = last.copy()
             ended[:, 2:, 0] = final
             series.append(ended)
-        each_of = zip(self._units, series, since_ns, self._least_ns, over, strict=True)
-        for unit, ended, violated_ns, least_ns, said in each_of:
+        for unit, ended, least_ns in zip(self._units, series, self._least_ns, strict=True):
             code = int(standing_codes(ended[:1], final=True)[0, 0])
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
-            since_s, at_s = ((min(each, time_ns) - first_ns) / 1e9 for each in (violated_ns, least_ns))
-            outcomes.append(FinalStanding(code, since_s, by, at_s, unit, said, violated_ns == LATEST_NS))
-        self.outcomes = tuple(outcomes)
+            outcomes.append(FinalStanding(code, by, (min(least_ns, time_ns) - first_ns) / 1e9, unit))
+        self.outcomes, codes = tuple(outcomes), [each.standing for each in outcomes]
+        since = [at_ns if code == VIOLATED else 0 for code, at_ns in zip(codes, since_ns, strict=True)]
+        self.order = np.lexsort((np.array(since), _RANKS[codes])).tolist()
         words, times_ns = [([each], np.zeros(1, np.int64)) for each in self._words], np.array([time_ns])
         instants = np.array([since_ns, self._least_ns])[:, :, None]
         [payload] = self._messages(times_ns, series, words, instants, over, final=True)

@@ -24,8 +24,8 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.spec.formula import ANY_CLASS, Formula, Outline, Quantified, TrackedName, iter_nodes
-from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, substitute
+from spatial_replay.spec.formula import ANY_CLASS, Formula, Outline, Quantified, TrackedName
+from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, nodes_of, substitute
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_BINDINGS: Final = 64
@@ -90,7 +90,7 @@ class ShadeTracker:
     ) -> None:
         """Start before the first sample."""
         self._regions = regions
-        nodes = [node for _, _, node in iter_nodes(instance.formula)]
+        nodes = nodes_of(instance.formula)
         self._leaves = [
             _separable(substitute(nodes[each.node], instance.bindings), each.sign) for each in parts
         ]

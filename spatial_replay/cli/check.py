@@ -36,6 +36,7 @@ from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
+from spatial_replay.spec.walks import nodes_of
 from spatial_replay.text import counted, counted_from, json_fields
 
 if TYPE_CHECKING:
@@ -313,7 +314,7 @@ class _CutResults:
             evidence = Evidence(stream.instance, own.regions, traces, units)
             result = SpecResult.from_stream(stream, evidence, join_blocks(kept), has_series=False)
             for part in result.untested if result.tested == "cut" else ():
-                node = next(each for number, _, each in iter_nodes(result.formula) if number == part.node)
+                node = nodes_of(result.formula)[part.node or 0]
                 message = f"{result.name} would be {result.verdict}: {str(part.message).removesuffix('.')}"
                 hint = "record a longer log; `replay --fail-on cut` fails such a result"
                 yield text.diagnostic("warning", node.span, message, hint)

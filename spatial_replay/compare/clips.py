@@ -19,14 +19,13 @@ from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_unfinished
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.monitor.stream import InstanceStream
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
-from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
 from spatial_replay.replay.engine import Replay, Replayed, run_replay
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
@@ -37,7 +36,7 @@ from spatial_replay.replay.selection import (
     clipped_source,
 )
 from spatial_replay.spec.diagnostics import nearest_hint
-from spatial_replay.spec.formula import Outline, Specification, iter_nodes
+from spatial_replay.spec.formula import Outline, Specification
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
 from spatial_replay.tuning.tuned import last_that_holds
 
@@ -101,7 +100,7 @@ class _Decision(NamedTuple):
 
     certain_ns: int | None
     cause: int | None
-    ends: tuple[float, ...]
+    ends: tuple[tuple[float, float], ...]
     path: _Path
     settled: _Path
 
@@ -116,7 +115,6 @@ class _Part:
         self._result, self._node = result, kept.node
         self._leaves, self._times_ns = result.leaves, result.times_ns
         self._order = result.evidence.instance.program.leaves
-        self._nodes = [node for _, _, node in iter_nodes(result.formula)]
         self._trace, self._regions = trace, regions
         self._reach = look_back([result.formula])
         # an instance lasts from the first to the last appearance of its object
@@ -170,34 +168,27 @@ class _Part:
         cause = result.first_cause(self._node)
         part, settled_ns = (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
         done = evaluate_offline(result.formula, self._order, leaves, times_ns)
-        path = self._path(done, times_ns, self._node)
+        path = _path(done, self._node)
         if settled_ns is None:
-            settled = self._path(done, times_ns, part)
+            settled = _path(done, part)
         else:
             count = int(np.searchsorted(times_ns, settled_ns, side="right"))
             first = evaluate_unfinished(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
-            settled = self._path(first, times_ns[:count], part)
-        ends = (
-            float(end[0]) + 0.0
-            for node in (self._node, part)
-            for wide in (True, False)
-            for end in done.ends(node, wide=wide)
-        )
-        return _Decision(certain_ns, None if cause is None else part, tuple(ends), path, settled)
+            settled = _path(first, part)
+        ends = tuple(done.interval(node, wide=wide) for node in (self._node, part) for wide in (True, False))
+        return _Decision(certain_ns, None if cause is None else part, ends, path, settled)
 
-    def _path(self, done: OfflineNodes | UnfinishedNodes, times_ns: Integers, node: int) -> _Path:
-        goes_on = isinstance(done, UnfinishedNodes)
-        lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
-        end = End.of(final_verdict(lower, upper))
-        path = deciding_path(self._result.formula, done, times_ns, node, end, goes_on=goes_on)
-        last = path.steps[-1]
-        low, high = done.ends(last.node)
-        return _Path(
-            tuple(step.node for step in path.steps),
-            int(times_ns[last.sample]),
-            (float(low[last.sample]), float(high[last.sample])),
-            missed_response(path, self._nodes, done, times_ns) if end is End.HIGH else None,
-        )
+
+def _path(done: OfflineNodes, node: int) -> _Path:
+    end = End.of(final_verdict(*done.interval(node)))
+    path = deciding_path(done, node, end)
+    last = path.steps[-1]
+    return _Path(
+        tuple(step.node for step in path.steps),
+        int(done.times_ns[last.sample]),
+        done.interval(last.node, last.sample),
+        missed_response(path, done)[0] if end is End.HIGH else None,
+    )
 
 
 class ClipSearch:

@@ -31,7 +31,7 @@ from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Sele
 from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
-from spatial_replay.spec.walks import other_names
+from spatial_replay.spec.walks import nodes_of, other_names
 from spatial_replay.text import (
     TEXTS,
     Instant,
@@ -601,7 +601,7 @@ def _deepest_flipped(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
 
 
 def _objects_of(result: SpecResult, node: int) -> frozenset[str]:
-    formula = next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
+    formula = nodes_of(result.formula)[node]
     bound = result.evidence.bound(formula)
     names: set[str] = set(other_names(bound))
     for _, _, leaf in iter_nodes(bound):

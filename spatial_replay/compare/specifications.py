@@ -107,8 +107,8 @@ class EditOutcomes:
             value = float(run.final[0, 0])
             return EditOutcome(final_verdict(value, value), value, value, value)
         done = evaluate_offline(formula, leaves, columns, self._times_ns)
-        lower, upper = (float(end[0]) + 0.0 for end in done.ends(0))
-        least, greatest = (float(end[0]) + 0.0 for end in done.ends(0, wide=False))
+        lower, upper = done.interval(0)
+        least, greatest = done.interval(0, wide=False)
         return EditOutcome(
             final_verdict(lower, upper), least if least == greatest else math.nan, lower, upper
         )

@@ -12,7 +12,7 @@ from spatial_replay.monitor.stream import NEVER
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Boolean, Formula, NamedSpec, iter_nodes
+from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
 from spatial_replay.text import shortened_formula
 
 
@@ -82,23 +82,24 @@ class Conjunct:
     formula: Formula
 
 
-def conjuncts_of(formula: Formula, name: str) -> tuple[Conjunct, ...]:
+def conjuncts_of(formula: Formula, name: str, node: int = 0) -> tuple[Conjunct, ...]:
     """Split a formula at its conjunctions, through named specs, in the order of the text.
 
     Args:
         name: what the formula itself is called.
+        node: its id.
     """
     specs: dict[int, str] = {}
     found = []
-    for identifier, parent, node in iter_nodes(formula):
+    for identifier, parent, part in iter_nodes(formula):
         if parent is None:
             specs[identifier] = name
         elif parent in specs:
-            specs[identifier] = node.name or specs[parent]
+            specs[identifier] = part.name or specs[parent]
         else:
             continue
-        if not (isinstance(node, Boolean) and node.operator in ("and", "spec")):
-            found.append(Conjunct(identifier, specs.pop(identifier), node))
+        if operator_of(part) not in ("and", "spec"):
+            found.append(Conjunct(node + identifier, specs.pop(identifier), part))
     return tuple(found)
 
 

@@ -14,7 +14,7 @@ from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.result import NodeResult, SpecResult, no_such_node
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.monitor.vacuity import UntestedPart, no_instances
+from spatial_replay.monitor.vacuity import UntestedPart, idle_templates
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.witness import Witness
@@ -64,12 +64,8 @@ class Evaluation(Displayed):
 
         Parts of a result that decided nothing are in its own `vacuous`.
         """
-        evaluated = {result.name for result in self.results}
-        return tuple(
-            no_instances(spec.name, spec.parameter, self.each.get(spec.parameter, ""), self.classes)
-            for spec in self.specification.results
-            if spec.parameter is not None and spec.name not in evaluated
-        )
+        evaluated = (result.formula for result in self.results)
+        return idle_templates(self.specification.results, evaluated, self.each, self.classes)
 
     @property
     def verdict(self) -> Verdict:

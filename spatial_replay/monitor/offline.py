@@ -1,4 +1,4 @@
-"""Offline robustness: rho(t, node) of every node from each sample to the end of a finished log.
+"""Offline robustness: rho(t, node) of every node from each sample to the end of the samples.
 
 A monitor's numbers, in contrast, are about the first and the newest sample. A sliding window is evaluated as
 a log of its own at each position.
@@ -10,8 +10,10 @@ at begin + i, or at end - 1 - i for a future operator.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import count
 from types import MappingProxyType
 from typing import NamedTuple
@@ -20,12 +22,25 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers, roomy, writable
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, roomy, writable
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.codes import OFFLINE_TARGET, low_and_high
+from spatial_replay.monitor.online.codes import OFFLINE_TARGET, joined_channels, low_and_high
 from spatial_replay.monitor.online.operators import SignalTable, array_of_rows
 from spatial_replay.monitor.online.signals import past_value
-from spatial_replay.spec.formula import Atom, Formula, Quantified, Temporal, iter_nodes
+from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
+    Atom,
+    Boolean,
+    Bound,
+    Formula,
+    Quantified,
+    Signal,
+    Temporal,
+    expand,
+    iter_nodes,
+    operator_of,
+)
+from spatial_replay.spec.walks import nodes_with_operands
 from spatial_replay.trace.trace import LATEST_NS
 
 
@@ -225,18 +240,34 @@ class OfflineTable(SignalTable):
 
 @dataclass(frozen=True, eq=False)
 class OfflineNodes:
-    """Every node at every sample.
+    """Every node of a formula at every sample.
 
     Attributes:
+        times_ns: (T,).
         columns: (C, N, T), the ends of each node's interval (see `channels`).
+        goes_on: whether samples may follow.
     """
 
+    formula: Formula
+    times_ns: Integers
     columns: Floats
+    goes_on: bool = False
+
+    @cached_property
+    def tree(self) -> list[tuple[Formula, list[int]]]:
+        """Every node, by id, with the ids of its operands."""
+        return nodes_with_operands(self.formula)
 
     def ends(self, node: int, *, wide: bool = True) -> tuple[Floats, Floats]:
         """Return the ends (T,) of a node's robustness at each sample, with uncertainty if `wide`."""
         low, high = low_and_high(len(self.columns), wide=wide)
         return self.columns[low, node], self.columns[high, node]
+
+    def interval(self, node: int, sample: int = 0, *, wide: bool = True) -> tuple[float, float]:
+        """Return the ends of a node's robustness at one sample."""
+        low, high = self.ends(node, wide=wide)
+        # adding zero turns -0.0 into 0.0
+        return float(low[sample]) + 0.0, float(high[sample]) + 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,21 +279,25 @@ class OfflineFormula:
         nodes, width: how many nodes it has, and columns with those of other rows.
     """
 
+    formula: Formula
     table: Integers
     nodes: int
     width: int
 
     @classmethod
-    def of(cls, formula: Formula, order: Sequence[Atom | Quantified]) -> OfflineFormula:
+    def of(
+        cls, formula: Formula, order: Sequence[Atom | Quantified], stand_ins: Sequence[Formula] = ()
+    ) -> OfflineFormula:
         """Compile a formula.
 
         Args:
             order: which leaf is which.
+            stand_ins: what is computed in place of each node, by id, if that is something else.
         """
         table = OfflineTable(order)
-        nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
+        nodes = [table.add(node) for node in stand_ins or (node for _, _, node in iter_nodes(formula))]
         instructions = table.instructions(nodes)
-        return cls(instructions, len(nodes), int(instructions[:, OFFLINE_TARGET].max()) + 1)
+        return cls(formula, instructions, len(nodes), int(instructions[:, OFFLINE_TARGET].max()) + 1)
 
     def evaluate(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
         """Evaluate every node over all samples; see `evaluate_offline`."""
@@ -270,7 +305,7 @@ class OfflineFormula:
         extrema = np.empty(len(times_ns))
         stamps = writable(times_ns)
         run_offline(self.table, writable(leaves), stamps, 0, len(stamps), columns, extrema)
-        return OfflineNodes(columns[:, : self.nodes])
+        return OfflineNodes(self.formula, times_ns, columns[:, : self.nodes])
 
 
 def evaluate_offline(
@@ -281,9 +316,142 @@ def evaluate_offline(
     Args:
         order: which leaf is which.
         leaves: (C, A, T), their intervals (see `leaf_values`).
-        times_ns: (T,), increasing.
+        times_ns: (T,), increasing; T at least 1.
     """
     return OfflineFormula.of(formula, order).evaluate(leaves, times_ns)
+
+
+def evaluate_unfinished(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> OfflineNodes:
+    """Evaluate every node over samples that others may follow; arguments as of `evaluate_offline`.
+
+    Values after the last sample are unknown, [-inf, +inf], so the numbers at the first sample are those of a
+    monitor. The path through them leads to the atom that settled a verdict before the log ended.
+    """
+    return replace(_evaluated(formula, order, leaves, times_ns, _is_open), goes_on=True)
+
+
+def evaluate_with_whole_windows(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> OfflineNodes:
+    """Evaluate every node over a finished log, but with windows that go on beyond its end.
+
+    Values there are unknown, and only there (see `is_cut`). Arguments as of `evaluate_offline`.
+    """
+    return _evaluated(formula, order, leaves, times_ns, is_cut)
+
+
+def _evaluated(
+    formula: Formula,
+    order: Sequence[Atom | Quantified],
+    leaves: Floats,
+    times_ns: Integers,
+    beyond: Callable[[Temporal, Integers], Booleans],
+) -> OfflineNodes:
+    opened = _OpenFormulas(times_ns, beyond)
+    stand_ins = [opened.of(node) for _, _, node in iter_nodes(formula)]
+    is_open = np.array(opened.columns, np.bool_).reshape(-1, len(times_ns))
+    columns = np.stack([np.full(is_open.shape, -np.inf), np.where(is_open, np.inf, -np.inf)])
+    compiled = OfflineFormula.of(formula, (*order, *opened.leaves), stand_ins)
+    return compiled.evaluate(joined_channels([leaves, columns], axis=1), times_ns)
+
+
+class _OpenFormulas:
+    """Formulas in which leaves of their own stand for what samples beyond the last one may bring.
+
+    Attributes:
+        leaves: one for each operator with a window that such samples may fall into.
+        columns: of each leaf (T,), at which samples it may be anything; it is `false` at the others.
+    """
+
+    def __init__(self, times_ns: Integers, beyond: Callable[[Temporal, Integers], Booleans]) -> None:
+        """Begin without any; `beyond` returns at which samples an operator's window is open."""
+        self.leaves: list[Atom] = []
+        self.columns: list[Booleans] = []
+        self._times_ns, self._beyond = times_ns, beyond
+        # the formulas stay alive, so that no other one takes the id of one
+        self._known: dict[int, tuple[Formula, Formula]] = {}
+
+    def of(self, formula: Formula) -> Formula:
+        """Return the formula to compute in place of one."""
+        if id(formula) not in self._known:
+            self._known[id(formula)] = formula, self._made(formula)
+        return self._known[id(formula)][1]
+
+    def _made(self, formula: Formula) -> Formula:
+        expanded = formula if operator_of(formula) == "WX" else expand(formula)
+        if expanded is not formula:
+            return self.of(expanded)
+        if not isinstance(formula, Boolean | Temporal):
+            return formula
+        made = replace(formula, operands=tuple([self.of(each) for each in formula.operands]))
+        if not isinstance(made, Temporal):
+            return made
+        is_open = self._beyond(made, self._times_ns)
+        if not is_open.any():
+            return made
+        leaf = Atom("", "signal", Signal(f"\0{len(self.leaves)}"))
+        self.leaves.append(leaf)
+        self.columns.append(is_open)
+        match made.operator:
+            case "F":
+                return Boolean("or", (made, leaf))
+            case "G":
+                return Boolean("and", (made, Boolean("not", (leaf,))))
+            case "U":
+                # a later sample may fulfil it, as far as the left operand has lasted up to now
+                lasting = Temporal("G", made.operands[:1])
+                return Boolean("or", (made, Boolean("and", (leaf, lasting))))
+        return Boolean("and", (Boolean("or", (made, leaf)), Boolean("not", (leaf,))))
+
+
+def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
+    """Return (T,), at which samples the end of a log cuts the window of an operator short.
+
+    An operator without an upper bound ends with the log; WX says itself what holds at the last sample.
+    """
+    bound = formula.bound
+    is_bounded = formula.operator == "X" or (bound is not None and bound.upper is not None)
+    return _is_open(formula, times_ns) & is_bounded
+
+
+def _is_open(formula: Temporal, times_ns: Integers) -> Booleans:
+    """Return (T,), at which samples later ones can fall into the window of an operator."""
+    bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX") else formula.bound
+    return ~is_closed(bound, times_ns) & (formula.operator in FUTURE_OPERATORS)
+
+
+def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
+    """Return (T,), whether no later sample can fall into the window of a future operator at each sample."""
+    count = len(times_ns)
+    if bound is None or bound.upper is None:
+        return np.zeros(count, np.bool_)
+    if bound.unit == "samples":
+        return np.arange(count) + min(bound.upper, count) < count
+    # integers of any size: a time and a duration may add up to more than 64 bits
+    span_ns = int(times_ns[-1]) - bound.upper
+    return np.arange(count) < bisect_left(times_ns, span_ns + 1)
+
+
+def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integers]:
+    """Return the first sample (T,) in an operator's window at each sample, and the one after the last."""
+    count = len(times_ns)
+    here = np.arange(count, dtype=np.int64)
+    is_ahead = formula.operator in FUTURE_OPERATORS
+    bound = formula.bound or Bound(0, None, "samples")
+    if formula.operator in ("X", "WX", "Y"):
+        bound = Bound(1, 1, "samples")
+    # as distances from the first sample, and no further than the last: sums stay below 64 bits
+    places = here if bound.unit == "samples" else times_ns - times_ns[0]
+    furthest = int(places[-1]) + 1
+    near = min(bound.lower, furthest)
+    far = furthest if bound.upper is None else min(bound.upper, furthest)
+    low, high = (places + near, places + far) if is_ahead else (places - far, places - near)
+    if bound.unit == "samples":
+        return np.clip(low, 0, count), np.clip(high + 1, 0, count)
+    begin = np.searchsorted(places, low, side="left").astype(np.int64)
+    return begin, np.searchsorted(places, high, side="right").astype(np.int64)
 
 
 def full_signal(

@@ -6,7 +6,7 @@ of minima and maxima. And where something is unknown: every number that depends 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Empty, Flags, Floats, Integers
 from spatial_replay.monitor.atoms.delays import iter_delays
+from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import (
@@ -28,7 +29,7 @@ from spatial_replay.spec.formula import (
     Truth,
     iter_nodes,
 )
-from spatial_replay.spec.walks import has_rate, is_spatial
+from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key, nodes_with_operands
 
 
 class PaperMemory(NamedTuple):
@@ -291,12 +292,11 @@ WIDTH = 11
 NOTHING = -1
 """No upper end, no column, no table of pairs."""
 
-# codes of nodes; a row is a node as written, since Def. 16 gives a number to each
+# codes of nodes, beside those of reports for Boolean ones; a row is a node as written, since Def. 16 gives a
+# number to each
 LEAF_NODE, TRUTH = 0, 1
-NOT, AND, OR, XOR, IMPLIES, IFF, SAME = 2, 3, 4, 5, 6, 7, 8
 NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
 
-_BOOLEAN_CODES = {"not": NOT, "and": AND, "or": OR, "xor": XOR, "->": IMPLIES, "<->": IFF, "spec": SAME}
 _TEMPORAL_CODES = {"X": NEXT, "F": EVENTUALLY, "G": ALWAYS, "U": UNTIL}
 OPERATORS = frozenset(_TEMPORAL_CODES)
 """The temporal operators that there are."""
@@ -322,18 +322,15 @@ class PaperTable:
 
 def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperTable:
     """Compile a formula of `OPERATORS` over these leaves."""
-    nodes = [(node, parent) for _, parent, node in iter_nodes(formula)]
-    operands: list[list[int]] = [[] for _ in nodes]
-    for identifier, (_, parent) in enumerate(nodes):
-        if parent is not None:
-            operands[parent].append(identifier)
+    nodes = nodes_with_operands(formula)
+    numbers: dict[object, int] = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
     is_plain = [is_spatial(node) for node, _ in nodes]
-    has_column = _columns(nodes, operands, is_plain)
+    has_column = _columns(nodes, is_plain)
     rows = np.zeros((len(nodes), WIDTH), np.int64)
     columns = pairs = begin = 0
-    for identifier, (node, _) in enumerate(nodes):
-        row, own = rows[identifier], operands[identifier]
-        row[[CODE, LEAF]] = _code(node, leaves)
+    for identifier, (node, own) in enumerate(nodes):
+        row = rows[identifier]
+        row[[CODE, LEAF]] = _code(node, numbers)
         row[[FIRST, END]] = begin, begin + len(own)
         row[IS_PLAIN] = is_plain[identifier]
         row[[HIGH, COLUMN, INNER, PAIRS]] = NOTHING
@@ -351,16 +348,14 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
                 row[INNER], columns = columns, columns + 1
             if has_column[identifier] and is_until_nested and not is_plain[own[0]]:
                 row[PAIRS], pairs = pairs, pairs + 1
-    return PaperTable(rows, np.array([i for own in operands for i in own], np.int64), columns, pairs)
+    return PaperTable(rows, np.array([i for _, own in nodes for i in own], np.int64), columns, pairs)
 
 
-def _columns(
-    nodes: Sequence[tuple[Formula, int | None]], operands: Sequence[Sequence[int]], is_plain: Sequence[bool]
-) -> list[bool]:
+def _columns(nodes: Sequence[tuple[Formula, Sequence[int]]], is_plain: Sequence[bool]) -> list[bool]:
     """Return which nodes are needed at all samples; parents come before their operands."""
     wanted = [False] * len(nodes)
-    for identifier, (node, _) in enumerate(nodes):
-        for operand in operands[identifier]:
+    for identifier, (node, operands) in enumerate(nodes):
+        for operand in operands:
             if isinstance(node, Temporal):
                 wanted[operand] = wanted[identifier] or not is_plain[operand]
             else:
@@ -368,31 +363,17 @@ def _columns(
     return wanted
 
 
-def _code(node: Formula, leaves: Sequence[Atom | Quantified]) -> tuple[int, int]:
+def _code(node: Formula, leaves: Mapping[object, int]) -> tuple[int, int]:
     """Return a node's code, and its leaf or the sign of its infinity."""
     match node:
         case Truth():
             return TRUTH, 1 if node.value else -1
         case Boolean():
-            return _BOOLEAN_CODES[node.operator], 0
+            return codes.REPORT_OF_BOOLEAN[node.operator], 0
         case Temporal():
             return _TEMPORAL_CODES[node.operator], 0
         case _:
-            return LEAF_NODE, _leaf_number(node, leaves)
-
-
-def _leaf_number(node: Atom | Quantified, leaves: Sequence[Atom | Quantified]) -> int:
-    for number, leaf in enumerate(leaves):
-        if isinstance(node, Atom):
-            if isinstance(leaf, Atom) and leaf.expression == node.expression:
-                return number
-        elif isinstance(leaf, Quantified) and _meaning(leaf) == _meaning(node):
-            return number
-    raise ValueError(f"{node!r} is none of the leaves")
-
-
-def _meaning(leaf: Quantified) -> tuple[object, ...]:
-    return leaf.quantifier, leaf.variables, leaf.group, leaf.body
+            return LEAF_NODE, leaves[leaf_key(node)]
 
 
 @inlined
@@ -424,17 +405,17 @@ def pick(is_least: bool, one: float, other: float) -> float:
 @inlined
 def combine(code: int, one: float, other: float) -> float:
     """Apply a Boolean operator; for one operand, both are that operand."""
-    if code == AND:
+    if code == codes.REPORT_AND:
         return least(one, other)
-    if code == OR:
+    if code == codes.REPORT_OR:
         return most(one, other)
-    if code == NOT:
+    if code == codes.REPORT_NOT:
         return -one
-    if code == IMPLIES:
+    if code == codes.REPORT_IMPLIES:
         return most(-one, other)
-    if code == XOR:
+    if code == codes.REPORT_XOR:
         return most(least(one, -other), least(-one, other))
-    if code == IFF:
+    if code == codes.REPORT_IFF:
         return least(most(-one, other), most(-other, one))
     return one
 
@@ -520,8 +501,8 @@ def scan_until_by_pairs(
 
 _TILE = 256
 _FIRST_ROOM = 1024
-MAX_PAIRS = 1 << 27
-"""The most pairs of samples that untils may store a number for: about 16,000 samples, 1.2 GB."""
+MAX_PAIRS = 1 << 26
+"""The most pairs of samples that untils may store a number for: about 11,600 samples, 0.6 GB."""
 
 
 class PaperRun:
@@ -575,6 +556,10 @@ class PaperRun:
         lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = empty((len(self._table.rows), 4, len(times_ns)))
+        samples, rows = self._position + len(times_ns), self._table.rows
+        # windows without an end: the others are known once their samples come
+        lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
+        self._check_pairs(int((np.maximum(samples - lows, 0) ** 2 // 2).sum()), samples)
         for t in range(0, len(times_ns), _TILE):
             count = min(_TILE, len(times_ns) - t)
             self._make_room(self._position + count)
@@ -601,18 +586,21 @@ class PaperRun:
         if pairs:
             used = int(memory.pair_end[0])
             wanted = used + pairs * samples * (samples - self._position)
-            if used > self._max_pairs:
-                raise UsageError(
-                    f"after {self._position} samples, an until of two temporal operands below a temporal "
-                    "operator compares too many pairs of them; bound it, evaluate fewer samples, or use "
-                    "the semantics 'ltlf'"
-                )
+            self._check_pairs(used, self._position)
             if wanted > len(memory.pairs):
-                more = max(wanted, 2 * used) - len(memory.pairs)
+                more = max(wanted, min(2 * used, self._max_pairs)) - len(memory.pairs)
                 memory = memory._replace(
                     pairs=_longer(memory.pairs, more), lost_pairs=_longer(memory.lost_pairs, more)
                 )
         self._memory = memory
+
+    def _check_pairs(self, pairs: int, samples: int) -> None:
+        if pairs > self._max_pairs:
+            raise UsageError(
+                f"over {samples:,} samples, an until of two temporal operands below a temporal operator "
+                "compares too many pairs of them; bound it, evaluate fewer samples, or use the semantics "
+                "'ltlf'"
+            )
 
 
 def left_out(

@@ -36,7 +36,7 @@ from spatial_replay.spec.formula import (
     Variable,
     operands_of,
 )
-from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
+from spatial_replay.spec.walks import base_of, iter_atoms, iter_bound, iter_expressions, terms_of
 from spatial_replay.text import counted, time_text
 from spatial_replay.trace.trace import Pauses, Trace
 
@@ -219,7 +219,7 @@ def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
     if log.rate is None:
         return []
     lines: dict[str, None] = {}
-    for node in _nodes(specification):
+    for node, _ in _bound_nodes(specification):
         bound = node.bound if isinstance(node, Temporal) else None
         if bound is not None and bound.unit == "samples":
             upper = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
@@ -264,7 +264,7 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
             span = Span(start, start + len(f"region {name}"))
             found[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
     for part, (count, first_ns) in log.missing.items():
-        named = (each for each in _nodes(specification) if isinstance(each, Atom))
+        named = (each for spec in specification.results for each in iter_atoms(spec.formula))
         span = next(each.span for each in named if part in named_parts(each))
         # one that the log never has is an error of names
         if count < log.samples:
@@ -384,21 +384,10 @@ def _over(
     return formula
 
 
-def _nodes(specification: Specification) -> Iterator[Formula]:
-    for spec in specification.results:
-        yield from iter_formulas(spec.formula)
-
-
 def _bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
     """Yield every node, with the quantifiers that bind variables of it, from the outside in."""
     for spec in specification.results:
-        stack: list[tuple[Formula, tuple[Quantified, ...]]] = [(spec.formula, ())]
-        while stack:
-            node, around = stack.pop()
-            if isinstance(node, Quantified):
-                stack.append((node.body, (*around, node)))
-            else:
-                stack += [(each, around) for each in reversed(operands_of(node))]
+        for node, around in iter_bound(spec.formula):
             yield node, _binding(node, around, spec.parameter) if isinstance(node, Atom) else ()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -38,7 +38,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness, time_o
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
-from spatial_replay.spec.walks import declared_unit
+from spatial_replay.spec.walks import declared_unit, nodes_of
 from spatial_replay.text import Instant, Sentence, counted_from, shortened_formula
 from spatial_replay.trace.trace import LATEST_NS
 
@@ -251,11 +251,9 @@ class SpecResult(Displayed):
         """Return why a node is violated or unknown, as `causes` does for the root."""
         return self._causes(node, self._witnesses)
 
-    def _conjuncts_of(self, node: int) -> list[Conjunct]:
+    def _conjuncts_of(self, node: int) -> Sequence[Conjunct]:
         """Return the parts of a node that have to hold for it to hold."""
-        formula = next(each for identifier, _, each in iter_nodes(self.formula) if identifier == node)
-        own = conjuncts_of(formula, self._name_of(node))
-        return [replace(each, node=node + each.node) for each in own]
+        return conjuncts_of(nodes_of(self.formula)[node], self._name_of(node), node)
 
     def first_cause(self, node: int) -> Cause | None:
         """Return the first of `causes_of` a node, without its witness: no sample is read for it."""
@@ -414,9 +412,7 @@ class SpecResult(Displayed):
         """
         leaves = self._leaves("what decides a verdict")
         done = evaluate_offline(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
-        lower, upper = (float(end[0]) + 0.0 for end in done.ends(0))
-        end = End.of(final_verdict(lower, upper))
-        return deciding_path(self.formula, done, self.times_ns, 0, end).steps[-1].node
+        return deciding_path(done, 0, End.of(final_verdict(*done.interval(0)))).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
         """Return what gave the verdict its robustness, and how a violation began where that was earlier.

@@ -15,7 +15,7 @@ from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import Atom, Formula, Number, Scaled
-from spatial_replay.spec.walks import declared_unit, iter_expressions, iter_formulas, per_second
+from spatial_replay.spec.walks import declared_unit, iter_parts, per_second
 from spatial_replay.text import (
     Instant,
     Sentence,
@@ -172,6 +172,14 @@ def amount_text(number: float, atom: Formula, units: Mapping[str, str] = Mapping
     return f"{amount} ({number_text(number)} on its scale of {format_number(divisor)})"
 
 
+def how_text(number: float, atom: Formula, units: Mapping[str, str], *, past: bool = False) -> str:
+    """Return how well an atom holds, as in "fails by 3.2"; arguments as of `amount_text`."""
+    how = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
+    if not without_residue(number, atom):
+        return f"just {how}"
+    return f"{how} by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else how
+
+
 def uncertain_text(least: str) -> str:
     """Return what follows the number of an atom that is uncertain: how much it is at least."""
     return f", at least {least} with what is uncertain"
@@ -179,13 +187,8 @@ def uncertain_text(least: str) -> str:
 
 def without_residue(number: float, atom: Formula) -> float:
     """Return a number of an atom, but 0 where it is no more than a rounding error."""
-    limits = [
-        abs(part.value)
-        for each in iter_formulas(atom)
-        if isinstance(each, Atom)
-        for part in iter_expressions(each.expression)
-        if isinstance(part, Number) and math.isfinite(part.value)
-    ]
+    limits = [abs(part.value) for part in iter_parts(atom) if isinstance(part, Number)]
+    limits = [each for each in limits if math.isfinite(each)]
     scale = max(limits, default=0.0) or 1.0
     return 0.0 if abs(number * divisor_of(atom)) <= _RESIDUE * scale else number
 
@@ -257,14 +260,9 @@ def _how_it_decides(
     amount, least = deciding.value, _end(deciding)
     if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
         amount = least
-    size = amount_text(abs(amount), deciding.atom, witness.units)
-    how = "holds" if amount >= 0.0 else "fails"
-    if math.isfinite(amount):
-        how += f" by {size}"
-    if abs(least) < abs(amount):
+    how = how_text(amount, deciding.atom, witness.units)
+    if abs(least) < abs(amount) and without_residue(amount, deciding.atom):
         how += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
-    if without_residue(amount, deciding.atom) == 0.0:
-        how = "just holds" if amount >= 0.0 else "just fails"
     if amount >= 0.0 and witness.verdict is Verdict.VIOLATED and not is_open:
         how = f"must not hold, and {how}"
     where = _in_time(witness)

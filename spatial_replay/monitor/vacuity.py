@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers, roomy
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
-from spatial_replay.monitor.online.codes import in_channels, low_and_high
-from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.path import End, PathNode, deciding_path
-from spatial_replay.monitor.witness.unfinished import (
-    UnfinishedNodes,
-    evaluate_untested,
+from spatial_replay.monitor.offline import (
+    OfflineNodes,
+    evaluate_offline,
     evaluate_with_whole_windows,
     is_cut,
     windows_of,
 )
+from spatial_replay.monitor.online.codes import in_channels, joined_channels, low_and_high
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.path import End, PathNode, deciding_path
 from spatial_replay.spec.format import format_formula, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
@@ -31,14 +30,24 @@ from spatial_replay.spec.formula import (
     Equality,
     Formula,
     Group,
+    NamedSpec,
     Quantified,
     Signal,
     Temporal,
     TrackedName,
     iter_nodes,
     operands_of,
+    operator_of,
 )
-from spatial_replay.spec.walks import is_spatial, iter_expressions, iter_formulas, iter_terms, standing
+from spatial_replay.spec.walks import (
+    is_spatial,
+    iter_parts,
+    iter_terms,
+    leaf_key,
+    nodes_of,
+    nodes_with_operands,
+    standing,
+)
 from spatial_replay.text import (
     Instant,
     Sentence,
@@ -80,20 +89,31 @@ class UntestedPart:
     time_ns: int | None = None
 
 
-def no_instances(name: str, parameter: str, chosen: str = "", classes: Iterable[str] = ()) -> UntestedPart:
-    """Return the entry of a template that no object fits.
+def idle_templates(
+    specs: Iterable[NamedSpec],
+    evaluated: Iterable[Formula],
+    each: Mapping[str, str],
+    classes: Collection[str],
+) -> tuple[UntestedPart, ...]:
+    """Return the templates without instances: no object fits them, so they decided nothing.
 
     Args:
-        chosen: its objects, such as "class:person".
-        classes: the classes of the log.
+        evaluated: the formulas that have a result.
+        each: the objects that parameters stand for, such as "class:person".
+        classes: of the log.
     """
-    text = f"{name}({parameter})"
-    message = f"`{text}` was never evaluated: no object stands for {parameter}."
-    kind, _, wanted = chosen.partition(":")
-    if kind == "class":
-        hint = nearest_hint(wanted, classes)
-        message += f" The log never has the class {printable(wanted)!r}{f'; {hint}' if hint else '.'}"
-    return UntestedPart(None, text, "no instances", Sentence(message))
+    found, done = [], {id(formula) for formula in evaluated}
+    for spec in specs:
+        if spec.parameter is None or id(spec.formula) in done:
+            continue
+        text = f"{spec.name}({spec.parameter})"
+        message = f"`{text}` was never evaluated: no object stands for {spec.parameter}."
+        kind, _, wanted = each.get(spec.parameter, "").partition(":")
+        if kind == "class":
+            hint = nearest_hint(wanted, sorted(classes))
+            message += f" The log never has the class {printable(wanted)!r}{f'; {hint}' if hint else '.'}"
+        found.append(UntestedPart(None, text, "no instances", Sentence(message)))
+    return tuple(found)
 
 
 def find_vacuous(
@@ -108,7 +128,7 @@ def find_vacuous(
         is_infinite: whether the formula's robustness is infinite at least, at the first sample.
     """
     instance = evidence.instance
-    nodes = [node for _, _, node in iter_nodes(instance.formula)]
+    nodes = nodes_of(instance.formula)
     scopes = _scopes(instance.formula, times_ns)
     found = [
         *_empty_windows(nodes, scopes, times_ns, evidence),
@@ -118,7 +138,7 @@ def find_vacuous(
     ]
     if is_infinite:
         done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
-        path = deciding_path(instance.formula, done, times_ns, 0, End.LOW)
+        path = deciding_path(done, 0, End.LOW)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         if node not in {each.node for each in found}:
             found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
@@ -152,23 +172,16 @@ def _scopes(
     Args:
         held: where an antecedent may hold; then the samples at which the verdict depends on a node.
     """
-    count = len(times_ns)
-    scopes: list[_Samples] = []
-    operands_passed: list[int] = []
-    nodes: list[Formula] = []
-    for _, parent, node in iter_nodes(formula):
-        nodes.append(node)
-        operands_passed.append(0)
-        if parent is None:
-            scopes.append(np.arange(count) == 0)
-            continue
-        place = operands_passed[parent]
-        operands_passed[parent] += 1
-        above = nodes[parent]
-        within = scopes[parent]
-        if held and place == 1 and isinstance(above, Boolean) and above.operator == "->" and within.any():
-            within = within & held(above.operands[0])
-        scopes.append(_below(above, place, within, times_ns) if isinstance(above, Temporal) else within)
+    tree = nodes_with_operands(formula)
+    scopes = [np.arange(len(times_ns)) == 0 for _ in tree]
+    for scope, (node, operands) in zip(scopes, tree, strict=True):
+        for place, operand in enumerate(operands):
+            within = scope
+            if isinstance(node, Temporal):
+                within = _below(node, place, scope, times_ns)
+            elif held and place and operator_of(node) == "->" and scope.any():
+                within = scope & held(operands_of(node)[0])
+            scopes[operand] = within
     return scopes
 
 
@@ -309,15 +322,10 @@ def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
         what = ("decides at ", when, f", where it looks {side} of the log.")
         yield _Idle(identifier, "past the end", what, when.time_ns)
-    elif isinstance(node, Atom | Quantified) and not _compares_exactly(node):
+    elif isinstance(node, Atom | Quantified) and not any(isinstance(e, Equality) for e in iter_parts(node)):
+        # comparing a mode makes it infinite with members in its groups, too
         what = ("decides at ", when, ", where no object is in its group.")
         yield _Idle(identifier, "no members", what, when.time_ns)
-
-
-def _compares_exactly(node: Formula) -> bool:
-    """Return whether a leaf compares a mode, which makes it infinite with members in its groups, too."""
-    atoms = (each for each in iter_formulas(node) if isinstance(each, Atom))
-    return any(isinstance(part, Equality) for atom in atoms for part in iter_expressions(atom.expression))
 
 
 def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Sentence, ...]:
@@ -336,9 +344,9 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
         ):
             (goal,) = node.operands
             if is_spatial(goal):
-                low, _ = evaluate_offline(goal, order, leaves[..., :1], times_ns[:1]).ends(0)
+                low, _ = evaluate_offline(goal, order, leaves[..., :1], times_ns[:1]).interval(0)
                 name = node.name or shortened_formula(format_formula(node))
-                found += [Sentence(f"`{name}` is already true at the first sample.")] if low[0] >= 0.0 else []
+                found += [Sentence(f"`{name}` is already true at the first sample.")] if low >= 0.0 else []
     return tuple(found)
 
 
@@ -361,8 +369,23 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     order = instance.program.leaves
     unknown = _with_unknown_leaves(order, leaves, evidence)
     known = leaves if verdict is Verdict.SATISFIED else unknown
-    low, high = evaluate_untested(instance.formula, order, known, unknown, times_ns)
-    return final_verdict(float(low[0]), float(high[0])) is verdict
+    stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
+
+    def tested(formula: Formula, *, in_antecedent: bool = False) -> Formula:
+        match formula:
+            case Boolean(operator="->", operands=(antecedent, consequent)):
+                known_one = tested(antecedent, in_antecedent=True)
+                return replace(formula, operands=(known_one, tested(consequent, in_antecedent=in_antecedent)))
+            case Boolean() | Temporal():
+                operands = [tested(each, in_antecedent=in_antecedent) for each in formula.operands]
+                return replace(formula, operands=tuple(operands))
+            case Atom() | Quantified() if in_antecedent:
+                return stand_ins[leaf_key(formula)]
+        return formula
+
+    both = joined_channels([unknown, known], axis=1)
+    done = evaluate_offline(tested(instance.formula), (*order, *stand_ins.values()), both, times_ns)
+    return final_verdict(*done.interval(0)) is verdict
 
 
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
@@ -412,19 +435,21 @@ def find_cut_window(
         leaves: (C, A, T), the leaves of the instance's formula.
     """
     instance = evidence.instance
-    nodes = [node for _, _, node in iter_nodes(instance.formula)]
+    nodes = nodes_of(instance.formula)
     if not any(isinstance(node, Temporal) and is_cut(node, times_ns)[-1] for node in nodes):
         return None
     order = instance.program.leaves
     done = evaluate_offline(instance.formula, order, leaves, times_ns)
     whole = evaluate_with_whole_windows(instance.formula, order, leaves, times_ns)
-    own, other = (final_verdict(*(float(end[0]) + 0.0 for end in each.ends(0))) for each in (done, whole))
+    own, other = (final_verdict(*each.interval(0)) for each in (done, whole))
     if own is not verdict or other is verdict:
         return None
-    ranks = _RankedNodes(done, whole, is_violated=verdict is Verdict.VIOLATED)
-    path = deciding_path(instance.formula, ranks, times_ns, 0, End.of(verdict))
+    ranks = _ranked(done, whole, is_violated=verdict is Verdict.VIOLATED)
+    path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
-    step = next((step for step in cut[::-1] if 1.0 in ranks.at(step)), path.steps[0])
+    # 1 and -1 are where a cut window decides
+    decided = [step for step in cut if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}]
+    step = decided[-1] if decided else path.steps[0]
     return _part(_cut(step, nodes[step.node], times_ns, evidence), nodes[step.node], evidence)
 
 
@@ -458,23 +483,12 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
     )
 
 
-class _RankedNodes:
-    """Nodes by verdict instead of by number: decided by whole windows, by cut ones, or not decided.
+def _ranked(done: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> OfflineNodes:
+    """Return nodes by verdict instead of by number: decided by whole windows, by cut ones, or not decided.
 
     Ranks go through minima, maxima and negations as numbers do, so that a path by them leads to a cut window.
     """
-
-    def __init__(self, done: OfflineNodes, whole: UnfinishedNodes, *, is_violated: bool) -> None:
-        self._both = (done, whole)
-        self._is_violated = is_violated
-
-    def ends(self, node: int) -> tuple[Floats, Floats]:
-        """Return the ranks (T,) of both ends of a node: 1 and -1 where a cut window decides."""
-        lows, highs = zip(*(each.ends(node) for each in self._both), strict=True)
-        holds = np.greater if self._is_violated else np.greater_equal
-        return sum(holds(low, 0.0) * 1.0 for low in lows), -sum(holds(-high, 0.0) * 1.0 for high in highs)
-
-    def at(self, step: PathNode) -> tuple[float, float]:
-        """Return how far from undecided both ends of a node are at a sample."""
-        low, high = self.ends(step.node)
-        return float(low[step.sample]), -float(high[step.sample])
+    holds = np.greater if is_violated else np.greater_equal
+    both = [each.columns[[*low_and_high(len(each.columns), wide=True)]] for each in (done, whole)]
+    low = sum(holds(low, 0.0) * 1.0 for low, _ in both)
+    return replace(done, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in both)]))

@@ -15,8 +15,8 @@ from spatial_replay.monitor.causes import Conjunct, conjuncts_of
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.program import Program, compile_formula
 from spatial_replay.monitor.sentences import (
-    amount_text,
     divisor_of,
+    how_text,
     missed_text,
     sentences_of,
     what_was_measured,
@@ -111,12 +111,7 @@ def _settling(atom: DecidingAtom) -> float:
 
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
-    number = _settling(atom)
-    how = "holds" if number >= 0.0 else "fails"
-    if not without_residue(number, atom.atom):
-        how = f"just {how}"
-    elif isfinite(number):
-        how += f" by {amount_text(abs(number), atom.atom, witness.units)}"
+    how = how_text(_settling(atom), atom.atom, witness.units)
     return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 
 

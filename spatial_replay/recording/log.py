@@ -225,9 +225,6 @@ class Recording:
 
     def end(self, end: RunEnd = _WHOLE) -> None:
         """Write what follows the last sample; the certificate is that of a replay of the log."""
-        # loaded like other encoders, with the first message
-        from spatial_replay.annotate.standing import worst_first
-
         ending = self._ending(end)
         if self._samples:
             annotator = self._evaluation.annotator
@@ -236,7 +233,7 @@ class Recording:
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:
-            places = worst_first(self._evaluation.annotator.standing.outcomes)
+            places = self._evaluation.annotator.standing.order
             results = [(self._evaluation.trees[place], streams[place]) for place in places]
             texts = {
                 tree.title: verdict_text(

@@ -17,7 +17,7 @@ from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.spec.walks import units_of, units_text
+from spatial_replay.spec.walks import nodes_of, units_of, units_text
 from spatial_replay.text import Sentence, counted_from, json_fields, json_number, names_of
 
 
@@ -259,8 +259,7 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
         sentences = result.sentences_about(node, causes, first_ns)
     is_whole = node == 0 and not is_open
     sentences += counted_from(result.remarks, first_ns) if is_whole else ()
-    formula = next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
-    if words := units_text(units_of(formula)):
+    if words := units_text(units_of(nodes_of(result.formula)[node])):
         sentences += (Sentence(words),)
     verdict = Verdict.PENDING if is_open else about.verdict
     decided = witness_document(witness, first_ns)

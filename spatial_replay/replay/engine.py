@@ -15,7 +15,6 @@ from spatial_replay import __version__
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.specification import (
-    ReportedTree,
     logged_specifications,
     specification_attachments,
 )
@@ -44,7 +43,7 @@ from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
-from spatial_replay.monitor.vacuity import UntestedPart, no_instances
+from spatial_replay.monitor.vacuity import UntestedPart, idle_templates
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.selection import (
@@ -313,7 +312,12 @@ class Replay:
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
             ),
-            vacuous=idle_templates(self.files, self.trees, options.each, self._names.classes),
+            vacuous=idle_templates(
+                (spec for file in self.files for spec in file.results),
+                (tree.formula for tree in self.trees),
+                options.each,
+                self._names.classes,
+            ),
             certificate={}
             if self._hashes is None
             else self._hashes.certificate(
@@ -363,28 +367,6 @@ def dropped_samples(source: Source) -> Dropped:
         for text in texts
     )
     return Dropped(count, kept + count, ending.get("interrupted") == "true")
-
-
-def idle_templates(
-    files: Sequence[Specification],
-    trees: Sequence[ReportedTree],
-    each: Mapping[str, str],
-    classes: Iterable[str],
-) -> tuple[UntestedPart, ...]:
-    """Return the templates without instances.
-
-    Args:
-        trees: what was evaluated.
-        each: the objects that parameters stand for.
-        classes: of the log.
-    """
-    evaluated = {id(tree.formula) for tree in trees}
-    return tuple(
-        no_instances(spec.name, spec.parameter, each.get(spec.parameter, ""), sorted(classes))
-        for file in files
-        for spec in file.results
-        if spec.parameter is not None and id(spec.formula) not in evaluated
-    )
 
 
 def replayed_specs(

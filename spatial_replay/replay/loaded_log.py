@@ -42,8 +42,9 @@ from spatial_replay.logs.messages import (
 )
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.monitor.vacuity import idle_templates
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.replay.engine import Replayed, dropped_samples, idle_templates, replayed_specs
+from spatial_replay.replay.engine import Replayed, dropped_samples, replayed_specs
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
@@ -455,8 +456,8 @@ class Evaluated:
                 self.evaluation, self.edited.files, self.stretches, self.selection.iter_traces
             ),
             vacuous=idle_templates(
-                self.edited.files,
-                self.evaluation.trees,
+                (spec for file in self.edited.files for spec in file.results),
+                (tree.formula for tree in self.evaluation.trees),
                 loaded.options.each,
                 [each for each in loaded.inside.classes if each],
             ),

@@ -126,8 +126,7 @@ def rate_of(signal: Signal) -> Rate:
 
 def has_rate(formula: Formula) -> bool:
     """Return whether a formula is about rates of change."""
-    atoms = (each for each in iter_formulas(formula) if isinstance(each, Atom))
-    return any(isinstance(part, Rate) for atom in atoms for part in iter_expressions(atom.expression))
+    return any(isinstance(part, Rate) for part in iter_parts(formula))
 
 
 def change_of(rate: Rate) -> Sum | SignedDistance:
@@ -172,11 +171,37 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
                 stack.append(current.body)
 
 
+def iter_bound(formula: Formula) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
+    """Yield a formula and all within it, as `iter_formulas`, with the quantifiers around, outermost first."""
+    stack: list[tuple[Formula, tuple[Quantified, ...]]] = [(formula, ())]
+    while stack:
+        node, around = stack.pop()
+        yield node, around
+        if isinstance(node, Quantified):
+            stack.append((node.body, (*around, node)))
+        stack += [(each, around) for each in reversed(operands_of(node))]
+
+
+def iter_atoms(formula: Formula) -> Iterator[Atom]:
+    """Yield the atoms of a formula, those in quantifiers included, in the order of the text."""
+    return (each for each in iter_formulas(formula) if isinstance(each, Atom))
+
+
+def iter_parts(formula: Formula) -> Iterator[Expression]:
+    """Yield every expression within the atoms of a formula."""
+    return (part for atom in iter_atoms(formula) for part in iter_expressions(atom.expression))
+
+
 def leaf_key(leaf: Formula) -> tuple[object, ...]:
     """Return what equal leaves have in common, wherever they stand in the text."""
     if isinstance(leaf, Quantified):
         return leaf.quantifier, leaf.variables, leaf.group, leaf.body
     return (leaf.expression,) if isinstance(leaf, Atom) else (leaf,)
+
+
+def nodes_of(formula: Formula) -> list[Formula]:
+    """Return every node of a tree, by id."""
+    return [node for _, _, node in iter_nodes(formula)]
 
 
 def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
@@ -397,9 +422,8 @@ def units_of(formula: Formula) -> tuple[Unit, ...]:
     comparable, unless each of them is scaled: see `is_mixed`.
     """
     found: dict[Unit, None] = {}
-    for each in iter_formulas(formula):
-        if isinstance(each, Atom):
-            found.update(dict.fromkeys(_units(each.expression)))
+    for each in iter_atoms(formula):
+        found.update(dict.fromkeys(_units(each.expression)))
     return tuple(found)
 
 

@@ -12,11 +12,11 @@ import spatial_replay as sr
 from examples import examples
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
 from spatial_replay import Specification
+from spatial_replay.monitor.offline import evaluate_unfinished
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.witness.path import End, deciding_path
-from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.format import format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
@@ -93,7 +93,7 @@ def test_what_settled_a_violation_has_the_number_of_that_moment(formula, run):
             continue
         count = int(settled[0]) + 1
         done = evaluate_unfinished(formula, program.leaves, leaves[:, :, :count], times[:count])
-        path = deciding_path(formula, done, times[:count], node, End.HIGH, goes_on=True)
+        path = deciding_path(done, node, End.HIGH)
         low, high = done.ends(path.steps[-1].node)
         number = (high if path.end is End.HIGH else -low)[path.steps[-1].sample]
         assert number == upper[node, count - 1]

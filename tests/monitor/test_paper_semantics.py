@@ -243,7 +243,9 @@ def test_too_many_pairs_of_samples_are_refused():
     p, q = (Atom(name, "signal", Signal(name)) for name in "pq")
     formula = Temporal("G", (Temporal("U", (Temporal("F", (p,)), Temporal("G", (q,)))),))
     run = PaperRun(formula, (p, q), max_pairs=10)
-    leaves = np.zeros((1, 2, 5))
-    run.extend(leaves, np.arange(5))
-    with pytest.raises(UsageError, match="after 5 samples, an until of two temporal operands"):
-        run.extend(leaves, np.arange(5, 10))
+    leaves = np.zeros((1, 2, 4))
+    run.extend(leaves, np.arange(4))
+    with pytest.raises(UsageError, match="over 8 samples, an until of two temporal operands"):
+        run.extend(leaves, np.arange(4, 8))
+    with pytest.raises(UsageError, match="over 50,000 samples"):
+        PaperRun(formula, (p, q)).extend(np.zeros((1, 2, 50_000)), np.arange(50_000))

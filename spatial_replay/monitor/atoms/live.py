@@ -83,15 +83,14 @@ class PlanArrays(NamedTuple):
         region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
             parts of each, vertices of each part, radius of each part, x and y of all vertices,
             (bottom, top) of each.
-        operand_start, operand_rows, operand_classes: rows of each operand, and the class that each must have.
+        listed_start, listed_rows, listed_classes: rows of each operand, then of each closest pair's group,
+            and the class that each row must have. After them come the rows needed for each binding, and those
+            without which each measurement is unknown.
         enlargement: of each operand.
         geometric: numbers of the measurements between footprints, with their `quantity` and operands
             `first` and `second` (-1: none).
         yaws: (Y, 3), the number of each measurement between orientations, and its two rows.
-        required_start, required: the rows without which each measurement is unknown.
-        closest_start, closest_rows, closest_classes, closest_enlargement: the rows of each closest pair's
-            group, the class that each must have, and the enlargement of both.
-        member_start, member_rows, member_classes: the rows that must be there for each binding, and classes.
+        closest_enlargement: of both in each closest pair.
         is_group: for each binding, 1 where it stands for a group itself: not known without its row.
         code, constants, outputs: what `run_instructions` takes.
     """
@@ -102,24 +101,16 @@ class PlanArrays(NamedTuple):
     region_radius: Floats
     region_vertices: Floats
     region_heights: Floats
-    operand_start: Integers
-    operand_rows: Integers
-    operand_classes: Integers
+    listed_start: Integers
+    listed_rows: Integers
+    listed_classes: Integers
     enlargement: Floats
     geometric: Integers
     quantity: Integers
     first: Integers
     second: Integers
     yaws: Integers
-    required_start: Integers
-    required: Integers
-    closest_start: Integers
-    closest_rows: Integers
-    closest_classes: Integers
     closest_enlargement: Floats
-    member_start: Integers
-    member_rows: Integers
-    member_classes: Integers
     is_group: Integers
     code: Integers
     constants: Floats
@@ -165,28 +156,20 @@ def plan_at(whole: Integers, real: Floats) -> PlanArrays:
         region_radius=real[whole[6] : whole[7]],
         region_vertices=real[whole[8] : whole[9]],
         region_heights=real[whole[10] : whole[11]].reshape((-1, 2)),
-        operand_start=whole[whole[12] : whole[13]],
-        operand_rows=whole[whole[14] : whole[15]],
-        operand_classes=whole[whole[16] : whole[17]],
+        listed_start=whole[whole[12] : whole[13]],
+        listed_rows=whole[whole[14] : whole[15]],
+        listed_classes=whole[whole[16] : whole[17]],
         enlargement=real[whole[18] : whole[19]],
         geometric=whole[whole[20] : whole[21]],
         quantity=whole[whole[22] : whole[23]],
         first=whole[whole[24] : whole[25]],
         second=whole[whole[26] : whole[27]],
         yaws=whole[whole[28] : whole[29]].reshape((-1, 3)),
-        required_start=whole[whole[30] : whole[31]],
-        required=whole[whole[32] : whole[33]],
-        closest_start=whole[whole[34] : whole[35]],
-        closest_rows=whole[whole[36] : whole[37]],
-        closest_classes=whole[whole[38] : whole[39]],
-        closest_enlargement=real[whole[40] : whole[41]],
-        member_start=whole[whole[42] : whole[43]],
-        member_rows=whole[whole[44] : whole[45]],
-        member_classes=whole[whole[46] : whole[47]],
-        is_group=whole[whole[48] : whole[49]],
-        code=whole[whole[50] : whole[51]].reshape((-1, 4)),
-        constants=real[whole[52] : whole[53]],
-        outputs=whole[whole[54] : whole[55]],
+        closest_enlargement=real[whole[30] : whole[31]],
+        is_group=whole[whole[32] : whole[33]],
+        code=whole[whole[34] : whole[35]].reshape((-1, 4)),
+        constants=real[whole[36] : whole[37]],
+        outputs=whole[whole[38] : whole[39]],
     )
 
 
@@ -301,17 +284,17 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
     if len(values) == 0:  # signals alone
         return
-    operands = len(plan.operand_start) - 1
+    operands, required = len(plan.enlargement), len(plan.listed_start) - 1 - len(values)
     of_operands, measured = np.empty(operands + 1), np.empty((len(plan.geometric), 1))
-    room = np.empty(2 * operands + 1 + len(plan.operand_rows), np.int64)
+    room = np.empty(2 * operands + 1 + plan.listed_start[operands], np.int64)
     widths, hidden, members = room[:operands], room[operands : 2 * operands + 1], room[2 * operands + 1 :]
     of_operands[operands], hidden[operands] = 0.0, 0  # for no operand, -1
     for operand in range(operands):
-        begin, end = plan.operand_start[operand], plan.operand_start[operand + 1]
+        begin, end = plan.listed_start[operand], plan.listed_start[operand + 1]
         widths[operand], hidden[operand], spread = end - begin, 0, 0.0
         for k in range(begin, end):
-            row, members[k] = plan.operand_rows[k], ABSENT
-            if not _is_there(rows.classes, row, plan.operand_classes[k]):
+            row, members[k] = plan.listed_rows[k], ABSENT
+            if not _is_there(rows.classes, row, plan.listed_classes[k]):
                 continue
             if _is_hidden(plan, rows, row):
                 hidden[operand] = 1
@@ -323,7 +306,7 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
     for sample in range(1):
         measure_rows(
             rows.part_start, rows.vertex_start, rows.vertices, rows.radius, rows.bottom, rows.top,
-            members, plan.operand_start, widths, plan.enlargement, plan.quantity, plan.first, plan.second,
+            members, plan.listed_start, widths, plan.enlargement, plan.quantity, plan.first, plan.second,
             rows.edges, measured, sample, sample + 1,
         )  # fmt: skip
     for g in range(len(plan.geometric)):
@@ -334,8 +317,8 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
         k, a, b = plan.yaws[y, 0], plan.yaws[y, 1], plan.yaws[y, 2]
         values[k, 0], spreads[k, 0] = misalignment_of(rows.yaw[a], rows.yaw[b]), 0.0
     for k in range(len(values)):
-        for at in range(plan.required_start[k], plan.required_start[k + 1]):
-            if rows.classes[plan.required[at]] == ABSENT:
+        for at in range(plan.listed_start[required + k], plan.listed_start[required + k + 1]):
+            if rows.classes[plan.listed_rows[at]] == ABSENT:
                 values[k, 0] = np.nan
 
 
@@ -344,14 +327,14 @@ def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
     """Fill `closest` (K, 4, 1), as `measurements.leaf_values` computes it."""
     if len(closest) == 0:
         return
-    found = np.empty((1, 3))
+    found, operands = np.empty((1, 3)), len(plan.enlargement)
     for k in range(len(closest)):
-        begin, end = plan.closest_start[k], plan.closest_start[k + 1]
+        begin, end = plan.listed_start[operands + k], plan.listed_start[operands + k + 1]
         members = np.empty((1, end - begin), np.int64)
         there = hidden = 0
         for m in range(begin, end):
-            row, members[0, m - begin] = plan.closest_rows[m], ABSENT
-            if not _is_there(rows.classes, row, plan.closest_classes[m]):
+            row, members[0, m - begin] = plan.listed_rows[m], ABSENT
+            if not _is_there(rows.classes, row, plan.listed_classes[m]):
                 continue
             there += 1
             if _is_hidden(plan, rows, row):
@@ -380,10 +363,11 @@ def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
 @inlined
 def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
     """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
+    first = len(plan.enlargement) + len(plan.closest_enlargement)
     for m in range(len(members)):
         members[m, 0] = 0 if plan.is_group[m] else 1
-        for k in range(plan.member_start[m], plan.member_start[m + 1]):
-            if not _is_there(classes, plan.member_rows[k], plan.member_classes[k]):
+        for k in range(plan.listed_start[first + m], plan.listed_start[first + m + 1]):
+            if not _is_there(classes, plan.listed_rows[k], plan.listed_classes[k]):
                 members[m, 0] = -1 if plan.is_group[m] else 0
 
 
@@ -430,7 +414,7 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats
         C, in how many channels they are.
     """
     plan = plan_at(whole, real)
-    rows, count = _rows_of_sample(plan, sample), len(plan.required_start) - 1
+    rows, count = _rows_of_sample(plan, sample), len(plan.geometric) + len(plan.yaws)
     members = np.empty((len(plan.is_group), 1), np.int8)
     _members(plan, rows.classes, members)
     results, closest = np.empty((2, count, 1)), np.empty((len(plan.closest_enlargement), 4, 1))
@@ -537,13 +521,13 @@ class PlanRows:
             return [Row(self._place(sample, name, is_point), wanted) for name in self.candidates(base)]
         return [Row(self._place(sample, name, is_point)) for name in named_members(base)]
 
-    def required(self, term: Term) -> list[int]:
+    def required(self, term: Term) -> list[Row]:
         """Return the rows, its sample's among them, without which a term is unknown."""
         then, base = standing(term), base_of(term)
-        sample = [self._sample_of(then)] if isinstance(then, Earlier) else []
+        sample = [Row(self._sample_of(then))] if isinstance(then, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
             return sample
-        return sample + [each.row for each in self.of_term(term)]
+        return sample + self.of_term(term)
 
     def _sample_of(self, term: Term) -> int:
         return self._sample[Delay.of(term) if isinstance(term, Earlier) else NO_DELAY]
@@ -654,12 +638,10 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         for k, each in enumerate(measurements)
         if isinstance(each, Misalignment)
     ]
-    operand_rows = [rows.of_term(term) for term in operands]
-    required = [
-        [row for term in measured_terms(each) for row in rows.required(term)] for each in measurements
-    ]
-    closest = [rows.of_term(each.group) for each in code.closest]
-    members = [rows.of_membership(each) for each in code.members]
+    listed = [rows.of_term(term) for term in operands]
+    listed += [rows.of_term(each.group) for each in code.closest]
+    listed += [rows.of_membership(each) for each in code.members]
+    listed += [[row for term in measured_terms(each) for row in rows.required(term)] for each in measurements]
     regions = FootprintBatch.from_footprints(
         [each.footprint for each in frame.regions.values()], [each.height for each in frame.regions.values()]
     )
@@ -678,24 +660,16 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         region_radius=regions.radius.copy(),
         region_vertices=regions.vertices.ravel(),
         region_heights=np.stack((regions.bottom, regions.top), axis=1),
-        operand_start=_starts(operand_rows),
-        operand_rows=_whole(each.row for among in operand_rows for each in among),
-        operand_classes=_whole(each.class_code for among in operand_rows for each in among),
+        listed_start=starts_from_counts(list(map(len, listed))),
+        listed_rows=_whole(each.row for among in listed for each in among),
+        listed_classes=_whole(each.class_code for among in listed for each in among),
         enlargement=np.array([_enlargement(term) for term in operands], np.float64),
         geometric=_whole(geometric),
         quantity=_whole(QUANTITY_CODES[quantity_of(measurements[k])] for k in geometric),
         first=_whole(pair[0] for pair in pairs),
         second=_whole(pair[1] if len(pair) > 1 else ABSENT for pair in pairs),
         yaws=np.array(yaws, np.int64).reshape(len(yaws), 3),
-        required_start=_starts(required),
-        required=_whole(row for among in required for row in among),
-        closest_start=_starts(closest),
-        closest_rows=_whole(each.row for among in closest for each in among),
-        closest_classes=_whole(each.class_code for among in closest for each in among),
         closest_enlargement=np.array([each.enlargement for each in code.closest], np.float64),
-        member_start=_starts(members),
-        member_rows=_whole(each.row for among in members for each in among),
-        member_classes=_whole(each.class_code for among in members for each in among),
         is_group=_whole(not each.chosen for each in code.members),
         code=np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
         constants=np.array(list(code.constants), np.float64),
@@ -705,10 +679,6 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
 
 def _whole(numbers: Iterable[int]) -> Integers:
     return np.array(list(numbers), np.int64)
-
-
-def _starts(among: Sequence[Sequence[object]]) -> Integers:
-    return starts_from_counts([len(each) for each in among])
 
 
 def _enlargement(term: Term) -> float:

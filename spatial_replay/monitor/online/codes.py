@@ -38,8 +38,7 @@ AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finis
 NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number, in its part, of a window or shift in seconds, -1 for none
-NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
-NODE_WIDTH = 13  # a part's own row is longer than those of its nodes
+NODE_WIDTH = 12  # a part's own row is longer than those of its nodes
 # codes of parts' nodes
 LITERAL = 0  # signal a
 PART_AND, PART_OR = 2, 3
@@ -62,13 +61,10 @@ PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, P
 # ended, since what may still come outdoes all that is open; eight bits higher up, which do even once it has
 PART_KNOWN = 7
 EVEN_IF_OVER = 1 << 8
-# whether the bound that is not known at once is the value but for positions where a window is open that
-# cuts it
-PART_IS_CUT = 8
 # the unit, and how far from the first sample on the root joins what its operand is; -1 if it never ends
-PART_END_UNIT, PART_ENDS_AT = 9, 10
-PART_HAS_NOW = 11  # whether it says what it is at the newest sample, too
-PART_IS_MONOTONE = 12  # whether what the root joins by the minimum never falls, or the other way round
+PART_END_UNIT, PART_ENDS_AT = 8, 9
+PART_HAS_NOW = 10  # whether it says what it is at the newest sample, too
+PART_IS_MONOTONE = 11  # whether what the root joins by the minimum never falls, or the other way round
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `tables`, `windows`
 

@@ -54,30 +54,25 @@ class _Direction(NamedTuple):
 
     Attributes:
         either, both: the nodes that are as great as the greater, and as the smaller one of their operands.
-        window, until: those that are great once their operand is.
+        until: those that are great once their operand is.
         release: those that are great as long as it is.
         worst, best: the bounds of the smallest, and of the greatest continuation.
-        weak: what `NODE_WEAK` is where what is still to come counts as small.
     """
 
     either: int
     both: int
-    window: int
     until: int
     release: int
     worst: int
     best: int
-    weak: int
 
 
 _BY_MINIMUM = _Direction(
-    codes.PART_OR, codes.PART_AND, codes.PART_WINDOW_MAX, codes.UNTIL, codes.RELEASE, codes.OPEN_LOW,
-    codes.OPEN_HIGH, 0,
-)  # fmt: skip
+    codes.PART_OR, codes.PART_AND, codes.UNTIL, codes.RELEASE, codes.OPEN_LOW, codes.OPEN_HIGH
+)
 _BY_MAXIMUM = _Direction(
-    codes.PART_AND, codes.PART_OR, codes.PART_WINDOW_MIN, codes.RELEASE, codes.UNTIL, codes.OPEN_HIGH,
-    codes.OPEN_LOW, 1,
-)  # fmt: skip
+    codes.PART_AND, codes.PART_OR, codes.RELEASE, codes.UNTIL, codes.OPEN_HIGH, codes.OPEN_LOW
+)
 _DIRECTIONS: Mapping[int, _Direction] = MappingProxyType(
     {codes.RELEASE: _BY_MINIMUM, codes.UNTIL: _BY_MAXIMUM}
 )
@@ -131,35 +126,6 @@ def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
     if all(outdone[node] for node in variables):
         known |= (1 | codes.EVEN_IF_OVER) << way.best
     return known
-
-
-def cutting_windows(rows: tuple[Row, ...]) -> set[int] | None:
-    """Return the windows that are the greatest while they are open, of a root that joins by the minimum.
-
-    Where one is open, what it stands in is no bound; anywhere else, the best that may come is what counts for
-    the value, too. The same upside down. None where other nodes make a difference between the two.
-    """
-    code, left, body, *_ = rows[-1]
-    way = _DIRECTIONS.get(code)
-    if way is None or left != NOTHING:
-        return None
-    differs: list[bool] = []
-    for own, a, b, weak, *_ in rows[: body + 1]:
-        operands = {codes.LITERAL: (), way.either: (a, b), way.both: (a, b)}.get(own, (a,))
-        is_free = own in (codes.LITERAL, way.either, way.both, *codes.AHEAD_OF)
-        is_open = own == way.window or (own == codes.SHIFT and weak == way.weak)
-        differs.append(not is_free or is_open or any(differs[each] for each in operands))
-    found, waiting = set[int](), [body]
-    while waiting:
-        row = waiting.pop()
-        own, a, b, *_ = rows[row]
-        if own == way.either:
-            waiting += (a, b)
-        elif own == way.window and not differs[a]:
-            found.add(row)
-        elif differs[row]:
-            return None
-    return found
 
 
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
@@ -304,7 +270,6 @@ class _Parts:
             part.end_corner,
             self.table_size,
             known_bounds(nodes, is_bounded=end != NEVER),
-            int(cutting_windows(nodes) is not None),
             *end,
             int(has_now),
             int(is_monotone(nodes)),
@@ -318,12 +283,12 @@ class _Parts:
 
 
 def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
-    """Yield rows with the numbers of their windows in seconds, and what is known of these windows."""
-    timed, cutting = 0, cutting_windows(nodes) or set()
-    for number, row in enumerate(nodes):
+    """Yield rows with the numbers of their windows in seconds."""
+    timed = 0
+    for row in nodes:
         code, unit = row[codes.NODE_CODE], row[codes.NODE_UNIT]
         is_timed = unit != codes.SAMPLES and code in (*codes.AHEAD_OF, *codes.PAST_WINDOWS, codes.PAST_DELAY)
-        yield (*row, timed if is_timed else NOTHING, int(number in cutting))
+        yield (*row, timed if is_timed else NOTHING)
         timed += is_timed
 
 

@@ -509,21 +509,15 @@ def _joined(
 
 @inlined
 def _at_first(
-    rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, own_set: int, end: int,
-    last: int,
-) -> float:  # fmt: skip
-    """Return what the root is at the first sample, by the columns of a set.
-
-    Args:
-        mode: what lies beyond the last sample.
-        end: what comes after the positions that the root joins.
-    """
+    rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, last: int
+) -> float:
+    """Return what the root is at the first sample, by the columns of a set."""
     nodes, base = len(rows) - 1, state[HEAD, BASE]
-    first, root = own_set * nodes, nodes - 1
+    first, root = mode * nodes, nodes - 1
     value = beyond(mode, rows[root, codes.NODE_WEAK])
     if not has_column(rows):
         is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, first + rows[root, codes.NODE_B]
-        value = _joined(is_until, columns, body, EXTRA * nodes + JOINED + own_set, value, base, end)
+        value = _joined(is_until, columns, body, EXTRA * nodes + JOINED + mode, value, base, last + 1)
     elif base <= last:
         value = columns[first + root, base]
     if state[HEAD, IS_BEGUN]:
@@ -542,17 +536,6 @@ def _is_known(rows: Integers, stamps: Integers, state: Integers, mode: int, last
     is_free = known & codes.EVEN_IF_OVER > 0 or not _is_over(rows, stamps, state, last)
     is_constant = state[HEAD, IS_BEGUN] > 0 and rows[part, codes.PART_VARIABLES] == 0
     return bool(is_constant or (known & 1 > 0 and is_free))
-
-
-@inlined
-def _end_of_uncut(rows: Integers, stamps: Integers, state: Integers, last: int) -> int:
-    """Return the first position where a window is open that cuts a bound short."""
-    end = last + 1
-    for d in range(len(rows) - 1):
-        if rows[d, codes.NODE_CUTS]:
-            end = min(end, _first_unclosed(state, stamps, window_of(rows, d), last))
-    first: int = max(end, state[HEAD, BASE])
-    return first
 
 
 @inlined
@@ -601,16 +584,12 @@ def run_windows(
                 corner = 0 if mode == codes.OPEN_LOW else corners - 1
                 columns[into, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
                 continue
-            own_set, end = mode, last + 1
-            if rows[nodes, codes.PART_IS_CUT] and mode == (codes.OPEN_LOW if is_until else codes.OPEN_HIGH):
-                own_set, end = codes.OPEN_END, _end_of_uncut(rows, stamps, state, last)
-            else:
-                is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
-                state[HEAD, KNOWN + mode] = last
-                if is_fresh:
-                    find_lows(rows, state, stamps, last)
-                _bring_up(rows, history, stamps, columns, state, tables, mode, last, is_fresh)
-            columns[into, k] = _at_first(rows, columns, state, tables, mode, own_set, end, last)
+            is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
+            state[HEAD, KNOWN + mode] = last
+            if is_fresh:
+                find_lows(rows, state, stamps, last)
+            _bring_up(rows, history, stamps, columns, state, tables, mode, last, is_fresh)
+            columns[into, k] = _at_first(rows, columns, state, tables, mode, last)
         if has_now and has_column(rows):
             columns[says + SAID_NOW, k] = columns[root, last]
         elif has_now:

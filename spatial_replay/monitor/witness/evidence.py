@@ -16,8 +16,8 @@ from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import joined_channels
-from spatial_replay.spec.formula import Atom, Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
-from spatial_replay.spec.walks import base_of, iter_formulas, logged_signals, named_members, substitute
+from spatial_replay.spec.formula import Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
+from spatial_replay.spec.walks import base_of, iter_atoms, logged_signals, named_members, substitute
 from spatial_replay.trace.trace import Trace, window_of
 
 
@@ -169,7 +169,7 @@ class NamedPart(NamedTuple):
 
 def named_parts(formula: Formula) -> list[NamedPart]:
     """Return the signals and objects that a formula names, each once."""
-    atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
+    atoms = list(iter_atoms(formula))
     found = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
     terms = [term for atom in atoms for term in atom.terms]
     found += [NamedPart(name, False) for term in terms for name in _object_names(base_of(term))]

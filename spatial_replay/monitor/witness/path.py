@@ -10,14 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
-from typing import Protocol, TypeVar
+from types import MappingProxyType
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import OfflineNodes
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.atoms.terms import Bindings
+from spatial_replay.monitor.offline import OfflineNodes, is_closed, windows_of
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, is_closed, windows_of
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Boolean,
@@ -25,11 +26,10 @@ from spatial_replay.spec.formula import (
     Formula,
     Temporal,
     Truth,
-    iter_nodes,
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import nodes_with_operands
+from spatial_replay.spec.walks import substitute
 from spatial_replay.text import shortened_formula
 
 _Number = TypeVar("_Number")
@@ -76,8 +76,7 @@ class SignedOperand:
     negated: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Extremum:
+class Extremum(NamedTuple):
     """A minimum or a maximum of operands or of other extrema."""
 
     is_minimum: bool
@@ -128,8 +127,7 @@ def _interval(part: SignedOperand | Extremum, interval: Callable[[int], Interval
     return (min(lows), min(highs)) if part.is_minimum else (max(lows), max(highs))
 
 
-@dataclass(frozen=True, slots=True)
-class PathNode:
+class PathNode(NamedTuple):
     """A node at a sample on a deciding path.
 
     Attributes:
@@ -141,8 +139,7 @@ class PathNode:
     sample: int
 
 
-@dataclass(frozen=True, slots=True)
-class DecidingPath:
+class DecidingPath(NamedTuple):
     """The path down from a node.
 
     Attributes:
@@ -155,70 +152,41 @@ class DecidingPath:
     end: End
 
 
-class NodeEnds(Protocol):
-    """Every node at every sample."""
-
-    def ends(self, node: int) -> tuple[Floats, Floats]:
-        """Return the ends (T,) of a node's interval at each sample."""
-        ...
-
-
-def deciding_path(
-    formula: Formula,
-    done: NodeEnds,
-    times_ns: Integers,
-    node: int,
-    end: End,
-    *,
-    goes_on: bool = False,
-    sample: int = 0,
-) -> DecidingPath:
+def deciding_path(done: OfflineNodes, node: int, end: End, *, sample: int = 0) -> DecidingPath:
     """Return the path to what decides a node at a sample.
 
     Ties go to the operand that leads to the earliest sample, then to the first operand; in a window, to the
     earliest sample.
-
-    Args:
-        done: every node at every sample of `times_ns` (T,).
-        goes_on: whether samples may follow; `done` is then that of `evaluate_unfinished`.
     """
-    return _Walk(formula, done, times_ns, goes_on=goes_on).follow(node, sample, end)
+    return _Walk(done).follow(node, sample, end)
 
 
 class _Walk:
     """The tree of a formula with every node's numbers."""
 
-    def __init__(self, formula: Formula, done: NodeEnds, times_ns: Integers, *, goes_on: bool) -> None:
+    def __init__(self, done: OfflineNodes) -> None:
         self._done = done
-        self._times = times_ns
-        self._goes_on = goes_on
-        tree = nodes_with_operands(formula)
-        self._nodes, self._operands = [each for each, _ in tree], [operands for _, operands in tree]
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
         """Return the path from a node at a sample."""
-        here = PathNode(node, sample)
-        match self._nodes[node]:
-            case Boolean() as boolean:
-                extremum = extremum_of(boolean.operator, self._operands[node])
+        here, (formula, operands) = PathNode(node, sample), self._done.tree[node]
+        match formula:
+            case Boolean():
+                extremum = extremum_of(formula.operator, operands)
                 paths = [
                     self.follow(operand.index, sample, end.turned if operand.negated else end)
-                    for operand in chosen(extremum, end, lambda index: self._interval(index, sample))
+                    for operand in chosen(extremum, end, lambda index: self._done.interval(index, sample))
                 ]
                 below = min(paths, key=lambda path: path.steps[-1].sample)
-            case Temporal() as temporal:
-                lasting = self._lasting(node, sample, end) if self._goes_on else None
-                taken = lasting or self._taken(temporal, self._operands[node], sample, end)
+            case Temporal():
+                lasting = self._lasting(node, sample, end) if self._done.goes_on else None
+                taken = lasting or self._taken(formula, operands, sample, end)
                 if taken is None:
                     return DecidingPath((here,), end)
                 below = self.follow(taken.node, taken.sample, end)
             case _:
                 return DecidingPath((here,), end)
         return DecidingPath((here, *below.steps), below.end)
-
-    def _interval(self, node: int, sample: int) -> Interval:
-        low, high = self._done.ends(node)
-        return float(low[sample]), float(high[sample])
 
     def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
         low, high = (column[samples] for column in self._done.ends(operand.index))
@@ -251,20 +219,20 @@ class _Walk:
 
         None if the samples so far decide the until.
         """
-        formula, left = self._nodes[node], SignedOperand(self._operands[node][0])
+        formula, operands = self._done.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
             return None
-        low, high = self._interval(node, sample)
+        left, (low, high) = SignedOperand(operands[0]), self._done.interval(node, sample)
         if formula.operator == "R":
             left, end, high = SignedOperand(left.index, True), end.turned, -low
-        if end is End.LOW or is_closed(formula.bound, self._times)[sample]:
+        if end is End.LOW or is_closed(formula.bound, self._done.times_ns)[sample]:
             return None
         lasting = self._ends(left, slice(sample, None))[1]
         return PathNode(left.index, sample + int(np.argmin(lasting))) if lasting.min() == high else None
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples that an operator looks at."""
-        begin, end = windows_of(formula, self._times)
+        begin, end = windows_of(formula, self._done.times_ns)
         return range(int(begin[sample]), int(end[sample]))
 
     def _extreme(self, operand: SignedOperand, window: range, end: End, *, is_minimum: bool) -> PathNode:
@@ -328,15 +296,12 @@ class MissedResponse:
         condition, response: their names, or their texts, shortened.
         time_ns: of the sample at which the condition held.
         is_condition: whether the deciding atom is in the condition.
-        node, sample: the id of the response, and the index of the sample at which it should have held.
     """
 
     condition: str
     response: str
     time_ns: int
     is_condition: bool
-    node: int
-    sample: int
 
 
 def short_title(formula: Formula) -> str:
@@ -345,20 +310,20 @@ def short_title(formula: Formula) -> str:
 
 
 def missed_response(
-    path: DecidingPath, nodes: Sequence[Formula], done: OfflineNodes | UnfinishedNodes, times_ns: Integers
-) -> MissedResponse | None:
-    """Return the outermost implication on the path to what violates a formula that failed, if there is one.
+    path: DecidingPath, done: OfflineNodes, bindings: Bindings = MappingProxyType({})
+) -> tuple[MissedResponse | None, DecidingPath | None]:
+    """Return the outermost implication that failed on the path to what violates a formula, if there is one.
+
+    If its condition decided, the path to what came closest to fulfilling its response comes with it.
 
     Args:
-        nodes: every node of the formula, by id.
+        bindings: the objects that variables stand for.
     """
     for step, below in pairwise(path.steps):
-        node = nodes[step.node]
+        node, operands = done.tree[step.node]
         if operator_of(node) == "->" and done.ends(step.node)[1][step.sample] < 0.0:
-            condition, response = map(short_title, operands_of(node))
-            # nodes are numbered in the order of the text
-            first = step.node + 1
-            after = first + sum(1 for _ in iter_nodes(operands_of(node)[0]))
-            time_ns, is_condition = int(times_ns[step.sample]), below.node == first
-            return MissedResponse(condition, response, time_ns, is_condition, after, step.sample)
-    return None
+            condition, response = (short_title(substitute(each, bindings)) for each in operands_of(node))
+            time_ns, is_condition = int(done.times_ns[step.sample]), below.node == operands[0]
+            closest = deciding_path(done, operands[1], End.HIGH, sample=step.sample) if is_condition else None
+            return MissedResponse(condition, response, time_ns, is_condition), closest
+    return None, None

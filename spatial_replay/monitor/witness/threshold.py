@@ -13,13 +13,12 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import evaluate_offline, new_leaves
+from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished, new_leaves
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import End
-from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -41,14 +40,15 @@ from spatial_replay.spec.formula import (
     Sum,
     Temporal,
     Term,
-    iter_nodes,
 )
 from spatial_replay.spec.walks import (
+    iter_atoms,
     iter_expressions,
     iter_formulas,
     leaf_key,
     map_leaves,
     map_terms,
+    nodes_of,
     operand_signs,
     rewritten,
 )
@@ -91,7 +91,7 @@ class Dial:
         if not isinstance(self.value, NamedNumber) or not self.value.is_plain:
             return None
         (constant,) = self.value.constants
-        used = [number for atom in _atoms_of(formula) for number in _numbers(atom.expression)]
+        used = [number for atom in iter_atoms(formula) for number in _numbers(atom.expression)]
         is_entangled = any(
             constant in number.constants and not number.is_plain
             for number in used
@@ -290,7 +290,7 @@ class _Search:
         self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
         self._leaves, self._times, self._node = leaves, times_ns, node
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
-        atoms = filter(self._is_meant, _atoms_of(self._formula))
+        atoms = filter(self._is_meant, iter_atoms(self._formula))
         slopes = {each.expression: dial.slopes(each.expression) for each in atoms}
         # from the formula: equal leaves share the place of the first, wherever it was written
         self._moving: dict[int, Atom | Quantified] = {}
@@ -304,21 +304,20 @@ class _Search:
         self._is_uniform = (
             all(len(each) == 1 for each in slopes.values())
             and not any(
-                self._is_meant(atom) for body in bodies if not _bare(body) for atom in _atoms_of(body)
+                self._is_meant(atom) for body in bodies if not _bare(body) for atom in iter_atoms(body)
             )
             and not any(dial.is_at("radius", radius) for each in slopes for radius in _radii_in(each))
         )
-        whole = next(each for identifier, _, each in iter_nodes(self._formula) if identifier == node)
         signs = {
             math.copysign(1.0, sign * slope)
-            for atom, sign in _signed_atoms(whole)
+            for atom, sign in _signed_atoms(nodes_of(self._formula)[node])
             if self._is_meant(atom)
             for slope in slopes[atom.expression]
             if slope
         }
         self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
-        low, high = self._evaluate(self._formula, self._order, leaves, times_ns).ends(node)
-        end = abs(float(high[0] if verdict is Verdict.VIOLATED else low[0]))
+        low, high = self._evaluate(self._formula, self._order, leaves, times_ns).interval(node)
+        end = abs(high if verdict is Verdict.VIOLATED else low)
         steepest = max((abs(slope) for each in slopes.values() for slope in each), default=0.0)
         # robustness changes by at most the slope
         self._least = end / steepest if steepest and math.isfinite(end) else 0.0
@@ -470,12 +469,7 @@ class _Search:
     def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
         leaves = joined_channels([self._leaves, columns], axis=1)
         done = self._evaluate(formula, (*self._order, *added), leaves, self._times)
-        low, high = done.ends(self._node)
-        return self._verdict_of(float(low[0]), float(high[0]))
-
-
-def _atoms_of(formula: Formula) -> Iterator[Atom]:
-    return (each for each in iter_formulas(formula) if isinstance(each, Atom))
+        return self._verdict_of(*done.interval(self._node))
 
 
 def _bare(formula: Formula) -> tuple[Atom, int] | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.offline import evaluate_offline
+from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom, failed_implication
 from spatial_replay.monitor.witness.evidence import Evidence, Gap
@@ -21,9 +21,8 @@ from spatial_replay.monitor.witness.path import (
     short_title,
 )
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
-from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of
+from spatial_replay.spec.formula import Atom, Formula, Quantified, operator_of
 from spatial_replay.spec.walks import declared_unit
 
 
@@ -137,22 +136,20 @@ def find_witness(
         (evaluate_unfinished, online_verdict) if goes_on else (evaluate_offline, final_verdict)
     )
     done = evaluate(instance.formula, instance.program.leaves, leaves, times_ns)
-    lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
+    lower, upper = done.interval(node)
     verdict = verdict_of(lower, upper)
     end = End.of(verdict)
-    nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
+    nodes = [evidence.bound(formula) for formula, _ in done.tree]
 
-    def follow(
-        end: End, node: int = node, sample: int = 0
-    ) -> tuple[DecidingPath, tuple[WitnessStep, ...], DecidingAtom | None]:
-        found = deciding_path(instance.formula, done, times_ns, node, end, goes_on=goes_on, sample=sample)
+    def followed(found: DecidingPath) -> tuple[tuple[WitnessStep, ...], DecidingAtom | None]:
         path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
         leaf = nodes[path[-1].node]
         if not isinstance(leaf, Atom | Quantified):
-            return found, path, None
-        return found, path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
+            return path, None
+        return path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
 
-    found, path, deciding = follow(end)
+    found = deciding_path(done, node, end)
+    path, deciding = followed(found)
     at_ns = path[-1].time_ns
     gaps: tuple[Gap, ...] = ()
     if deciding is not None and deciding.unknown:
@@ -165,14 +162,16 @@ def find_witness(
         threshold = threshold_of(evidence, *over, node, verdict, deciding, goes_on=open_ended)
     open_end = None
     if end is not End.OPEN and lower < upper and not goes_on:
-        _, other_path, other = follow(end.turned)
+        other_path, other = followed(deciding_path(done, node, end.turned))
         if other is not None and other.lower < other.upper:
             open_end = other, other_path[-1].time_ns
-    missed = missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None
+    missed, nearest = None, None
+    if verdict is Verdict.VIOLATED:
+        missed, nearest = missed_response(found, done, instance.bindings)
     closest: tuple[DecidingAtom, int] | None = None
     closest_path: tuple[WitnessStep, ...] = ()
-    if missed is not None and missed.is_condition:
-        _, best_path, best = follow(End.HIGH, missed.node, missed.sample)
+    if nearest is not None:
+        best_path, best = followed(nearest)
         if best is not None and not best.unknown:
             closest, closest_path = (best, best_path[-1].time_ns), best_path
     last = nodes[path[-1].node]
@@ -181,8 +180,7 @@ def find_witness(
         scene = evidence.scene(at_ns)
         if (within := failed_implication(scene, last, found.end)) is not None:
             condition, response, is_condition = within
-            titles, place = (short_title(condition), short_title(response)), found.steps[-1]
-            missed = MissedResponse(*titles, at_ns, is_condition, place.node, place.sample)
+            missed = MissedResponse(short_title(condition), short_title(response), at_ns, is_condition)
             best = deciding_atom(scene, response, End.HIGH) if is_condition else None
             closest = (best, at_ns) if best is not None and not best.unknown else None
     return Witness(
@@ -217,7 +215,7 @@ def time_of_least(
     """
     order = instance.program.leaves
     done = evaluate_offline(instance.formula, order, leaves, times_ns)
-    path = deciding_path(instance.formula, done, times_ns, node, End.HIGH)
+    path = deciding_path(done, node, End.HIGH)
     earliest = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
 
     def is_reached(sample: int) -> bool:
