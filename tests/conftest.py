@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -20,6 +21,9 @@ settings.register_profile("quick", settings.get_profile("thorough"), max_example
 settings.register_profile("ci", settings.get_profile("quick"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "quick")
 
+
+# a tenth of the time went into collections of a heap that holds every module
+gc.set_threshold(100_000, 50, 100)
 
 # programs under test run the package that these tests import, wherever they start
 if not os.environ.get("SPATIAL_REPLAY_INSTALLED"):
