@@ -311,9 +311,7 @@ class OwnSimulation:
             what = f"{type(samples[0]).__name__} objects" if samples else "nothing"
             raise UsageError(f"{self.name} returns {what}; a simulation returns one Sample or more")
         about = {"source": self.name, "options": json.dumps(values)}
-        return SimulatedCase(
-            Trace.from_samples(samples), lambda output: _write(output, samples, self.files, about)
-        )
+        return _simulated(samples, self.files, about)
 
     def command(self, case: Case) -> None:
         """Return the command that repeats the run of a case; None if there is none."""
@@ -356,9 +354,7 @@ class ScenarioRuns:
             return self._plan(given)
         samples = simulate_script(self.name, **given)
         about = about_run(self.name, **given)
-        return SimulatedCase(
-            Trace.from_samples(samples), lambda output: _write(output, samples, self.files, about), unit="m"
-        )
+        return _simulated(samples, self.files, about, unit="m")
 
     def command(self, case: Case) -> str:
         """See `OwnSimulation`."""
@@ -500,9 +496,12 @@ def _is_beside(one: Placement, other: Placement) -> bool:
     )
 
 
-def _write(
-    output: Path, samples: Sequence[Sample], files: Sequence[Specification], about: Mapping[str, str]
-) -> None:
-    with run_log(output, files, about) as log:
-        for sample in samples:
-            log.write(sample)
+def _simulated(
+    samples: Sequence[Sample], files: Sequence[Specification], about: Mapping[str, str], unit: str = ""
+) -> SimulatedCase:
+    def write(output: Path) -> None:
+        with run_log(output, files, about) as log:
+            for sample in samples:
+                log.write(sample)
+
+    return SimulatedCase(Trace.from_samples(samples), write, unit)

@@ -28,17 +28,11 @@ class Path:
     Attributes:
         cells: (K, 2) rows and columns of its start, turns and end; between them it follows a row, a column or
             a diagonal.
-        straight, diagonal: number of steps of each kind.
+        length: in cells.
     """
 
     cells: Integers
-    straight: int
-    diagonal: int
-
-    @property
-    def length(self) -> float:
-        """Length in cells."""
-        return self.straight + ROOT_2 * self.diagonal
+    length: float
 
 
 def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Path | None:
@@ -69,7 +63,8 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
         return None
     steps = np.abs(np.diff(cells, axis=0))
     diagonal = int(steps.min(axis=1).sum())
-    return Path(read_only_integers(cells), int(steps.max(axis=1).sum()) - diagonal, diagonal)
+    straight = int(steps.max(axis=1).sum()) - diagonal
+    return Path(read_only_integers(cells), straight + ROOT_2 * diagonal)
 
 
 def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:

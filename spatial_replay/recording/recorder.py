@@ -19,12 +19,13 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
 from types import FrameType, MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
 
+from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.errors import LogError, OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import (
@@ -1050,8 +1051,11 @@ def record_source(
     about |= _units_metadata(source, unit)
     stream = open_output(output, durability)
     try:
-        with leaving(output), stream:
-            _record(LogWriter(stream), about, files, chain([first], traces), advance)
+        with leaving(output), stream, recording_in(stream, files, about) as (_, recording):
+            for trace in chain([first], traces):
+                with uninterrupted():
+                    recording.add(trace)
+                advance(len(trace))
     except OutputError:
         # a disk that is full: half of a log that can be recorded again is worth less than none
         if output.is_file():
@@ -1086,31 +1090,29 @@ def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
         raise LogError("; ".join([f"{source.name} has no sample", *tally.faults[:1]]))
 
 
-def _record(
-    writer: LogWriter,
-    about: Mapping[str, str],
+@contextmanager
+def recording_in(
+    stream: BinaryIO,
     files: Sequence[Specification],
-    traces: Iterator[Trace],
-    advance: Callable[[int], None],
-) -> None:
-    """Write a whole log, up to the end of the traces or an interruption."""
+    about: Mapping[str, str] | None,
+    known: Sequence[SpecAutomaton] = (),
+) -> Iterator[tuple[LogWriter, Recording]]:
+    """Begin a log, and write its end however the block ends; after an error it is marked as interrupted."""
     interrupted = True
+
+    def end() -> None:
+        with uninterrupted():
+            recording.end(RunEnd(interrupted))
+            writer.close()
+
     with ExitStack() as ending:
         # an interruption between two records would leave a log whose index does not fit
         with uninterrupted():
-            recording = Recording(writer, files, about)
-            ending.callback(lambda: _end(writer, recording, interrupted=interrupted))
-        for trace in traces:
-            with uninterrupted():
-                recording.add(trace)
-            advance(len(trace))
+            writer = LogWriter(stream)
+            recording = Recording(writer, files, about, known)
+            ending.callback(end)
+        yield writer, recording
         interrupted = False
-
-
-def _end(writer: LogWriter, recording: Recording, *, interrupted: bool) -> None:
-    with uninterrupted():
-        recording.end(RunEnd(interrupted))
-        writer.close()
 
 
 class _Tally:

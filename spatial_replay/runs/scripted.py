@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Unpack
@@ -18,11 +18,10 @@ from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.planning.decisions import Outcome
-from spatial_replay.recording.log import Recording, RunEnd, refuse_templates
-from spatial_replay.recording.recorder import leaving, terminable, uninterrupted
-from spatial_replay.runs.virtual_camera import Film, open_film
-from spatial_replay.simulation.tabletop import Tabletop, default_specification, make_world
+from spatial_replay.recording.log import Recording, refuse_templates
+from spatial_replay.recording.recorder import leaving, recording_in, terminable, uninterrupted
+from spatial_replay.runs.virtual_camera import open_film
+from spatial_replay.simulation.tabletop import default_specification, make_world
 from spatial_replay.simulation.world import Conditions
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
@@ -94,7 +93,7 @@ class RunLog:
             OutputError: the log cannot be written.
         """
         with uninterrupted():
-            self._write_waiting()
+            self.write_waiting()
             self._recording.add_metadata(name, data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
@@ -104,22 +103,17 @@ class RunLog:
             OutputError: the log cannot be written.
         """
         with uninterrupted():
-            self._write_waiting()
+            self.write_waiting()
             self._writer.add_attachment(name, media_type, data)
 
     def flush(self) -> None:
         """Write everything so far, so that it can be read even if the process is killed."""
         with uninterrupted():
-            self._write_waiting()
+            self.write_waiting()
             self._writer.flush()
 
-    def end(self, *, interrupted: bool = False) -> None:
-        """Write what follows the last sample, and close the log."""
-        self._write_waiting()
-        self._recording.end(RunEnd(interrupted))
-        self._writer.close()
-
-    def _write_waiting(self) -> None:
+    def write_waiting(self) -> None:
+        """Write what was not written yet."""
         waiting, self._waiting = self._waiting, []
         beside, self._beside = self._beside, []
         if waiting or beside:
@@ -152,20 +146,18 @@ def run_log(
     """
     refuse_inputs(output, inputs)
     refuse_templates(files)
-    interrupted = True
-    with leaving(output), terminable(), open_output(output, durability) as stream, ExitStack() as ending:
-        # an interruption between these lines would leave a log without an end
-        with uninterrupted():
-            writer = LogWriter(stream)
-            log = RunLog(writer, Recording(writer, files, about, known))
-            ending.callback(lambda: _end(log, interrupted=interrupted))
-        yield log
-        interrupted = False
-
-
-def _end(log: RunLog, *, interrupted: bool) -> None:
-    with uninterrupted():
-        log.end(interrupted=interrupted)
+    with (
+        leaving(output),
+        terminable(),
+        open_output(output, durability) as stream,
+        recording_in(stream, files, about, known) as opened,
+    ):
+        log = RunLog(*opened)
+        try:
+            yield log
+        finally:
+            with uninterrupted():
+                log.write_waiting()
 
 
 def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None:
@@ -239,7 +231,18 @@ def record_script(
             open_film(world, cameras, seed=conditions.get("seed", 0)) as film,
             run_log(output, files, about, inputs, durability=durability) as log,
         ):
-            result = _follow_script(world, log, film, duration_ns, advance)
+
+            def observe(sample: Sample) -> None:
+                log.write(sample)
+                if film is not None:
+                    film.take(sample)
+                advance(1)
+
+            world.attach(observe)
+            result = world.follow(world.script(), duration_ns)
+            if not log.samples:
+                # without a motion there is no sample: take the one of the world at rest
+                world.step()
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
@@ -267,22 +270,3 @@ def about_run(scenario: str, **conditions: Unpack[Conditions]) -> dict[str, str]
     # worlds are simulated in metres
     axes = Axes(unit="m").metadata()
     return {"source": scenario, "seed": str(seed), "options": json.dumps(options), **axes}
-
-
-def _follow_script(
-    world: Tabletop, log: RunLog, film: Film | None, duration_ns: int | None, advance: Callable[[int], None]
-) -> Outcome | None:
-    """Follow the script and log every sample; return its result, None if the duration ended before it."""
-
-    def observe(sample: Sample) -> None:
-        log.write(sample)
-        if film is not None:
-            film.take(sample)
-        advance(1)
-
-    world.attach(observe)
-    result = world.follow(world.script(), duration_ns)
-    if not log.samples:
-        # without a motion there is no sample: take the one of the world at rest
-        world.step()
-    return result

@@ -332,10 +332,6 @@ class Search:
             return self._widest_by_boxes()
         return self._widest_of_several()
 
-    def holds(self, point: Point) -> bool:
-        """Return whether every run has the right verdict."""
-        return self._all_hold([*self._bad, *self._good], point)
-
     def limit(self, run: int) -> int | None:
         """Return the number at which a run holds by the narrowest, for one constant with a direction.
 
@@ -478,7 +474,7 @@ class Search:
             if not missing:
                 break
             deciding += missing
-        if not self.holds(point):
+        if not self._all_hold([*self._bad, *self._good], point):
             return Found(point, is_held=False, conflict=self._conflict(point), is_proven=False)
         return Found(self._centred(point), is_held=True, is_proven=False)
 
