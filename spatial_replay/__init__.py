@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from spatial_replay.automata.compile import automaton
     from spatial_replay.falsification.failure_search import falsify
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-    from spatial_replay.monitor.evaluate import Evaluation, evaluate
     from spatial_replay.monitor.monitor import Monitor
+    from spatial_replay.monitor.result import Evaluation, evaluate
     from spatial_replay.monitor.verdict import Verdict
     from spatial_replay.planning.decisions import Outcome
     from spatial_replay.planning.planner import Planner, plan

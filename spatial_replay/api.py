@@ -17,8 +17,7 @@ from spatial_replay.learning.learned import DEFAULT_LINES, Learned, learn_runs
 from spatial_replay.logs.messages import MAPPED, MemorySource, Source
 from spatial_replay.logs.read_options import Reading
 from spatial_replay.logs.remote import LogFile, local_copy, local_files, log_file, sendable
-from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, checked_kinds
+from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, Semantics, checked_kinds
 from spatial_replay.replay.engine import Replayed, load_files, recorded_texts, run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.replay.verification import Verified, verify_certificate

@@ -47,10 +47,9 @@ from spatial_replay.logs.messages import (
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvent, RecentEvents, Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.monitor.stream import Instance, SeriesBlock
+from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import LATEST_NS, Trace
 

@@ -21,8 +21,8 @@ from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.wire import WireTemplate, placed
 from spatial_replay.monitor.offline import evaluate_offline
-from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
 from spatial_replay.text import listed
 

@@ -15,20 +15,17 @@ import numpy as np
 
 from spatial_replay.annotate.requirements import Requirement
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.atoms.delays import look_back
-from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
-from spatial_replay.monitor.causes import conjuncts_of, find_causes
-from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.atoms.terms import Bindings, TraceScene, look_back
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_unfinished
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.sentences import divisor_of
-from spatial_replay.monitor.stream import NEVER, SeriesBlock, join_blocks
+from spatial_replay.monitor.sentences import conjuncts_of, divisor_of, find_causes
+from spatial_replay.monitor.stream import NEVER, Instance, SeriesBlock, join_blocks
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.monitor.witness.atom import deciding_atom
 from spatial_replay.monitor.witness.path import (
     DecidingPath,
     End,
     MissedResponse,
+    deciding_atom,
     deciding_path,
     missed_response,
 )

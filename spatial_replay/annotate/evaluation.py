@@ -14,9 +14,8 @@ from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import AUTOMATON, DERIVED, SCENE, Attachment, Channel
-from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
+from spatial_replay.monitor.stream import EvaluationStream, Instance, SeriesBlock
+from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import listed, nearest_hint
 from spatial_replay.trace.trace import Trace

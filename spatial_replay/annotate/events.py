@@ -25,13 +25,11 @@ from spatial_replay.annotate.deciding_leaf import (
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.compiled import kernel
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import amount_text, how_text, uncertain_text
-from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.stream import Instance, SeriesBlock
+from spatial_replay.monitor.verdict import Semantics, Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from spatial_replay.errors import SpecificationError
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.stream import Instance
 from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.format import format_formula

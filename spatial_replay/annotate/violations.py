@@ -21,9 +21,8 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.measure import Operand, contacts
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.monitor.stream import Instance, SeriesBlock
 from spatial_replay.spec.formula import ANY_CLASS, Formula, Outline, Quantified, TrackedName
 from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, nodes_of, substitute
 from spatial_replay.trace.trace import LATEST_NS, Trace

@@ -47,7 +47,7 @@ from spatial_replay.logs.remote import (
 )
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.mapping.yaml_document import MOST_FAULTS
-from spatial_replay.monitor.instances import Choice
+from spatial_replay.monitor.stream import Choice
 from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification

@@ -26,8 +26,7 @@ from spatial_replay.mapping.yaml_document import (
     read_yaml_text,
     schema_of,
 )
-from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.verdict import Semantics, Verdict
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from spatial_replay.batch.run_table import By, Difference, Tolerance, Total
     from spatial_replay.batch.suite import Suite
     from spatial_replay.batch.workers import Workers
-    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.monitor.verdict import Semantics
 
 
 _COLOURS: Final = MappingProxyType(

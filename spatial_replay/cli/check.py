@@ -282,8 +282,7 @@ class _CutResults:
 
     def __init__(self, specification: Specification) -> None:
         # only needed with --log: the monitor loads the numerical libraries
-        from spatial_replay.monitor.instances import find_instances
-        from spatial_replay.monitor.stream import EvaluationStream
+        from spatial_replay.monitor.stream import EvaluationStream, find_instances
         from spatial_replay.trace.trace import FOREVER
 
         self._specification = specification

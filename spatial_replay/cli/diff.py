@@ -26,7 +26,7 @@ from spatial_replay.logs.remote import LogFile, local_files
 if TYPE_CHECKING:
     from spatial_replay.compare.runs import LogDiff
     from spatial_replay.compare.specifications import SpecificationDiff
-    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.monitor.verdict import Semantics
 
 
 @click.command(cls=JsonCommand)

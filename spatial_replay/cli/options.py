@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
-    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.monitor.verdict import Semantics
     from spatial_replay.recording.recorder import Recorded
     from spatial_replay.replay.engine import Replayed
     from spatial_replay.replay.selection import ReplayOptions, Window

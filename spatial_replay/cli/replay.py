@@ -35,7 +35,7 @@ from spatial_replay.text import counted
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
-    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.monitor.verdict import Semantics
     from spatial_replay.replay.engine import Replayed
     from spatial_replay.replay.table import Quantity
 

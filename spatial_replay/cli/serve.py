@@ -25,7 +25,7 @@ from spatial_replay.errors import importing
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.monitor.verdict import Semantics
     from spatial_replay.replay.loaded_log import Evaluated
     from spatial_replay.replay.specification_files import SpecificationFiles
 

@@ -23,8 +23,8 @@ from spatial_replay.compiled import cache_folder, compilations, compile_ahead
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.messages import MemorySource
-from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
+from spatial_replay.monitor.result import evaluate
 from spatial_replay.recording.recorder import Recorder
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.runs.planned import warm_up_planner

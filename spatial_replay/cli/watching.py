@@ -22,7 +22,7 @@ from spatial_replay.logs.remote import local_copy
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.monitor.verdict import Semantics
     from spatial_replay.replay.loaded_log import Evaluated, LoadedLog
     from spatial_replay.replay.selection import ReplayOptions
     from spatial_replay.replay.specification_files import SpecificationFiles

@@ -16,15 +16,13 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Source
 from spatial_replay.logs.remote import RemoteFile
-from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.atoms.terms import TraceScene, look_back
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_unfinished
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.monitor.stream import InstanceStream
-from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.verdict import Verdict, final_verdict, require_ltlf
 from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
 from spatial_replay.replay.engine import Replay, Replayed, run_replay
 from spatial_replay.replay.selection import (

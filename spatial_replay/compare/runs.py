@@ -21,11 +21,10 @@ from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.messages import Source
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
-from spatial_replay.monitor.evaluate import Evaluation
-from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import require_ltlf
+from spatial_replay.monitor.result import Evaluation, SpecResult
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.monitor.verdict import require_ltlf
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection
 from spatial_replay.spec.checks import with_numbers

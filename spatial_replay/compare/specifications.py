@@ -25,11 +25,10 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.messages import Source
-from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.paper import PaperRun
-from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.result import Evaluation, SpecResult, evaluate
+from spatial_replay.monitor.semantics import PaperRun
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection

@@ -40,7 +40,7 @@ from spatial_replay.falsification.simulations import (
 from spatial_replay.lazy import Printed
 from spatial_replay.logs.output_file import output_error, refuse_addresses
 from spatial_replay.logs.remote import local_copy
-from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay.monitor.result import evaluate
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS
 from spatial_replay.sanity import refuse_decided

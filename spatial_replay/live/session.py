@@ -29,10 +29,9 @@ from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.mapping.topic_reader import ReadingPlan
-from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update
+from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.monitor.violation import Violation
 from spatial_replay.recording.clips import Trigger
 from spatial_replay.recording.log import (
     RecorderLog,

@@ -25,7 +25,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, roomy, writable
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import OFFLINE_TARGET, joined_channels, low_and_high
-from spatial_replay.monitor.online.operators import SignalTable, array_of_rows
+from spatial_replay.monitor.online.program import SignalTable, array_of_rows
 from spatial_replay.monitor.online.signals import past_value
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,

@@ -1,21 +1,680 @@
-"""The two semantics of a formula: the one place that chooses the evaluator by name."""
+"""The two semantics of a formula, one of which is chosen by name; and Def. 16 of the paper as samples come.
+
+`PaperRun` differs from `OnlineRun` beyond the ends of the run: an operand that would need samples from there
+is left out of minima and maxima. And where something is unknown: every number that depends on it is
+undetermined.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Literal, NamedTuple, Protocol, TypeAlias, cast, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, cast, get_args
 
 import numpy as np
 
+from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Empty, Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Flags, Floats, Integers
+from spatial_replay.monitor.atoms.terms import iter_delays
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.step import ROOM, OnlineRun
-from spatial_replay.monitor.paper import PaperRun, check_operators, left_out
-from spatial_replay.spec.formula import Formula, Specification
+from spatial_replay.monitor.verdict import Semantics
+from spatial_replay.spec.diagnostics import SourceText
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    Quantified,
+    Specification,
+    Temporal,
+    Truth,
+    iter_nodes,
+)
+from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key, nodes_with_operands
 
-Semantics: TypeAlias = Literal["ltlf", "paper"]
-"""Robustness over finite traces, or the paper's Def. 16 to the letter."""
+
+class PaperMemory(NamedTuple):
+    """State between samples; each array of numbers has a parallel one of lost numbers.
+
+    Attributes:
+        stamps: (room,), times of the samples in ns; of the first alone if nothing keeps a column.
+        columns: (K, room), numbers at each sample, on the samples so far.
+        value: (N,), each node at the first sample.
+        now: (N,), each node at the newest sample.
+        left: (N,), of an until at the first sample: the least of its left operand.
+        starts: (N,), where the window of the earliest sample that is still open begins; -1 for not yet.
+        opens: (N,), the earliest sample whose window is still open.
+        pairs: the left operand of an until for each end of its run, one row after the other.
+        pair_starts: (P, room), sample s of the row of end t is at `pair_starts[p, t] + s`.
+        pair_end: (1,), how much of `pairs` is used.
+    """
+
+    stamps: Integers
+    columns: Floats
+    lost_columns: Flags
+    value: Floats
+    lost_value: Flags
+    now: Floats
+    lost_now: Flags
+    left: Floats
+    lost_left: Flags
+    starts: Integers
+    opens: Integers
+    pairs: Floats
+    lost_pairs: Flags
+    pair_starts: Integers
+    pair_end: Integers
+
+
+@piece
+def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: Flags) -> None:
+    """Compute a node on the newest sample alone, from its operands there."""
+    code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
+    if code == NEXT or (code > NEXT and rows[n, LOW] > 0):
+        numbers[n], lost[n] = np.nan, 0
+        return
+    operand = operands[first]
+    if code in (EVENTUALLY, ALWAYS):
+        numbers[n], lost[n] = numbers[operand], lost[operand]
+        return
+    if code > ALWAYS:
+        other = operands[end - 1]
+        numbers[n], lost[n] = least(numbers[operand], numbers[other]), lost[operand] | lost[other]
+        return
+    _fold(code, operands[first:end], numbers, lost, n)
+
+
+@piece
+def _fold(code: int, operands: Integers, numbers: Floats, lost: Flags, n: int) -> None:
+    """Compute a Boolean node from its operands."""
+    number, is_lost = numbers[operands[0]], lost[operands[0]]
+    number = combine(code, number, number) if len(operands) == 1 else number
+    for each in operands[1:]:
+        number = combine(code, number, numbers[each])
+        is_lost |= lost[each]
+    numbers[n], lost[n] = number, is_lost
+
+
+@piece
+def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
+    """Compute a Boolean node at every sample, from its operands."""
+    code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
+    row = rows[n, COLUMN]
+    into, lost = memory.columns[row], memory.lost_columns[row]
+    other_row = rows[operands[first], COLUMN]
+    other, other_lost = memory.columns[other_row], memory.lost_columns[other_row]
+    for t in range(last + 1):
+        into[t] = combine(code, other[t], other[t]) if end - first == 1 else other[t]
+        lost[t] = other_lost[t]
+    for each in range(first + 1, end):
+        other_row = rows[operands[each], COLUMN]
+        other, other_lost = memory.columns[other_row], memory.lost_columns[other_row]
+        for t in range(last + 1):
+            into[t] = combine(code, into[t], other[t])
+            lost[t] |= other_lost[t]
+
+
+@piece
+def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: PaperMemory) -> bool:
+    """Return whether the last sample is in the first one's window; note where that window begins."""
+    passed = time_ns - memory.stamps[0] if rows[n, IS_IN_NS] else last
+    if memory.starts[n] < 0 and passed >= rows[n, LOW]:
+        memory.starts[n] = last
+    return bool(memory.starts[n] >= 0 and (rows[n, HIGH] < 0 or passed <= rows[n, HIGH]))
+
+
+@piece
+def _step_first(
+    rows: Integers, operands: Integers, n: int, last: int, time_ns: int, memory: PaperMemory
+) -> None:
+    """Update a temporal node that is needed at the first sample only."""
+    code, value, lost = rows[n, CODE], memory.value, memory.lost_value
+    right = operands[rows[n, END] - 1]
+    right_row = rows[right, COLUMN]
+    is_plain = rows[right, IS_PLAIN] != 0
+    if code == NEXT:
+        if is_plain and last == 1:
+            value[n], lost[n] = memory.now[right], memory.lost_now[right]
+        if not is_plain and last >= 1:
+            value[n], lost[n] = memory.columns[right_row, 1], memory.lost_columns[right_row, 1]
+        return
+    if not _window_at_first(rows, n, last, time_ns, memory):
+        return
+    start = memory.starts[n]
+    if code in (EVENTUALLY, ALWAYS):
+        if is_plain:
+            value[n] = pick(code == ALWAYS, value[n], memory.now[right])
+            lost[n] |= memory.lost_now[right]
+        else:
+            numbers, marks = memory.columns[right_row], memory.lost_columns[right_row]
+            value[n], lost[n] = total(code == ALWAYS, numbers, marks, start, last)
+        return
+    left = operands[rows[n, FIRST]]
+    if rows[left, IS_PLAIN]:
+        memory.left[n] = least(memory.left[n], memory.now[left])
+        memory.lost_left[n] |= memory.lost_now[left]
+    else:
+        left_row = rows[left, COLUMN]
+        numbers, marks = memory.columns[left_row], memory.lost_columns[left_row]
+        memory.left[n], memory.lost_left[n] = total(True, numbers, marks, start, last)
+    if is_plain:
+        value[n] = most(value[n], least(memory.now[right], memory.left[n]))
+        lost[n] |= memory.lost_now[right] | memory.lost_left[n]
+        return
+    inner = rows[n, INNER]
+    memory.columns[inner, last], memory.lost_columns[inner, last] = memory.left[n], memory.lost_left[n]
+    value[n], lost[n] = np.nan, 0
+    for t in range(start, last + 1):
+        value[n] = most(value[n], least(memory.columns[right_row, t], memory.columns[inner, t]))
+        lost[n] |= memory.lost_columns[right_row, t] | memory.lost_columns[inner, t]
+
+
+@piece
+def _apart(rows: Integers, n: int, earlier: int, later: int, memory: PaperMemory) -> int:
+    """Return the distance of two samples, in the unit of a node's window."""
+    return memory.stamps[later] - memory.stamps[earlier] if rows[n, IS_IN_NS] else later - earlier
+
+
+@piece
+def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
+    """Update a temporal node that is needed at every sample, where its window was still open."""
+    code = rows[n, CODE]
+    row, inner = rows[n, COLUMN], rows[n, INNER]
+    into, into_lost = memory.columns[row], memory.lost_columns[row]
+    right_row = rows[operands[rows[n, END] - 1], COLUMN]
+    right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
+    if code == NEXT:
+        for t in range(last):
+            into[t], into_lost[t] = right[t + 1], right_lost[t + 1]
+        into[last], into_lost[last] = np.nan, 0
+        return
+    low, high = rows[n, LOW], rows[n, HIGH]
+    while high >= 0 and _apart(rows, n, memory.opens[n], last, memory) > high:
+        memory.opens[n] += 1
+    start = max(memory.starts[n], memory.opens[n])
+    while start <= last and _apart(rows, n, memory.opens[n], start, memory) < low:
+        start += 1
+    memory.starts[n] = start
+    if start <= last:
+        _scan_node(rows, operands, n, start, last, memory)
+    if inner == row:
+        return
+    for t in range(memory.opens[n], last + 1):
+        while start <= last and _apart(rows, n, t, start, memory) < low:
+            start += 1
+        if start <= last:
+            into[t], into_lost[t] = memory.columns[inner, start], memory.lost_columns[inner, start]
+        else:
+            into[t], into_lost[t] = np.nan, 0
+
+
+@piece
+def _scan_node(
+    rows: Integers, operands: Integers, n: int, start: int, last: int, memory: PaperMemory
+) -> None:
+    """Run the unbounded operator from each sample, from `start` on, to the last one."""
+    code, inner = rows[n, CODE], rows[n, INNER]
+    into, into_lost = memory.columns[inner], memory.lost_columns[inner]
+    right_node, left_node = operands[rows[n, END] - 1], operands[rows[n, FIRST]]
+    right_row, left_row = rows[right_node, COLUMN], rows[left_node, COLUMN]
+    right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
+    left, left_lost = memory.columns[left_row], memory.lost_columns[left_row]
+    if code in (EVENTUALLY, ALWAYS):
+        scan(code == ALWAYS, right, right_lost, start, last, into, into_lost)
+    elif rows[left_node, IS_PLAIN]:
+        scan_until(left, left_lost, right, right_lost, start, last, into, into_lost)
+    elif rows[right_node, IS_PLAIN]:
+        scan_until_by_last(left, left_lost, right[last], right_lost[last], start, last, into, into_lost)
+    else:
+        pair_starts, end = memory.pair_starts[rows[n, PAIRS]], memory.pair_end[0]
+        pair_starts[last] = end - start
+        memory.pair_end[0] = end + last + 1 - start
+        row, lost_row = memory.pairs[end:], memory.lost_pairs[end:]
+        scan(True, left[start:], left_lost[start:], 0, last - start, row, lost_row)
+        scan_until_by_pairs(
+            memory.pairs, memory.lost_pairs, pair_starts, right, right_lost, start, last, into, into_lost
+        )
+
+
+@kernel
+def step_paper(
+    rows: Integers, operands: Integers, leaves: Floats, lost_leaves: Flags, times_ns: Integers,
+    t: int, count: int, position: int, memory: PaperMemory, series: Floats,
+) -> None:  # fmt: skip
+    """Run the samples t up to t + count; `position` samples came before.
+
+    Args:
+        leaves: (A, T); NaN where one is left out.
+        lost_leaves: (A, T), 1 where one is not known.
+        series: (N, 4, T), receives value, now, lower and upper of each node.
+    """
+    nodes = rows.shape[0]
+    for k in range(t, t + count):
+        last = position + k - t
+        if last < memory.stamps.shape[0]:
+            memory.stamps[last] = times_ns[k]
+        for n in range(nodes - 1, -1, -1):
+            code, is_plain = rows[n, CODE], rows[n, IS_PLAIN] != 0
+            if code == LEAF_NODE:
+                leaf = rows[n, LEAF]
+                memory.now[n], memory.lost_now[n] = leaves[leaf, k], lost_leaves[leaf, k]
+            elif code == TRUTH:
+                memory.now[n] = np.inf * rows[n, LEAF]
+            else:
+                _set_now(rows, operands, n, memory.now, memory.lost_now)
+            column = rows[n, COLUMN]
+            if is_plain:
+                if column >= 0:
+                    memory.columns[column, last] = memory.now[n]
+                    memory.lost_columns[column, last] = memory.lost_now[n]
+                if last == 0:
+                    memory.value[n], memory.lost_value[n] = memory.now[n], memory.lost_now[n]
+            elif column >= 0:
+                if code >= NEXT:
+                    _step_column(rows, operands, n, last, memory)
+                else:
+                    _set_column(rows, operands, n, last, memory)
+                memory.value[n] = memory.columns[column, 0]
+                memory.lost_value[n] = memory.lost_columns[column, 0]
+            elif code >= NEXT:
+                _step_first(rows, operands, n, last, times_ns[k], memory)
+            else:
+                own = operands[rows[n, FIRST] : rows[n, END]]
+                _fold(code, own, memory.value, memory.lost_value, n)
+            # adding zero turns -0.0 into 0.0, so that equal numbers are equal bits
+            series[n, 0, k] = np.nan if memory.lost_value[n] else memory.value[n] + 0.0
+            series[n, 1, k] = np.nan if memory.lost_now[n] else memory.now[n] + 0.0
+            series[n, 2, k] = series[n, 3, k] = series[n, 0, k]
+
+
+# columns of the table
+CODE, FIRST, END, IS_IN_NS, LOW, HIGH, IS_PLAIN, COLUMN, INNER, PAIRS, LEAF = range(11)
+WIDTH = 11
+NOTHING = -1
+"""No upper end, no column, no table of pairs."""
+
+# codes of nodes, beside those of reports for Boolean ones; a row is a node as written, since Def. 16 gives a
+# number to each
+LEAF_NODE, TRUTH = 0, 1
+NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
+
+_TEMPORAL_CODES = {"X": NEXT, "F": EVENTUALLY, "G": ALWAYS, "U": UNTIL}
+OPERATORS = frozenset(_TEMPORAL_CODES)
+"""The temporal operators that there are."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperTable:
+    """A formula's nodes, by id.
+
+    Attributes:
+        rows: (N, WIDTH): code; begin and end of the node's operands in `operands`; its window; whether it is
+            plain; its places in `PaperMemory`; a leaf's number, or the sign of a constant.
+        operands: ids of the operands, node after node.
+        columns: how many columns are kept.
+        pairs: how many tables over pairs of samples are kept.
+    """
+
+    rows: Integers
+    operands: Integers
+    columns: int
+    pairs: int
+
+
+def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperTable:
+    """Compile a formula of `OPERATORS` over these leaves."""
+    nodes = nodes_with_operands(formula)
+    numbers: dict[object, int] = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
+    is_plain = [is_spatial(node) for node, _ in nodes]
+    has_column = _columns(nodes, is_plain)
+    rows = np.zeros((len(nodes), WIDTH), np.int64)
+    columns = pairs = begin = 0
+    for identifier, (node, own) in enumerate(nodes):
+        row = rows[identifier]
+        row[[CODE, LEAF]] = _code(node, numbers)
+        row[[FIRST, END]] = begin, begin + len(own)
+        row[IS_PLAIN] = is_plain[identifier]
+        row[[HIGH, COLUMN, INNER, PAIRS]] = NOTHING
+        begin += len(own)
+        if has_column[identifier]:
+            row[COLUMN], columns = columns, columns + 1
+        if isinstance(node, Temporal):
+            if node.bound is not None:
+                upper = NOTHING if node.bound.upper is None else node.bound.upper
+                row[[IS_IN_NS, LOW, HIGH]] = node.bound.unit == "ns", node.bound.lower, upper
+            is_until_nested = node.operator == "U" and not is_plain[own[-1]]
+            if has_column[identifier] and row[LOW] == 0 and row[HIGH] == NOTHING:
+                row[INNER] = row[COLUMN]
+            elif has_column[identifier] or is_until_nested:
+                row[INNER], columns = columns, columns + 1
+            if has_column[identifier] and is_until_nested and not is_plain[own[0]]:
+                row[PAIRS], pairs = pairs, pairs + 1
+    return PaperTable(rows, np.array([i for _, own in nodes for i in own], np.int64), columns, pairs)
+
+
+def _columns(nodes: Sequence[tuple[Formula, Sequence[int]]], is_plain: Sequence[bool]) -> list[bool]:
+    """Return which nodes are needed at all samples; parents come before their operands."""
+    wanted = [False] * len(nodes)
+    for identifier, (node, operands) in enumerate(nodes):
+        for operand in operands:
+            if isinstance(node, Temporal):
+                wanted[operand] = wanted[identifier] or not is_plain[operand]
+            else:
+                wanted[operand] = wanted[identifier] and not is_plain[identifier]
+    return wanted
+
+
+def _code(node: Formula, leaves: Mapping[object, int]) -> tuple[int, int]:
+    """Return a node's code, and its leaf or the sign of its infinity."""
+    match node:
+        case Truth():
+            return TRUTH, 1 if node.value else -1
+        case Boolean():
+            return codes.REPORT_OF_BOOLEAN[node.operator], 0
+        case Temporal():
+            return _TEMPORAL_CODES[node.operator], 0
+        case _:
+            return LEAF_NODE, leaves[leaf_key(node)]
+
+
+@inlined
+def least(one: float, other: float) -> float:
+    """Return the lesser number, of those not left out; NaN if both are."""
+    if np.isnan(one):
+        return other
+    if np.isnan(other):
+        return one
+    return min(one, other)
+
+
+@inlined
+def most(one: float, other: float) -> float:
+    """Return the greater number, of those not left out; NaN if both are."""
+    if np.isnan(one):
+        return other
+    if np.isnan(other):
+        return one
+    return max(one, other)
+
+
+@inlined
+def pick(is_least: bool, one: float, other: float) -> float:
+    """Return `least` or `most` of two numbers."""
+    return least(one, other) if is_least else most(one, other)
+
+
+@inlined
+def combine(code: int, one: float, other: float) -> float:
+    """Apply a Boolean operator; for one operand, both are that operand."""
+    if code == codes.REPORT_AND:
+        return least(one, other)
+    if code == codes.REPORT_OR:
+        return most(one, other)
+    if code == codes.REPORT_NOT:
+        return -one
+    if code == codes.REPORT_IMPLIES:
+        return most(-one, other)
+    if code == codes.REPORT_XOR:
+        return most(least(one, -other), least(-one, other))
+    if code == codes.REPORT_IFF:
+        return least(most(-one, other), most(-other, one))
+    return one
+
+
+@piece
+def total(
+    is_least: bool, numbers: Floats, lost: Flags, first: int, last: int
+) -> tuple[float, int]:  # fmt: skip
+    """Return the least or the greatest number from `first` to `last`."""
+    result, is_lost = np.nan, 0
+    for t in range(first, last + 1):
+        result = pick(is_least, result, numbers[t])
+        is_lost |= lost[t]
+    return result, is_lost
+
+
+@piece
+def scan(
+    is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, into: Floats, into_lost: Flags
+) -> None:
+    """Compute, from each sample from `first` on, the least or greatest number up to `last`."""
+    result, is_lost = np.nan, 0
+    for t in range(last, first - 1, -1):
+        result = pick(is_least, result, numbers[t])
+        is_lost |= lost[t]
+        into[t], into_lost[t] = result, is_lost
+
+
+@piece
+def scan_until(
+    left: Floats, left_lost: Flags, right: Floats, right_lost: Flags,
+    first: int, last: int, into: Floats, into_lost: Flags,
+) -> None:  # fmt: skip
+    """Run until from each sample from `first` on to `last`; the left operand depends on no later sample.
+
+    The best over later ends is capped by the left operand here. An end of which everything was left out so
+    far takes on the left operand here, which is then as good as any.
+    """
+    best, is_lost, is_any_left_out = np.nan, 0, False
+    for t in range(last, first - 1, -1):
+        here = least(right[t], left[t])
+        if not np.isnan(left[t]):
+            if is_any_left_out:
+                best = left[t]
+            elif not np.isnan(best):
+                best = min(left[t], best)
+            is_any_left_out = False
+        if np.isnan(here):
+            is_any_left_out = True
+        best = most(best, here)
+        is_lost |= left_lost[t] | right_lost[t]
+        into[t], into_lost[t] = best, is_lost
+
+
+@piece
+def scan_until_by_last(
+    left: Floats, left_lost: Flags, right: float, right_lost: int,
+    first: int, last: int, into: Floats, into_lost: Flags,
+) -> None:  # fmt: skip
+    """Run until from each sample to `last`, given until to the sample before it."""
+    still, is_lost = np.nan, right_lost
+    into[last], into_lost[last] = np.nan, 0
+    for t in range(last, first - 1, -1):
+        still = least(still, left[t])
+        is_lost |= left_lost[t]
+        into[t] = most(into[t], least(right, still))
+        into_lost[t] |= is_lost
+
+
+@piece
+def scan_until_by_pairs(
+    still: Floats, still_lost: Flags, starts: Integers, right: Floats, right_lost: Flags,
+    first: int, last: int, into: Floats, into_lost: Flags,
+) -> None:  # fmt: skip
+    """Run until from each sample to `last`, given the least left operand for each beginning and end."""
+    into[first : last + 1], into_lost[first : last + 1] = np.nan, 0
+    for end in range(first, last + 1):
+        for t in range(first, end + 1):
+            at = starts[end] + t
+            into[t] = most(into[t], least(right[end], still[at]))
+            into_lost[t] |= right_lost[end] | still_lost[at]
+
+
+_TILE = 256
+_FIRST_ROOM = 1024
+MAX_PAIRS = 1 << 26
+"""The most pairs of samples that untils may store a number for: about 11,600 samples, 0.6 GB."""
+
+
+class PaperRun:
+    """The numbers of every node on every prefix by Def. 16.
+
+    A temporal operator over plain formulas carries one number. Below another temporal operator it carries
+    numbers for every sample so far, and each sample takes time in proportion to them.
+    """
+
+    def __init__(
+        self, formula: Formula, leaves: Sequence[Atom | Quantified], *, max_pairs: int = MAX_PAIRS
+    ) -> None:
+        """Start before the first sample.
+
+        Args:
+            leaves: the formula's atoms and open quantifiers, in the order in which `extend` is given them.
+            max_pairs: the most pairs of samples to compare.
+        """
+        self._max_pairs = max_pairs
+        self._table = paper_table(formula, leaves)
+        self._memory = _first_memory(self._table)
+        self._position = 0
+        self._value = np.full(len(self._table.rows), np.nan)
+
+    def __len__(self) -> int:
+        """Return how many samples were added."""
+        return self._position
+
+    @property
+    def final(self) -> Floats:
+        """(N, 2): twice each node's value on the samples so far; NaN where it is undetermined."""
+        return np.repeat(self._value[:, None], 2, axis=1)
+
+    def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
+        """Add samples.
+
+        Args:
+            leaves: (C, A, T), as for `OnlineRun.extend`, with NaN where a leaf is left out (see `left_out`).
+            times_ns: (T,), increasing and after the previous samples.
+            empty: gives memory for what is returned.
+
+        Returns:
+            (N, 4, T): value, now, lower and upper of each node; the last two are the first.
+
+        Raises:
+            UsageError: more pairs of samples than allowed.
+        """
+        # Def. 16 knows no uncertainty: nominal ends only, and a number is lost where they differ
+        low, high = low_and_high(len(leaves), wide=False)
+        numbers = np.ascontiguousarray(leaves[low])
+        lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)
+        times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
+        series = empty((len(self._table.rows), 4, len(times_ns)))
+        samples, rows = self._position + len(times_ns), self._table.rows
+        # windows without an end: the others are known once their samples come
+        lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
+        self._check_pairs(int((np.maximum(samples - lows, 0) ** 2 // 2).sum()), samples)
+        for t in range(0, len(times_ns), _TILE):
+            count = min(_TILE, len(times_ns) - t)
+            self._make_room(self._position + count)
+            step_paper(
+                self._table.rows, self._table.operands, numbers, lost, times_ns,
+                t, count, self._position, self._memory, series,
+            )  # fmt: skip
+            self._position += count
+        if len(times_ns):
+            self._value = series[:, 0, -1].copy()
+        return series
+
+    def _make_room(self, samples: int) -> None:
+        """Grow the memory to hold the given number of samples."""
+        memory, pairs = self._memory, self._table.pairs
+        if self._table.columns and samples > len(memory.stamps):
+            more = max(samples, 2 * len(memory.stamps)) - len(memory.stamps)
+            memory = memory._replace(
+                stamps=_longer(memory.stamps, more),
+                columns=_longer(memory.columns, more),
+                lost_columns=_longer(memory.lost_columns, more),
+                pair_starts=_longer(memory.pair_starts, more),
+            )
+        if pairs:
+            used = int(memory.pair_end[0])
+            wanted = used + pairs * samples * (samples - self._position)
+            self._check_pairs(used, self._position)
+            if wanted > len(memory.pairs):
+                more = max(wanted, min(2 * used, self._max_pairs)) - len(memory.pairs)
+                memory = memory._replace(
+                    pairs=_longer(memory.pairs, more), lost_pairs=_longer(memory.lost_pairs, more)
+                )
+        self._memory = memory
+
+    def _check_pairs(self, pairs: int, samples: int) -> None:
+        if pairs > self._max_pairs:
+            raise UsageError(
+                f"over {samples:,} samples, an until of two temporal operands below a temporal operator "
+                "compares too many pairs of them; bound it, evaluate fewer samples, or use the semantics "
+                "'ltlf'"
+            )
+
+
+def left_out(
+    values: Floats,
+    leaves: Sequence[Atom | Quantified],
+    positions: Integers,
+    times_ns: Integers,
+    first_ns: int,
+) -> Floats:
+    """Return leaves with NaN where one, or the body of a quantifier, looks back (`a[-3]`) to before the log.
+
+    Args:
+        values: (C, A, T) of these leaves.
+        positions: (T,), how many samples of the log come before each.
+        times_ns: (T,).
+        first_ns: the time of the log's first sample.
+    """
+    is_before = np.zeros(values.shape[1:], np.bool_)
+    for row, leaf in zip(is_before, leaves, strict=True):
+        for samples, duration_ns in set(iter_delays([leaf])):
+            row |= positions < (samples or 0)
+            if duration_ns is not None:
+                row |= times_ns - duration_ns < first_ns
+    return np.where(is_before, np.nan, values) if is_before.any() else values
+
+
+def _first_memory(table: PaperTable) -> PaperMemory:
+    nodes, room = len(table.rows), _FIRST_ROOM if table.columns else 1
+    return PaperMemory(
+        stamps=np.zeros(room, np.int64),
+        columns=np.full((table.columns, room), np.nan),
+        lost_columns=np.zeros((table.columns, room), np.int8),
+        value=np.full(nodes, np.nan),
+        lost_value=np.zeros(nodes, np.int8),
+        now=np.full(nodes, np.nan),
+        lost_now=np.zeros(nodes, np.int8),
+        left=np.full(nodes, np.nan),
+        lost_left=np.zeros(nodes, np.int8),
+        starts=np.full(nodes, -1, np.int64),
+        opens=np.zeros(nodes, np.int64),
+        pairs=np.empty(0),
+        lost_pairs=np.empty(0, np.int8),
+        pair_starts=np.zeros((table.pairs, room), np.int64),
+        pair_end=np.zeros(1, np.int64),
+    )
+
+
+def _longer(array: np.ndarray, more: int) -> np.ndarray:
+    """Return the array with room for more along its last axis."""
+    return np.concatenate([array, np.zeros((*array.shape[:-1], more), array.dtype)], axis=-1)
+
+
+def check_operators(specification: Specification) -> None:
+    """Check that all temporal operators of the result specs are the paper's.
+
+    Raises:
+        UsageError: the first other operator, with its place.
+    """
+    for spec in specification.results:
+        for _, _, node in iter_nodes(spec.formula):
+            if isinstance(node, Temporal) and node.operator not in OPERATORS:
+                source = SourceText.of(specification.source, specification.filename)
+                fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
+                remedy = "write it with X, F, G and U"
+                if node is spec.formula and has_rate(node):
+                    remedy = "a rate of change is read from the second sample on: write X in front"
+                raise UsageError(
+                    f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, as {spec.name} has; "
+                    f"{remedy}, or evaluate with the semantics 'ltlf'"
+                )
 
 
 def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -> Semantics:
@@ -31,16 +690,6 @@ def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -
         for specification in specifications:
             check_operators(specification)
     return cast(Semantics, name)
-
-
-def require_ltlf(semantics: Semantics, what: str) -> None:
-    """Check that results have signals, windows and witnesses, which only "ltlf" defines.
-
-    Raises:
-        UsageError: other semantics.
-    """
-    if semantics != "ltlf":
-        raise UsageError(f"{what} is not defined under the semantics {semantics!r}; evaluate with 'ltlf'")
 
 
 class Run(Protocol):

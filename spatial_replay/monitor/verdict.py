@@ -1,4 +1,4 @@
-"""Verdicts, online and at the end of a log."""
+"""Verdicts, online and at the end of a log, and the semantics that they are of."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from reprlib import repr as shortened
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from spatial_replay.errors import UsageError
 from spatial_replay.text import nearest_hint
+
+Semantics: TypeAlias = Literal["ltlf", "paper"]
+"""Robustness over finite traces, or the paper's Def. 16 to the letter."""
 
 FAILING_KINDS: Final = ("vacuous", "cut", "unknown")
 """Kinds of results that fail where asked (`fail_on`)."""
@@ -85,3 +88,13 @@ _BEST_FIRST: Final = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdi
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
     """Return the worst: violated, unknown, pending, satisfied; satisfied if there are none."""
     return max(verdicts, key=_BEST_FIRST.index, default=Verdict.SATISFIED)
+
+
+def require_ltlf(semantics: Semantics, what: str) -> None:
+    """Check that results have signals, windows and witnesses, which only "ltlf" defines.
+
+    Raises:
+        UsageError: other semantics.
+    """
+    if semantics != "ltlf":
+        raise UsageError(f"{what} is not defined under the semantics {semantics!r}; evaluate with 'ltlf'")

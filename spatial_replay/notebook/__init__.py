@@ -20,7 +20,6 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.automata.automaton": "automaton_view",
         "spatial_replay.compare.runs": "study_view",
         "spatial_replay.compare.specifications": "study_view",
-        "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",
         "spatial_replay.planning.decisions": "planning_view",
         "spatial_replay.planning.maps": "planning_view",

@@ -14,8 +14,7 @@ from spatial_replay.annotate.specification import unit_of, unit_words
 from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
-from spatial_replay.monitor.evaluate import Evaluation
-from spatial_replay.monitor.result import RESULT_COLUMNS, RESULT_TIMES, SpecResult, worst_first
+from spatial_replay.monitor.result import RESULT_COLUMNS, RESULT_TIMES, Evaluation, SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (

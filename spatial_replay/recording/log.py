@@ -56,9 +56,9 @@ from spatial_replay.logs.messages import (
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.monitor import SpecUpdate, Update
 from spatial_replay.monitor.sentences import verdict_text
+from spatial_replay.monitor.stream import find_instances
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification

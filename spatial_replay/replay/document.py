@@ -8,12 +8,11 @@ from typing import Any
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.causes import Cause
 from spatial_replay.monitor.result import RESULT_COLUMNS, NodeResult, SpecResult, no_such_node
-from spatial_replay.monitor.sentences import sentences_of
+from spatial_replay.monitor.sentences import Cause, sentences_of
 from spatial_replay.monitor.vacuity import UntestedPart
 from spatial_replay.monitor.verdict import Verdict, online_verdict
-from spatial_replay.monitor.witness.atom import Measured
+from spatial_replay.monitor.witness.path import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes

@@ -40,11 +40,10 @@ from spatial_replay.logs.messages import (
     read_ahead,
 )
 from spatial_replay.monitor.result import SpecResult, worst_first
-from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
 from spatial_replay.monitor.vacuity import UntestedPart, idle_templates
-from spatial_replay.monitor.verdict import Verdict, worst_verdict
+from spatial_replay.monitor.verdict import Semantics, Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,

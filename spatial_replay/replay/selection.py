@@ -38,9 +38,10 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
-from spatial_replay.monitor.atoms.delays import look_back
-from spatial_replay.monitor.instances import Instance, check_parameters, find_instances
-from spatial_replay.monitor.semantics import Semantics, checked_semantics
+from spatial_replay.monitor.atoms.terms import look_back
+from spatial_replay.monitor.semantics import checked_semantics
+from spatial_replay.monitor.stream import Instance, check_parameters, find_instances
+from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_bound, format_duration

@@ -41,7 +41,7 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.replay.engine import Replay, load_files, run_replay
 from spatial_replay.replay.selection import CLIP_METADATA, KEEP_ALL, ReplayOptions, Window, clipped_source
 from spatial_replay.spec.formula import Specification

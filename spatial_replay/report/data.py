@@ -17,7 +17,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import NodeResult, SpecResult, worst_first
 from spatial_replay.monitor.sentences import divisor_of, open_text
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.atom import DecidingAtom
+from spatial_replay.monitor.witness.path import DecidingAtom
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.palette import CURVES, SIGNS
 from spatial_replay.replay.engine import Replayed

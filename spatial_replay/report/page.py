@@ -15,8 +15,8 @@ from types import MappingProxyType
 from typing import Final
 
 from spatial_replay import __version__
-from spatial_replay.monitor.causes import settled_time
 from spatial_replay.monitor.result import SpecResult, worst_first
+from spatial_replay.monitor.sentences import settled_time
 from spatial_replay.monitor.verdict import Verdict, counts_text
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import SIGNS

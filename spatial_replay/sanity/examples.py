@@ -18,7 +18,7 @@ import numpy as np
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject, centre_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
-from spatial_replay.monitor.evaluate import Evaluation, evaluate
+from spatial_replay.monitor.result import Evaluation, evaluate
 from spatial_replay.sanity.conditions import (
     Fact,
     Quantity,

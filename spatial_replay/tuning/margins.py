@@ -17,8 +17,8 @@ from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.instances import Instance, find_instances
 from spatial_replay.monitor.offline import OfflineFormula, new_leaves
+from spatial_replay.monitor.stream import Instance, find_instances
 from spatial_replay.spec import check_names
 from spatial_replay.spec.constants import text_of, value_given
 from spatial_replay.spec.diagnostics import nearest_hint

@@ -20,8 +20,7 @@ from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.scene.scene_update import PERIOD_NS, SceneEncoder
 from spatial_replay.annotate.violations import EvaluatedResult
 from spatial_replay.logs.messages import MemorySource
-from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
+from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock, find_instances
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
 

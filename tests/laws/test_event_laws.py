@@ -27,9 +27,9 @@ from spatial_replay.annotate.events import (
     track,
 )
 from spatial_replay.annotate.specification import reported_trees
-from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.semantics import checked_semantics
+from spatial_replay.monitor.stream import EvaluationStream, find_instances
+from spatial_replay.monitor.verdict import Semantics
 
 _VALUES = st.one_of(st.sampled_from([-2.0, -1.0, 0.0, 1.0, math.inf, -math.inf]), st.just(math.nan))
 _SETTLED = st.sampled_from([None] * 12 + [0.5, -0.5])

@@ -18,8 +18,7 @@ import spatial_replay as sr
 from examples import examples
 from laws.strategies_monitor import recordings, specifications
 from spatial_replay.compiled import only
-from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.stream import EvaluationStream, find_instances
 from spatial_replay.trace.trace import FOREVER
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"

@@ -41,10 +41,9 @@ from laws.strategies_monitor import (
     windows_of,
 )
 from spatial_replay import Monitor, Verdict, evaluate
-from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
-from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.stream import EvaluationStream, find_instances
 from spatial_replay.monitor.verdict import final_verdict, online_verdict
 from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth, iter_nodes
 from spatial_replay.trace.trace import FOREVER

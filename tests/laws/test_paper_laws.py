@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from examples import examples
 from laws.strategies_monitor import LEAVES, WORDS, bounds, cuts, recordings, specifications
 from spatial_replay import Monitor, UsageError, evaluate
-from spatial_replay.monitor.paper import PaperRun
+from spatial_replay.monitor.semantics import PaperRun
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Temporal, Truth, iter_nodes
 
 LOST, LEFT_OUT = "lost", "left out"

@@ -11,7 +11,7 @@ import pytest
 from monitor.scenes import SECOND, judged, numbers, points, root
 from spatial_replay import Monitor, Trace, UsageError, Verdict, evaluate, parse_specification
 from spatial_replay.monitor.atoms.instructions import MAX_BINDINGS
-from spatial_replay.monitor.online.operators import MAX_VARIABLES
+from spatial_replay.monitor.online.program import MAX_VARIABLES
 from spatial_replay.monitor.verdict import final_verdict, online_verdict, worst_verdict
 
 TWO_SPECS = """\

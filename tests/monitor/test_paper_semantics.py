@@ -11,7 +11,7 @@ import pytest
 from monitor.scenes import SECOND, judged, numbers, points, root
 from monitor.test_published import SCENES, TOLERANCE, sample_from_frame
 from spatial_replay import Monitor, Trace, UsageError, evaluate, parse_specification, read_trace
-from spatial_replay.monitor.paper import PaperRun
+from spatial_replay.monitor.semantics import PaperRun
 from spatial_replay.spec.formula import Atom, Signal, Temporal
 
 

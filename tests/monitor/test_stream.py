@@ -7,9 +7,8 @@ import pytest
 
 from monitor.scenes import SECOND, numbers, points
 from spatial_replay import Footprint, Sample, Trace, TraceError, parse_specification
-from spatial_replay.monitor.atoms.delays import look_back
-from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.atoms.terms import look_back
+from spatial_replay.monitor.stream import EvaluationStream, find_instances
 from spatial_replay.trace.trace import FOREVER
 
 

@@ -35,7 +35,7 @@ def test_without_matplotlib_pages_are_shown():
     "used",
     [
         "spatial_replay.automata.automaton",
-        "spatial_replay.monitor.evaluate",
+        "spatial_replay.monitor.result",
         "spatial_replay.planning.planner",
         "spatial_replay.spec.load",
     ],

@@ -37,10 +37,18 @@ from spatial_replay.geometry.footprint import (
 )
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import QUANTITY_CODES, closest_rows, misalignment_of
-from spatial_replay.monitor.atoms.delays import NO_DELAY, PREVIOUS, Delay, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
 from spatial_replay.monitor.atoms.measurements import quantity_of
-from spatial_replay.monitor.atoms.terms import footprint_from_outline, left_out_of, open_group
+from spatial_replay.monitor.atoms.terms import (
+    NO_DELAY,
+    PREVIOUS,
+    Delay,
+    RecentSamples,
+    footprint_from_outline,
+    iter_delays,
+    left_out_of,
+    open_group,
+)
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     STEP,

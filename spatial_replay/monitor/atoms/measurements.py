@@ -19,8 +19,7 @@ from spatial_replay.geometry.measure import (
     measure,
     misalignment,
 )
-from spatial_replay.monitor.atoms.closest_pair import ClosestPair
-from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
+from spatial_replay.monitor.atoms.instructions import ClosestPair, LeafCode, Membership, run_instructions
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.spec.formula import (
     Centre,

@@ -66,7 +66,7 @@ PART_END_UNIT, PART_ENDS_AT = 8, 9
 PART_HAS_NOW = 10  # whether it says what it is at the newest sample, too
 PART_IS_MONOTONE = 11  # whether what the root joins by the minimum never falls, or the other way round
 # kinds of parts
-TABLE, WINDOWED = 0, 1  # see `tables`, `windows`
+TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 
 # columns of reports: the index is of the signal or part, the rule is for now
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)

@@ -17,33 +17,411 @@ cannot exceed the least of its closed positions, and later samples may always be
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
+from itertools import islice
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
+from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.operators import (
-    NOTHING,
-    PartRows,
-    Row,
-    SignalTable,
-    array_of_rows,
-    operand_rows,
-    part_of,
-)
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
     Boolean,
+    Bound,
     Formula,
     Quantified,
     Temporal,
+    Truth,
+    expand,
+    operands_of,
 )
-from spatial_replay.spec.walks import looks_ahead, nodes_with_operands
+from spatial_replay.spec.walks import leaf_key, looks_ahead, nodes_with_operands
+
+Row = tuple[int, ...]
+"""A row of a table, its columns as `codes` lists them."""
+
+NOTHING = -1
+"""Stands where a row has no operand, no upper end, no variable, no table or no window."""
+
+
+def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
+    """Return the unit, the lower and the upper end (None: unbounded) of an operator's window."""
+    if bound is None:
+        return codes.SAMPLES, 0, None
+    return (codes.SAMPLES if bound.unit == "samples" else codes.NANOSECONDS), bound.lower, bound.upper
+
+
+def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
+    """Return rows as an array (R, width), also for R = 0; zeros follow a shorter row."""
+    padded = [(*row, *(0,) * (width - len(row))) for row in rows]
+    return np.array(padded, np.int64).reshape(len(rows), width)
+
+
+def _operands_of_row(row: Row) -> tuple[int, ...]:
+    """Return the rows of a `SignalTable` that one of them is computed from."""
+    code, a, b, *_ = row
+    if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
+        return ()
+    return (a, b) if code in (codes.AND, codes.OR, codes.SINCE) else (a,)
+
+
+class SignalTable:
+    """Collects rows; equal subformulas share one, and operands come before what they are operands of.
+
+    Attributes:
+        leaves: atoms and open quantifiers, by the number that their rows refer to.
+    """
+
+    def __init__(self, leaves: Sequence[Atom | Quantified] = ()) -> None:
+        """Begin with leaves that are numbered already."""
+        self.leaves: list[Atom | Quantified] = []
+        self._leaf_numbers: dict[object, int] = {}
+        self._rows: dict[Row, int] = {}
+        # an expansion holds an operand more than once; without this, nested ones would take 2**depth steps
+        self._added: dict[int, tuple[Formula, int]] = {}
+        for leaf in leaves:
+            self._leaf_number(leaf)
+
+    def __len__(self) -> int:
+        """Return how many rows there are."""
+        return len(self._rows)
+
+    @property
+    def windows(self) -> int:
+        """How many rings of positions the rows keep."""
+        return sum(row[0] in codes.RINGS for row in self._rows)
+
+    @property
+    def keeps_history(self) -> bool:
+        """Whether any row looks at more than the newest sample."""
+        return any(row[0] in (*codes.RINGS, codes.DELAY) for row in self._rows)
+
+    def array(self, kept: Iterable[int]) -> Integers:
+        """Return the table (S, SIGNAL_WIDTH), with its rings numbered.
+
+        Args:
+            kept: the rows that parts look at behind the newest sample.
+        """
+        rings = [row for row in self._rows if row[0] in codes.RINGS]
+        looked_at = set(kept)
+        for row in self._rows:
+            if row[0] in (*codes.RINGS, codes.DELAY):
+                looked_at.update(_operands_of_row(row))
+        rows = [
+            (*row, rings.index(row) if row in rings else NOTHING, int(number in looked_at))
+            for number, row in enumerate(self._rows)
+        ]
+        return array_of_rows(rows, codes.SIGNAL_WIDTH)
+
+    def add(self, formula: Formula) -> int:
+        """Return the row of a formula without future operators."""
+        formula = expand(formula)
+        if id(formula) not in self._added:
+            operands = [self.add(each) for each in operands_of(formula)]
+            self._added[id(formula)] = formula, self._added_row(formula, operands)
+        return self._added[id(formula)][1]
+
+    def _added_row(self, formula: Formula, operands: list[int]) -> int:
+        match formula:
+            case Truth():
+                return self.row(codes.CONSTANT, low=1 if formula.value else -1)
+            case Atom() | Quantified():
+                return self.row(codes.LEAF, self._leaf_number(formula))
+            case Boolean():
+                return self._boolean(formula.operator, operands)
+            case Temporal():
+                return self._temporal(formula.operator, operands, formula.bound)
+
+    def row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
+        """Return the place of a row, which is added unless there is one like it."""
+        return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
+
+    def _leaf_number(self, formula: Atom | Quantified) -> int:
+        key = leaf_key(formula)
+        if key not in self._leaf_numbers:
+            self._leaf_numbers[key] = len(self.leaves)
+            self.leaves.append(formula)
+        return self._leaf_numbers[key]
+
+    def _boolean(self, operator: str, operands: list[int]) -> int:
+        first, *rest = operands
+        if operator == "not":
+            return self.row(codes.NOT, first)
+        for operand in rest:
+            first = self.row(codes.AND if operator == "and" else codes.OR, first, operand)
+        return first
+
+    def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
+        """Add a past operator; with `codes.AHEAD`, the future operator that mirrors it in time."""
+        unit, low, high = window_of(bound)
+        match operator:
+            case "Y":
+                return self.delay(operands[0], codes.SAMPLES, 1, ahead)
+            case "S":
+                left, right = operands
+                return self.since(left, right, unit, low, high, ahead)
+        is_weak = operator == "H"
+        if high is not None:
+            code = codes.WINDOW_MIN if is_weak else codes.WINDOW_MAX
+            return self.row(code + ahead, operands[0], 0, unit, low, high)
+        running = self.row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
+        return running if low == 0 else self.delay(running, unit, low, ahead, is_weak=is_weak)
+
+    def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
+        """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and phi S
+        psi before. Min distributes over max, so both are exact for robustness too."""
+        result = self.row(codes.SINCE + ahead, left, right)
+        if low > 0:
+            before = self.delay(result, unit, low, ahead)
+            since = self.row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
+            result = self.row(codes.AND, since, before)
+        if high is not None:
+            within = self.row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
+            result = self.row(codes.AND, within, result)
+        return result
+
+    def elapsed(self, unit: int, distance: int, sign: int) -> int:
+        """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
+        return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
+
+    def elapsed_at(self, signal: int) -> tuple[int, int] | None:
+        """Return the unit and the distance of what `elapsed` adds; None for another row."""
+        code, _, _, unit, distance, _ = next(islice(self._rows, signal, None))
+        return (unit, distance) if code == codes.ELAPSED else None
+
+    def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
+        """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
+        return self.row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
+
+
+MAX_VARIABLES = 12
+"""How many unbounded future operators one part may nest: its table has 2**variables entries."""
+
+LAST = (1 << 63) - 1
+"""No sample comes later, in samples or in ns."""
+
+_RUNNING = (codes.UNTIL, codes.RELEASE)
+_RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
+
+
+def part_of(signals: SignalTable, node: Temporal) -> PartRows:
+    """Return the part of a node that looks ahead.
+
+    Raises:
+        UsageError: more than `MAX_VARIABLES` unbounded future operators.
+    """
+    part = PartRows(signals, node)
+    if part.variables > MAX_VARIABLES:
+        raise UsageError(
+            f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
+            f"{MAX_VARIABLES} is the limit: split it into specs joined by `and`"
+        )
+    return part
+
+
+class PartRows:
+    """The rows of a node that looks ahead, in negation normal form: operands first, equal ones once.
+
+    Attributes:
+        variables: how many operators take a value from the next sample on.
+        tables: 1, and one for each past operator that carries a table of its own.
+    """
+
+    def __init__(self, signals: SignalTable, root: Temporal) -> None:
+        """Build the part of a node; `signals` receives the subformulas that do not look ahead."""
+        self.variables = 0
+        self.tables = 1
+        self._rows: dict[Row, int] = {}
+        self._signals = signals
+        self._is_past = root.operator not in FUTURE_OPERATORS
+        self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
+        is_bounded = root.bound is not None or root.operator in ("X", "WX")
+        if is_bounded and not self._is_past:
+            self._ending(root, True)
+        else:
+            self._add(root, True)
+
+    def rows(self) -> tuple[Row, ...]:
+        """Return rows with the numbers of their variable and table, and whether they depend on either."""
+        variable = 0
+        table = 1  # the part's own is 0
+        result: list[Row] = []
+        for *fields, is_variable in self._rows:
+            has_table = fields[0] in _RECURRENT_PAST
+            below = any(result[each][-1] for each in operand_rows(*fields[:3]))
+            result.append(
+                (
+                    *fields,
+                    variable if is_variable else NOTHING,
+                    table if has_table else NOTHING,
+                    int(is_variable or has_table or below),
+                )
+            )
+            variable += is_variable
+            table += has_table
+        return tuple(result)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether one sample settles everything but the variables: no window, shift or past operator."""
+        flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR)
+        # what a past operator is now is asked for, too, although nothing past is left of `H[0,5] G G x`
+        is_flat = all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
+        return is_flat and not self._is_past
+
+    @property
+    def end_corner(self) -> int:
+        """The corner of the table that ends a run: +inf for weak operators, -inf for strong ones."""
+        weak = [row[3] for row in self._rows if row[-1]]
+        return sum(1 << variable for variable, is_weak in enumerate(weak) if is_weak)
+
+    def row(
+        self,
+        code: int,
+        a: int = 0,
+        b: int = 0,
+        weak: int = 0,
+        unit: int = 0,
+        low: int = 0,
+        high: int = 0,
+        variable: bool = False,
+    ) -> int:
+        """Return the place of a row, which is added unless there is one like it."""
+        key = (code, a, b, weak, unit, low, high, int(variable))
+        if key not in self._rows:
+            self._rows[key] = len(self._rows)
+            self.variables += variable
+            self.tables += code in _RECURRENT_PAST
+        return self._rows[key]
+
+    def _add(self, formula: Formula, positive: bool) -> int:
+        """Return the row of a formula, or of its negation, in negation normal form.
+
+        Each is built once in either polarity: the expansion of `xor` holds its operands in both.
+        """
+        formula = expand(formula)
+        while isinstance(formula, Boolean) and formula.operator == "not":
+            formula, positive = expand(formula.operands[0]), not positive
+        key = (id(formula), positive)
+        if key not in self._added:
+            self._added[key] = formula, self._built(formula, positive)
+        return self._added[key][1]
+
+    def _built(self, formula: Formula, positive: bool) -> int:
+        if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
+            operands = [self._add(each, positive) for each in formula.operands]
+            if isinstance(formula, Boolean):
+                is_both = (formula.operator == "and") == positive
+                return reduce(partial(self._join, is_both=is_both), operands)
+            build = self._future if formula.operator in FUTURE_OPERATORS else self._past
+            return build(formula.operator, operands, formula.bound, positive)
+        return self.row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
+
+    def _join(self, first: int, second: int, *, is_both: bool) -> int:
+        return self.row(codes.PART_AND if is_both else codes.PART_OR, first, second)
+
+    def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
+        left, right, bound = _as_until(operator, operands, bound)
+        # in its polarity the node is an until or a release, the negation of an until
+        is_until = (operator != "G") == positive
+        return self._bounded(left, right, *window_of(bound), is_until=is_until)
+
+    def _bounded(
+        self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
+    ) -> int:
+        """Add until or release over a window, by the identity that `SignalTable` uses for since."""
+        weak = int(not is_until)
+        own, other = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
+        within = None if high is None else self.row(own, right, 0, weak, unit, low, high)
+        if within is not None and left == NOTHING:
+            return within
+        code = codes.UNTIL if is_until else codes.RELEASE
+        running = self.row(code, left, right, weak, variable=high is None)
+        if low > 0 or high is not None:
+            running = self.row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
+        if low > 0 and left != NOTHING:
+            before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
+            running = self._join(before, running, is_both=is_until)
+        return running if within is None else self._join(within, running, is_both=is_until)
+
+    def _past(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
+        unit, low, high = window_of(bound)
+        if operator == "Y":
+            return self.row(codes.PAST_DELAY, operands[0], 0, int(not positive), codes.SAMPLES, 1)
+        left, right = (NOTHING, operands[0]) if operator in ("O", "H") else operands
+        is_since = (operator in ("O", "S")) == positive
+        weak = int(not is_since)
+        own, other = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
+        within = None if high is None else self.row(own, right, 0, weak, unit, low, high)
+        if within is not None and left == NOTHING:
+            return within
+        result = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
+        if low > 0:
+            result = self.row(codes.PAST_DELAY, result, 0, weak, unit, low)
+            if left != NOTHING:
+                before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
+                result = self._join(before, result, is_both=is_since)
+        return result if within is None else self._join(within, result, is_both=is_since)
+
+    def _ending(self, formula: Formula, positive: bool) -> int:
+        """Return the row of a bounded operator of which only the value at the first sample is needed.
+
+        Its window is a fixed stretch of the run. In an until, say, positions outside the window are -inf, and
+        so is the operand that has to hold so far where the window ends: later samples are out of reach.
+        """
+        formula = expand(formula)
+        if isinstance(formula, Boolean) and formula.operator == "not":
+            return self._ending(formula.operands[0], not positive)
+        if not isinstance(formula, Temporal):
+            # W is U or G
+            sides = [self._ending(each, positive) for each in operands_of(formula)]
+            return reduce(partial(self._join, is_both=not positive), sides)
+        operands = [self._add(each, positive) for each in formula.operands]
+        left, body, bound = _as_until(formula.operator, operands, formula.bound)
+        unit, low, high = window_of(bound)
+        is_until = (formula.operator != "G") == positive
+        sign = -1 if is_until else 1
+        if low > 0:
+            body = self._join(body, self._elapsed(unit, low, -sign), is_both=is_until)
+        if high is not None:
+            end = self._elapsed(unit, high, sign)
+            left = end if left == NOTHING else self._join(left, end, is_both=is_until)
+            if high < LAST:
+                body = self._join(body, self._elapsed(unit, high + 1, sign), is_both=is_until)
+        code = codes.UNTIL if is_until else codes.RELEASE
+        return self.row(code, left, body, int(not is_until), variable=True)
+
+    def _elapsed(self, unit: int, distance: int, sign: int) -> int:
+        """Return the row of an infinity that changes its sign a distance from the first sample on."""
+        return self.row(codes.LITERAL, self._signals.elapsed(unit, distance, sign))
+
+
+def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[int, int, Bound | None]:
+    """Return the operands and bound of U for a future operator: X is F[1,1]; F and G have no left operand."""
+    if operator == "U":
+        return operands[0], operands[1], bound
+    return NOTHING, operands[0], Bound(1, 1, "samples") if operator == "X" else bound
+
+
+def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
+    """Which extremum an until or since takes of its right operand, and which of its left one."""
+    return (greatest, least) if is_strong else (least, greatest)
+
+
+def operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
+    """Return the rows of a node's operands."""
+    if code == codes.LITERAL:
+        return ()
+    if code in codes.BINARY_NODES:
+        return (a, b) if a != NOTHING else (b,)
+    return (a,)
+
 
 NEVER = codes.SAMPLES, NOTHING
 """The end of a root that has none."""

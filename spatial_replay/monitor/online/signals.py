@@ -1,7 +1,15 @@
-"""Signals: subformulas without future operators.
+"""Signals, and tables: all of a formula that takes no window ahead.
 
-Their robustness is final with its sample. So it is computed forwards, once, with a little state for past
-operators.
+A signal is a subformula without future operators. Its robustness is final with its sample. So it is computed
+forwards, once, with a little state for past operators.
+
+A table is the value of a formula at the first sample as a function of what is still to come. Let x_1 … x_m
+be the values that the unbounded temporal subformulas of a part will have at the next sample. In negation
+normal form the part's value is a monotone lattice polynomial of them (minima and maxima only). Its values
+at the corners x in {-inf, +inf}^m therefore determine it: they are its table of 2^m numbers. A new sample
+substitutes for each x_j the formula that it expands to (max(psi, min(phi, x)) for an until) and reads the
+old table at that point. The first and the last entry bound the value over every continuation. The corner
+with strong operators at -inf and weak ones at +inf is the value if the run ends here.
 """
 
 from __future__ import annotations
@@ -148,3 +156,153 @@ def run_signals(
             memory[c, s] = history[c, s, end - 1]
             if position == 0:
                 memory[c, number + s] = history[c, s, begin]
+
+
+# rows that a part works with, after one for each of its nodes; what it says comes after them
+VALUES, FRESH, POINT, SAYS = range(4)
+EXTRA_ROWS = 6
+
+
+@inlined
+def read_table(tables: Floats, row: int, first: int, variables: int, points: Floats, point: int) -> float:
+    """Read a table at a point: walk its corners in descending order of the coordinates.
+
+    Args:
+        tables, row, first: where the table begins.
+        points, point: the row of the point.
+    """
+    # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
+    result, corner = tables[row, first], 0
+    for _ in range(variables):
+        greatest = -1
+        for j in range(variables):
+            if not corner >> j & 1 and (greatest < 0 or points[point, j] > points[point, greatest]):
+                greatest = j
+        corner |= 1 << greatest
+        result = max(result, min(points[point, greatest], tables[row, first + corner]))
+    return float(result)
+
+
+@inlined
+def _start(
+    rows: Integers, first: int, end: int, corners: int, memory: Floats, channel: int, table: int,
+    work: Floats, values: int,
+) -> None:  # fmt: skip
+    """Fill the table before the first sample: each operator as it is there."""
+    for corner in range(corners):
+        for d in range(end - first):
+            variable, a, b = rows[first + d, codes.NODE_VARIABLE], rows[first + d, codes.NODE_A], 0
+            if variable >= 0:
+                work[values, d] = np.inf if corner >> variable & 1 else -np.inf
+            elif rows[first + d, codes.NODE_CODE] == codes.PART_OR:
+                b = rows[first + d, codes.NODE_B]
+                work[values, d] = max(work[values, a], work[values, b])
+        memory[channel, table + corner] = work[values, end - 1 - first]
+
+
+@inlined
+def _fill_columns(
+    rows: Integers, first: int, end: int, history: Floats, channel: int, begin: int, count: int,
+    work: Floats, top: int,
+) -> None:  # fmt: skip
+    """Compute the nodes that depend on no variable, over some samples."""
+    for d in range(end - first):
+        row, own = first + d, top + d
+        code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], top + rows[row, codes.NODE_B]
+        if code == codes.LITERAL:
+            for k in range(count):
+                work[own, k] = history[channel, a, begin + k]
+        elif not rows[row, codes.NODE_DEPENDS]:
+            if code == codes.PART_AND:
+                for k in range(count):
+                    work[own, k] = min(work[top + a, k], work[b, k])
+            elif code == codes.PART_OR:
+                for k in range(count):
+                    work[own, k] = max(work[top + a, k], work[b, k])
+
+
+@inlined
+def _run_simple(
+    rows: Integers, root: int, end_corner: int, memory: Floats, channel: int, table: int, work: Floats,
+    top: int, says: int, count: int,
+) -> None:  # fmt: skip
+    """Run a part that is a single until or release: a table of two numbers."""
+    low, high = memory[channel, table], memory[channel, table + 1]
+    has_left, a, b = rows[root, codes.NODE_A] >= 0, rows[root, codes.NODE_A], rows[root, codes.NODE_B]
+    is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
+    for k in range(count):
+        right = work[top + b, k]
+        if is_until:
+            least, most = right, max(right, work[top + a, k]) if has_left else np.inf
+        else:
+            least, most = min(right, work[top + a, k]) if has_left else -np.inf, right
+        low, high = max(low, min(least, high)), max(low, min(most, high))
+        work[says + 1, k], work[says + 2, k] = low, high
+        work[says, k] = high if end_corner else low
+    memory[channel, table], memory[channel, table + 1] = low, high
+
+
+@piece
+def run_table(
+    rows: Integers, part: int, history: Floats, channel: int, memory: Floats, table: int, work: Floats,
+    top: int, position: int, begin: int, count: int,
+) -> int:  # fmt: skip
+    """Substitute samples into the table of a part without windows, in one channel.
+
+    Args:
+        part: its row.
+        table: where it begins in the `memory` of the channel.
+        top: the first row of `work` that there is room in.
+        position: of the first of the `count` samples; they stand at `begin` in the history.
+
+    Returns:
+        The first of the rows of `work` that say what it is, and its lower and upper bound.
+    """
+    first, end = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
+    variables, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]
+    nodes, corners, root = end - first, 1 << variables, rows[end - 1, codes.NODE_CODE]
+    values, fresh, point, says = (
+        top + nodes + VALUES,
+        top + nodes + FRESH,
+        top + nodes + POINT,
+        top + nodes + SAYS,
+    )
+    if position == 0:
+        _start(rows, first, end, corners, memory, channel, table, work, values)
+    elif memory[channel, table] == memory[channel, table + corners - 1]:
+        # it no longer changes
+        for k in range(count):
+            work[says, k] = work[says + 1, k] = work[says + 2, k] = memory[channel, table]
+        return int(says)
+    _fill_columns(rows, first, end, history, channel, begin, count, work, top)
+    if variables == 1 and root in (codes.UNTIL, codes.RELEASE):
+        _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, says, count)
+        return int(says)
+    for k in range(count):
+        for d in range(nodes):
+            # what depends on no variable is the same at every corner
+            if not rows[first + d, codes.NODE_DEPENDS]:
+                work[values, d] = work[top + d, k]
+        for corner in range(corners):
+            for row in range(first, end):
+                if not rows[row, codes.NODE_DEPENDS]:
+                    continue
+                code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], rows[row, codes.NODE_B]
+                if code == codes.PART_AND:
+                    value = min(work[values, a], work[values, b])
+                elif code == codes.PART_OR:
+                    value = max(work[values, a], work[values, b])
+                else:
+                    variable, is_until = rows[row, codes.NODE_VARIABLE], code == codes.UNTIL
+                    value = np.inf if corner >> variable & 1 else -np.inf
+                    if a >= 0:
+                        value = min(work[values, a], value) if is_until else max(work[values, a], value)
+                    value = max(work[values, b], value) if is_until else min(work[values, b], value)
+                    work[point, variable] = value
+                work[values, row - first] = value
+            work[fresh, corner] = read_table(memory, channel, table, variables, work, point)
+        for corner in range(corners):
+            memory[channel, table + corner] = work[fresh, corner]
+        work[says, k] = memory[channel, table + end_corner]
+        work[says + 1, k], work[says + 2, k] = memory[channel, table], memory[channel, table + corners - 1]
+    return int(says)

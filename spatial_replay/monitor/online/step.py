@@ -16,11 +16,18 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Empty, Floats, Integers
-from spatial_replay.monitor.online import codes, tables, windows
+from spatial_replay.monitor.online import codes, windows
 from spatial_replay.monitor.online.codes import CHANNELS, in_channels
 from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.signals import ENTERING, HEAD, RING, TAIL, run_signals
-from spatial_replay.monitor.online.tables import run_table
+from spatial_replay.monitor.online.signals import (
+    ENTERING,
+    EXTRA_ROWS,
+    HEAD,
+    RING,
+    TAIL,
+    run_signals,
+    run_table,
+)
 from spatial_replay.monitor.online.windows import run_windows
 
 NUMBERS = 8
@@ -292,7 +299,7 @@ class OnlineRun:
         nodes = max((len(rows) for rows in program.part_rows), default=0)
         corners = 1 << max((int(part[codes.PART_VARIABLES]) for part in program.parts), default=0)
         shape = (
-            NUMBERS * parts + (NUMBERS + SERIES) * reports + nodes + tables.EXTRA_ROWS,
+            NUMBERS * parts + (NUMBERS + SERIES) * reports + nodes + EXTRA_ROWS,
             max(tile, nodes, corners),
         )
         self._work = np.zeros(shape)

@@ -5,7 +5,7 @@ recent sample. A sample changes a column only where a window opens or closes wit
 changed. Columns are updated operands first, and each says between which positions it
 has changed.
 
-Positions of the root whose windows have all closed are absorbed into a table (see `tables`). It belongs to
+Positions of the root whose windows have all closed are absorbed into a table (see `signals`). It belongs to
 the *base*, the first position of the root that is not absorbed. It gives the root's value at the first sample
 as a function of each variable's value at the end of the table, its *boundary*. A past operator over one that
 looks ahead has a table of its own, which says what it is at one position, its *state*.
@@ -22,7 +22,7 @@ import numpy as np
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.tables import read_table
+from spatial_replay.monitor.online.signals import read_table
 
 CLOSING = 16
 """So many samples together are looked at for positions that have closed."""

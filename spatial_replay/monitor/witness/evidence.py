@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.atoms.terms import TraceScene, look_back, tail
 from spatial_replay.monitor.online.codes import joined_channels
+from spatial_replay.monitor.stream import Instance
 from spatial_replay.spec.formula import Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
 from spatial_replay.spec.walks import base_of, iter_atoms, logged_signals, named_members, substitute
 from spatial_replay.trace.trace import Trace, window_of

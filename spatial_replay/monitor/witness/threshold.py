@@ -16,9 +16,8 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished, new_leaves
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
-from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.path import End
+from spatial_replay.monitor.witness.path import DecidingAtom, End
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,

@@ -7,16 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished
+from spatial_replay.monitor.stream import Instance
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
-from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom, failed_implication
 from spatial_replay.monitor.witness.evidence import Evidence, Gap
 from spatial_replay.monitor.witness.path import (
+    DecidingAtom,
     DecidingPath,
     End,
     MissedResponse,
+    deciding_atom,
     deciding_path,
+    failed_implication,
     missed_response,
     short_title,
 )
