@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 
-NOTHING, SIGNED_DISTANCE, PROTRUSION = -1, 0, 1
+SIGNED_DISTANCE, PROTRUSION = 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
 CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
 
@@ -345,8 +345,6 @@ def measure_rows(
 ) -> None:
     """Fill `values` (K, T) with K quantities in the samples from `begin` to before `end`; see `measure`.
 
-    Pairs with the quantity `NOTHING` stay as they are.
-
     In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
     `member_start` (O + 1,) ends with the total. `edges` (V, 4), one for each vertex, is room to work in;
     calls for other samples may share it at the same time, since all write the same there.
@@ -357,7 +355,7 @@ def measure_rows(
     for block in range(begin, end, BLOCK):
         block_end = min(block + BLOCK, end)
         for k in range(len(quantity)):
-            if SIGNED_DISTANCE <= quantity[k] <= PROTRUSION:
+            if quantity[k] <= PROTRUSION:
                 for side in range(2):
                     operand = first[k] if side == 0 else second[k]
                     of_first = member_start[operand]
@@ -376,7 +374,7 @@ def measure_rows(
                 if quantity[k] == SIGNED_DISTANCE:
                     grown = enlargement[a] + enlargement[b]
                     values[k, t] = _union_distance(rows, members, a_members, b_members, grown)
-                elif quantity[k] == PROTRUSION:
+                else:
                     grown = enlargement[a] - enlargement[b]
                     values[k, t] = _union_protrusion(rows, members, a_members, b_members, grown)
 

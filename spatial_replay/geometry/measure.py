@@ -23,7 +23,6 @@ from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers, writable
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, FootprintBatch
 from spatial_replay.geometry.kernels import (
-    NOTHING,
     Rows,
     fill_contacts,
     fill_row,
@@ -40,7 +39,6 @@ Quantity: TypeAlias = Literal[
 QUANTITY_CODES: Mapping[str, int] = MappingProxyType(
     {name: code for code, name in enumerate(get_args(Quantity))}
 )
-_BETWEEN_TWO = frozenset({"signed_distance", "protrusion"})
 _SHARE = 16_384
 """So many quantities pay for a thread of their own."""
 _NO_ROWS = np.empty(0, dtype=np.int64)
@@ -93,13 +91,6 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     size = np.array([operand.rows.size for operand in operands], dtype=np.int64)
     values = np.empty((len(requests), operands[0].rows.shape[0] if operands else 0))
     codes = np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64)
-    if values.shape[1] > 1:
-        rests = [_rests(operand) for operand in operands]
-        still = [k for k, each in enumerate(requests) if all(rests[o] for o in _operands_of(each))]
-        if still:
-            once = [Operand(operand.rows[:1], operand.enlargement) for operand in operands]
-            values[still] = measure(batch, once, [requests[k] for k in still])
-            codes[still] = NOTHING
     arguments: Any = (
         *_arrays_of(batch),
         members,
@@ -121,16 +112,6 @@ def _arrays_of(batch: FootprintBatch) -> Any:
     """Return what kernels take first."""
     starts = (writable(batch.part_start), writable(batch.vertex_start))
     return (*starts, *map(writable, (batch.vertices, batch.radius, batch.bottom, batch.top)))
-
-
-def _rests(operand: Operand) -> bool:
-    """Return whether an operand has the same rows in all samples."""
-    rows = operand.rows
-    return bool((rows[0] == rows[-1]).all() and (rows == rows[0]).all())
-
-
-def _operands_of(request: MeasureRequest) -> tuple[int, ...]:
-    return (request.first, request.second) if request.quantity in _BETWEEN_TWO else (request.first,)
 
 
 def misalignment(first: Floats, second: Floats) -> Floats:

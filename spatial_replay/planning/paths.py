@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.compiled import kernel, piece
-from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Flags, Integers, read_only_integers
 
 ROOT_2 = math.sqrt(2.0)
@@ -42,14 +41,8 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
         free: (R, C), whether the path may cross a cell; the start need not be free.
         start: row and column.
         goals: (R, C), whether it may end in a cell, if that is free.
-
-    Raises:
-        UsageError: the start is outside the grid, or the arrays differ in shape.
     """
-    rows, columns = free.shape
     row, column = start
-    if goals.shape != free.shape or not (0 <= row < rows and 0 <= column < columns):
-        raise UsageError(f"no path from {start} over {free.shape} cells to goals among {goals.shape}")
     is_free = free.copy()
     is_free[row, column] = True
     ends = np.argwhere(goals & is_free)

@@ -70,17 +70,12 @@ _SAME_YAW: Final = math.radians(1.0)
 
 def settings_for(world: Tabletop) -> Settings:
     """Return the planner settings for a world."""
-    bodies, space = world.bodies, world.workspace
-    about = {
-        "skill": world.skill,
-        "area": [space.xmin, space.ymin, space.xmax, space.ymax],
-        "yaws": space.yaws,
-        "nearest": space.nearest,
-        "farthest": space.farthest,
-        "supports": [body.name for body in bodies if body.support],
-        "movable": [body.name for body in bodies if body.movable],
+    bodies = {
+        "supports": [body.name for body in world.bodies if body.support],
+        "movable": [body.name for body in world.bodies if body.movable],
     }
-    return changed_settings(None, {**about, **_PRESETS[world.skill]})
+    given = {"skill": world.skill, **world.workspace, **bodies, **_PRESETS[world.skill]}
+    return changed_settings(None, given)
 
 
 def _settings(world: Tabletop, formula: Formula, changes: Mapping[str, Any]) -> Settings:
@@ -215,14 +210,15 @@ def record_plan(
     """
     files = [default_specification(scenario) if file is None else file, *also]
     kept, *others = logged_specifications(files, {})
-    _refuse_missing(kept, name)
-    for planned in [name] if name else [spec.name for spec in kept.results if len(kept.results) == 1]:
-        refuse_unsatisfiable(kept, planned)
+    results = [spec.name for spec in kept.results]
+    if name is not None and name not in results:
+        raise UsageError(f"{kept.filename} has no result {name!r}; its results are: {', '.join(results)}")
+    spec = chosen_spec(kept, name)
+    refuse_unsatisfiable(kept, spec.name)
     about = {**about_run(scenario, **conditions), "planned": "true"}
     # an error in the world or the planner leaves the output untouched
     with closing(make_world(scenario, **conditions)) as world:
         refuse_unknown_names([kept, *others], world.sample())
-        spec = chosen_spec(kept, name)
         settings = _settings(world, spec.formula, changes)
         planner = Planner(kept, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
@@ -245,7 +241,6 @@ def record_plan(
 
             world.attach(observe, lambda tick: _log_tick(log, tick, world.time_ns))
             last = run_plan(box, partial(execute_in, world, planner.settings), world.step)
-        own = {spec.name for spec in kept.results}
         return PlannedRun(
             samples=log.samples,
             seconds=log.seconds,
@@ -257,16 +252,9 @@ def record_plan(
             pruned=len(last.pruned),
             planning_s=box.planning_s,
             bounds=planner.bounds,
-            yaws="" if world.workspace.yaws or "yaws" in changes else _yaws_text(settings.workspace.yaws),
-            others={name: each for name, each in log.verdicts.items() if name not in own},
+            yaws="" if "yaws" in {*world.workspace, *changes} else _yaws_text(settings.workspace.yaws),
+            others={name: each for name, each in log.verdicts.items() if name not in results},
         )
-
-
-def _refuse_missing(file: Specification, name: str | None) -> None:
-    """Raise UsageError if a file has no result of a name."""
-    results = [spec.name for spec in file.results]
-    if name is not None and name not in results:
-        raise UsageError(f"{file.filename} has no result {name!r}; its results are: {', '.join(results)}")
 
 
 def warm_up_planner() -> None:

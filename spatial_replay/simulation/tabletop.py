@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module, resources
 from types import MappingProxyType
-from typing import TypeVar, Unpack
+from typing import Any, TypeVar, Unpack
 
 import numpy as np
 
@@ -35,7 +35,6 @@ from spatial_replay.simulation.world import (
     Conditions,
     Injection,
     Pose,
-    ReachableArea,
     Start,
     TreeTick,
     footprint,
@@ -83,7 +82,7 @@ class Scenario:
     Attributes:
         name: as on the command line.
         placements: the bodies in their initial poses.
-        workspace: where the robot can put bodies.
+        workspace: where the robot can put bodies, by the keys of settings files.
         skill: what the robot does with bodies.
         script: the motion of the robot without a planner.
         placing: how it picks and places, if that is its skill.
@@ -92,7 +91,7 @@ class Scenario:
 
     name: str
     placements: tuple[Placement, ...]
-    workspace: ReachableArea
+    workspace: Mapping[str, Any]
     skill: Skill
     script: Script
     placing: Placing = picking
@@ -175,8 +174,8 @@ class Tabletop:
         return tuple(each.body for each in self._scenario.placements)
 
     @property
-    def workspace(self) -> ReachableArea:
-        """Where the robot can place objects."""
+    def workspace(self) -> Mapping[str, Any]:
+        """Where the robot can place objects, by the keys of settings files."""
         return self._scenario.workspace
 
     @property

@@ -149,25 +149,6 @@ class Body:
     support: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class ReachableArea:
-    """The area in which the robot can place the centre of an object: a box and a ring around its base.
-
-    Attributes:
-        xmin, ymin, xmax, ymax: the box, in metres.
-        nearest, farthest: distances from the base, in metres.
-        yaws: allowed yaws of objects, in radians; none to keep theirs.
-    """
-
-    xmin: float
-    ymin: float
-    xmax: float
-    ymax: float
-    nearest: float = 0.0
-    farthest: float = math.inf
-    yaws: tuple[float, ...] = ()
-
-
 class TreeNode(NamedTuple):
     """A node of a behaviour tree.
 

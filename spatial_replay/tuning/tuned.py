@@ -581,8 +581,7 @@ class Search:
 
     def _conflict(self, point: Point) -> tuple[int, ...]:
         """Return the runs that conflict: one or two for which no point is found, else all that fail."""
-        margin = self._margins.margin
-        worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
+        worst = self._worst(point, [])
         for few in (*[[run] for run in worst], worst):
             if not self._all_hold(few, self._optimised(few, point)):
                 return tuple(few)
@@ -629,18 +628,9 @@ class Search:
         runs, end = [*self._bad, *self._good], self._steps[axis] if towards > 0 else 0
         if self._margins.directions[axis] is not None:
             return self._edge_of_each(point, axis, end, least)
-
-        def holds(number: int) -> bool:
-            nonlocal runs
-            moved = self._with(point, axis, number)
-            for index, run in enumerate(runs):
-                if not self._margins.holds(run, moved, least):
-                    # it is the likeliest to fail again
-                    runs = [run, *runs[:index], *runs[index + 1 :]]
-                    return False
-            return True
-
-        return last_that_holds(point[axis], end, holds)
+        return last_that_holds(
+            point[axis], end, lambda number: self._all_hold(runs, self._with(point, axis, number), least)
+        )
 
 
 MOST_RUNS: Final = 10_000

@@ -49,10 +49,11 @@ def test_all_bodies_start_in_reach_and_at_rest(name: str) -> None:
     with world(name, seed=3) as (made, _):
         before = {body.name: centre(made, body.name) for body in made.bodies}
         space = made.workspace
+        xmin, ymin, xmax, ymax = space["area"]
         for x, y in before.values():
-            assert space.xmin <= x <= space.xmax
-            assert space.ymin <= y <= space.ymax
-            assert space.nearest <= math.hypot(x, y) <= space.farthest
+            assert xmin <= x <= xmax
+            assert ymin <= y <= ymax
+            assert space["nearest"] <= math.hypot(x, y) <= space["farthest"]
         for _ in range(6):
             made.step()
         assert all(off(made, name, place) < 1e-3 for name, place in before.items())

@@ -8,7 +8,7 @@ from collections.abc import Generator
 from spatial_replay.planning.decisions import Outcome
 from spatial_replay.simulation.arm import Scene, picking
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import Body, Box, Cylinder, ReachableArea, Shape
+from spatial_replay.simulation.world import Body, Box, Cylinder, Shape
 
 
 def _thing(
@@ -56,7 +56,7 @@ SCENARIO = Scenario(
         _thing("kanelbulle", "bun", Cylinder(0.032, 0.03), (0.12, 0.55), 0.08, (0.7, 0.45, 0.2)),
         Placement(_PLATE, 0.48, 0.0, 0.0, 0.8, (0.9, 0.9, 0.95)),
     ),
-    workspace=ReachableArea(-0.3, -0.7, 0.7, 0.7, nearest=0.33, farthest=0.7),
+    workspace={"area": (-0.3, -0.7, 0.7, 0.7), "nearest": 0.33, "farthest": 0.7},
     skill="place",
     script=_script,
 )

@@ -7,7 +7,7 @@ from collections.abc import Generator
 from spatial_replay.planning.decisions import Outcome
 from spatial_replay.simulation.arm import Scene, pushing
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import Body, Box, ReachableArea
+from spatial_replay.simulation.world import Body, Box
 
 _BLOCK = Box(0.04, 0.04, 0.04)
 
@@ -34,7 +34,7 @@ SCENARIO = Scenario(
         _block("red", 0.47, -0.09, 0.4, (0.85, 0.2, 0.2)),
         _block("blue", 0.585, 0.1, 0.8, (0.2, 0.35, 0.85)),
     ),
-    workspace=ReachableArea(0.29, -0.2, 0.69, 0.2, nearest=0.3, farthest=0.71),
+    workspace={"area": (0.29, -0.2, 0.69, 0.2), "nearest": 0.3, "farthest": 0.71},
     skill="push",
     script=_script,
     scatter_m=0.008,

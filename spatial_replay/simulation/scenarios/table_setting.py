@@ -27,7 +27,7 @@ from spatial_replay.simulation.arm import (
     set_down,
 )
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import Body, Box, Cylinder, ReachableArea, TreeNode, TreeTick
+from spatial_replay.simulation.world import Body, Box, Cylinder, TreeNode, TreeTick
 
 # ----------------------------------------------------------------------------------------- the behaviour tree
 
@@ -229,15 +229,12 @@ SCENARIO = Scenario(
         # without a mass it is fixed
         Placement(_MAT, 0.48, 0.0, _UPRIGHT, 0.0, (0.3, 0.45, 0.4)),
     ),
-    workspace=ReachableArea(
-        -0.3,
-        -0.65,
-        0.68,
-        0.65,
-        nearest=0.33,
-        farthest=0.7,
-        yaws=(0.0, _UPRIGHT / 2, _UPRIGHT, 1.5 * _UPRIGHT),
-    ),
+    workspace={
+        "area": (-0.3, -0.65, 0.68, 0.65),
+        "nearest": 0.33,
+        "farthest": 0.7,
+        "yaws": (0.0, _UPRIGHT / 2, _UPRIGHT, 1.5 * _UPRIGHT),
+    },
     skill="place",
     script=_script,
     placing=_placing,
