@@ -21,8 +21,7 @@ from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, Semanti
 from spatial_replay.replay.engine import Replayed, load_files, recorded_texts, run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.replay.verification import Verified, verify_certificate
-from spatial_replay.report.comparison_page import write_comparison
-from spatial_replay.report.write import refuse_output
+from spatial_replay.report.write import refuse_output, write_comparison
 from spatial_replay.report.write import write_report as write_page
 from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.sources.overview import Overview, overview_of

@@ -36,8 +36,8 @@ from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import output_error, replacing
 from spatial_replay.logs.remote import is_address
 from spatial_replay.notebook.figures import Html, element
-from spatial_replay.report.compact import sentence_parts
 from spatial_replay.report.page import asset, html_page, text
+from spatial_replay.report.panels import sentence_parts
 from spatial_replay.report.write import write_report
 from spatial_replay.text import counted, cut, printable
 

@@ -241,11 +241,10 @@ class Suite:
         logs: Sequence[str],
         specs: Sequence[Path | str],
         conditions: Conditions = DEFAULT_CONDITIONS,
-        expectation: Expectation = DEFAULT_EXPECTATION,
     ) -> Suite:
         """Return a suite of one case, named "logs", with paths relative to the current folder."""
         patterns = tuple(LogPattern(log) for log in logs)
-        return cls("batch", Path(), (Case("logs", patterns, tuple(specs), conditions, expectation),))
+        return cls("batch", Path(), (Case("logs", patterns, tuple(specs), conditions),))
 
 
 def load_suite(path: str | PathLike[str]) -> Suite:

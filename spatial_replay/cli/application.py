@@ -82,6 +82,7 @@ FAMILIES = {
     "report": "replay",
     "export": "replay",
     "recover": "clip",
+    "falsify": "record",
 }
 """Commands that share the module of another one."""
 

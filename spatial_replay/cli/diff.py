@@ -98,7 +98,7 @@ def _of_specifications(
 ) -> SpecificationDiff:
     from spatial_replay.compare.specifications import diff_over_source
     from spatial_replay.replay.engine import recorded_texts
-    from spatial_replay.report.comparison_page import write_comparison
+    from spatial_replay.report.write import write_comparison
 
     if len(request.specs) > 2:
         raise UsageError(f"{len(request.specs)} specifications; give two: --spec OLD --spec NEW")
@@ -127,7 +127,7 @@ def _of_logs(
     request: EvaluationArguments, other: LogFile, align: str, output: Path | None, semantics: Semantics
 ) -> LogDiff:
     from spatial_replay.compare.runs import diff_sources
-    from spatial_replay.report.comparison_page import write_comparison
+    from spatial_replay.report.write import write_comparison
 
     first = open_inputs(request, can_do_without=True)
     second = open_inputs(replace(request, log=other), known=first.files, can_do_without=True)

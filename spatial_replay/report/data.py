@@ -21,11 +21,11 @@ from spatial_replay.monitor.witness.path import DecidingAtom
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.palette import CURVES, SIGNS
 from spatial_replay.replay.engine import Replayed
-from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.report.panels import (
     MOST_EVENTS,
     MOST_NODES,
     NO_PICTURES,
+    Packing,
     ReportedDecisions,
     ReportedScene,
     StatePath,
@@ -36,13 +36,15 @@ from spatial_replay.report.panels import (
     named_nodes,
     requirement_values,
     scene_value,
+    sentence_parts,
     shown_nodes,
+    singles,
     start_of,
     tree_value,
 )
 from spatial_replay.spec.formula import Quantified, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.text import Sentence, json_number
+from spatial_replay.text import Sentence, json_fields, json_number
 from spatial_replay.trace.units import Axes
 
 MANY: Final = 6
@@ -325,10 +327,7 @@ def _result_value(
     # (nodes, 4, samples), of the shown nodes
     series = each.result.series[list(shown_nodes(each.result.formula))][:, :, samples]
     value: dict[str, Any] = {
-        "title": each.result.title,
-        "name": each.result.name,
-        "object": each.result.object,
-        "verdict": str(each.result.verdict),
+        **json_fields(each.result, "title", "name", "object", "verdict"),
         "pointer": _pointer_value(each, first_ns, report.axes.unit),
         "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,

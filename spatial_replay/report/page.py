@@ -20,9 +20,8 @@ from spatial_replay.monitor.sentences import settled_time
 from spatial_replay.monitor.verdict import Verdict, counts_text
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import SIGNS
-from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
-from spatial_replay.report.panels import final_text
+from spatial_replay.report.panels import final_text, json_text, sentence_parts
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import declared_unit, units_of, units_text
 from spatial_replay.text import Instant, Sentence, counted, printable, time_text

@@ -1,16 +1,22 @@
-"""Panels of a report: their facts as JSON, from a replay."""
+"""Panels of a report: their facts as JSON, from a replay, with arrays in a compact form.
+
+Arrays are little-endian bytes one after the other, compressed, in Base64.
+"""
 
 from __future__ import annotations
 
 import base64
+import json
 import math
+import re
+import zlib
 from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -56,10 +62,73 @@ from spatial_replay.planning.decision_log import (
     once_all_are_done,
 )
 from spatial_replay.planning.decisions import Reason
-from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import number_text, with_unit
+from spatial_replay.text import cut, json_fields, number_text, with_unit
+
+Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
+"""Numbers of an array in the page: float64, float32, int32, uint16, uint8."""
+Reference: TypeAlias = Mapping[str, Any]
+"""Where an array lies in the page: its kind, the offset of its first byte, how many numbers it has."""
+
+_ALIGNMENT: Final = 8
+_LEVEL: Final = 6
+
+
+class Packing:
+    """Collects the arrays of one page."""
+
+    def __init__(self) -> None:
+        self._pieces: list[bytes] = []
+        self._size = 0
+
+    def add(self, array: NDArray[Any], kind: Kind) -> Reference:
+        """Take in an array, flattened by rows, and return where the page finds it."""
+        data = np.ascontiguousarray(array, f"<{kind}").tobytes()
+        reference = {"kind": kind, "offset": self._size, "length": int(np.size(array))}
+        self._pieces += [data, bytes(-len(data) % _ALIGNMENT)]
+        self._size += len(data) + len(self._pieces[-1])
+        return reference
+
+    def text(self) -> str:
+        """Return everything taken in as a text without characters that HTML interprets."""
+        return base64.b64encode(zlib.compress(b"".join(self._pieces), _LEVEL)).decode("ascii")
+
+
+def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return numbers in single precision; one below 0 stays below 0, however near."""
+    with np.errstate(over="ignore", under="ignore"):
+        near = numbers.astype(np.float32)
+    smallest = np.finfo(np.float32).smallest_subnormal
+    return np.where((numbers < 0.0) & (near == 0.0), -smallest, near)
+
+
+def json_text(value: Any) -> str:
+    """Return JSON that is safe within a script element, with any texts in it."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    for sign in "<>&":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return text
+
+
+_CODE: Final = re.compile(
+    r"""
+    (?<![^\s(]) `                           # what quotes a formula follows a space or a parenthesis
+    ( (?: "(?:[^"\\]|\\.)*" | [^`"] )*    # a name in its own quotes may have such signs in it
+      (?: "[^"]*… )? )                       # and may be cut short
+    ` (?= [\s,.:;)] | $ )
+    """,
+    re.VERBOSE,
+)
+
+
+def sentence_parts(sentence: str) -> list[str]:
+    """Split a sentence into text and code, in turn, beginning with text.
+
+    Code is between backquotes, which names of objects may contain, too.
+    """
+    return _CODE.split(sentence)
+
 
 MOST_NODES: Final = 400
 """Nodes of a tree that a page shows, at most."""
@@ -110,8 +179,8 @@ def tree_value(
             "id": identifier,
             "parent": None if parent is None else place[parent],
             "name": node.name or "",
-            "head": _cut(calls.get(identifier) or _head(node, relations)),
-            "text": _cut(format_formula(node, relations=relations)),
+            "head": cut(calls.get(identifier) or _head(node, relations), _LONGEST),
+            "text": cut(format_formula(node, relations=relations), _LONGEST),
             "unit": unit_of(node, units),
             "divisor": divisor_of(node),
             "initial": identifier in initial,
@@ -177,10 +246,6 @@ def _head(node: Formula, relations: frozenset[str]) -> str:
     return text
 
 
-def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1].rstrip()}…"
-
-
 class StatePath:
     """The states of a run, collected from its messages as they come.
 
@@ -209,16 +274,11 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
     visited = {state for states in path.sets for state in states}
     drawing, short = draw_automaton(automaton, visited), abbreviated(automaton)
     return {
-        "summary": drawing.summary,
-        "left_out": drawing.left_out,
+        **json_fields(drawing, "summary", "left_out"),
         "states": [
             {
-                "number": state.number,
+                **json_fields(state, "number", "about", "is_accepting", "is_lost", "is_won"),
                 "at": (state.column, state.row),
-                "about": state.about,
-                "accepting": state.is_accepting,
-                "lost": state.is_lost,
-                "won": state.is_won,
             }
             for state in drawing.states
         ],
@@ -744,12 +804,10 @@ def _decision_value(
     decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
 ) -> dict[str, Any]:
     value: dict[str, Any] = {
-        "number": decision.number,
+        **json_fields(decision, "number", "specification", "reason"),
         "time": (decision.time_ns - first_ns) / 1e9,
-        "specification": decision.specification,
         "kind": decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " "),
         "states": list(decision.states),
-        "reason": decision.reason,
         "edges": [
             _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
             for edge in decision.considered
@@ -761,9 +819,8 @@ def _decision_value(
     if decision.HasField("outcome"):
         outcome = decision.outcome
         value["outcome"] = {
+            **json_fields(outcome, "succeeded", "reason"),
             "time": (outcome.end_ns - first_ns) / 1e9,
-            "succeeded": outcome.succeeded,
-            "reason": outcome.reason,
             "states": list(outcome.states),
             "travelled": packing.add(np.array(outcome.travelled), "f8"),
         }
@@ -790,10 +847,9 @@ def _guard_texts(guards: Sequence[PlanGuard]) -> list[str]:
 
 def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
     return {
-        "object": candidate.object,
+        **json_fields(candidate, "object", "rejected"),
         "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
         "status": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
-        "rejected": candidate.rejected,
         "why": [f"{key} {text}" for key, text in candidate_lines(candidate)],
         "target": _target_value(candidate.target) if candidate.HasField("target") else None,
     }

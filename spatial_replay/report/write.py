@@ -1,4 +1,4 @@
-"""Reports: a log evaluated, and one HTML page that shows what the run did and why.
+"""Reports as HTML pages: what a run did and why, or what differs, with both runs under one time cursor.
 
 A replay gives the results and a `Collector` takes the rest from its messages. Together they are a
 `RunReport`, which `page` turns into HTML.
@@ -10,25 +10,38 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
 
+from spatial_replay import __version__
 from spatial_replay.annotate.specification import unit_of
+from spatial_replay.compare.runs import DecisionDiff, LogDiff
+from spatial_replay.compare.specifications import SpecificationDiff
 from spatial_replay.errors import UsageError
 from spatial_replay.logs import messages as log_topics
 from spatial_replay.logs.messages import Messages, Source
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.notebook.figures import Html, element
 from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
-from spatial_replay.report.data import ReportedResult, RunReport, worst_results
-from spatial_replay.report.page import page
-from spatial_replay.report.panels import ReportedDecisions, ReportedScene, StatePath, pictures_of
+from spatial_replay.report.data import ReportedResult, RunReport, page_data, worst_results
+from spatial_replay.report.page import chip, document, page, panel, sentence_html, text
+from spatial_replay.report.panels import (
+    ReportedDecisions,
+    ReportedScene,
+    StatePath,
+    json_text,
+    pictures_of,
+    shown_nodes,
+)
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import Instant, Sentence
 
 _COLLECTED: Final = frozenset(
     (
@@ -170,3 +183,223 @@ def _gaps(replayed: Replayed) -> tuple[str, ...]:
     unknown = [each for each in replayed.results if each.verdict is Verdict.UNKNOWN]
     gaps = (gap for each in unknown for gap in each.gaps() if gap.window is not None)
     return tuple(dict.fromkeys(gap_sentence(gap, replayed.first_ns) for gap in gaps))
+
+
+Side: TypeAlias = tuple[Source, Sequence[Specification], ReplayOptions]
+"""One side of a page: a log, its specifications and the options of their evaluation."""
+
+
+def write_comparison(
+    diff: SpecificationDiff | LogDiff,
+    sides: tuple[Side, Side],
+    output: Path,
+    *,
+    inputs: Sequence[Path] = (),
+    advance: Callable[[int], None] = lambda samples: None,
+) -> None:
+    """Write a diff as one HTML page, which needs no other file and no network. Equal diffs give equal pages.
+
+    Args:
+        sides: what was compared, the old specification or run A first.
+        inputs: files that the output must not be.
+        advance: called with the number of samples of each block that is done.
+
+    Raises:
+        UsageError: what `refuse_output` refuses.
+        LogError: a log can no longer be read.
+        OutputError: the output cannot be written.
+    """
+    refuse_output(output, inputs)
+    with replacing(output, inputs) as stream:
+        (_, a), (_, b) = (report_of(*side, advance) for side in sides)
+        stream.write(comparison_page(diff, a, b))
+
+
+def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> bytes:
+    """Return the page of a diff, in UTF-8.
+
+    Args:
+        a, b: both sides, as they are reported.
+    """
+    one, other = page_data(a), page_data(b)
+    labels = _labels(diff)
+    decision = None if isinstance(diff, SpecificationDiff) else diff.decision
+    is_same = "nothing differs" if diff.is_empty else "different"
+    title = element("div", element("h1", text(" → ".join(labels))), **{"class": "title"})
+    about = element(
+        "p", text(f"{_about(diff)} · {is_same} · spatial-replay {__version__}"), **{"class": "about"}
+    )
+    parts = [
+        element("header", title, about, **{"class": "top"}),
+        element(
+            "main",
+            panel("verdicts", "What differs", *_changes(diff, (a.replayed.first_ns, b.replayed.first_ns))),
+            panel("scene-a", labels[0]),
+            panel("scene-b", labels[1]),
+            *_decision_panels(decision, labels),
+            panel("timeline", "Over time"),
+            id="main",
+            tabindex="-1",
+        ),
+    ]
+    return document(
+        " → ".join(labels),
+        parts,
+        {
+            "facts-a": json_text(one.facts),
+            "facts-b": json_text(other.facts),
+            "pairs": json_text({"labels": labels, **_pairs(diff, a, b)}),
+        },
+        {"numbers-a": one.numbers, "numbers-b": other.numbers},
+        "comparison",
+    )
+
+
+def _labels(diff: SpecificationDiff | LogDiff) -> tuple[str, str]:
+    if isinstance(diff, SpecificationDiff):
+        names = diff.old.filename, diff.new.filename
+        return names if names[0] != names[1] else (f"{names[0]} (old)", f"{names[1]} (new)")
+    return (diff.a, diff.b) if diff.a != diff.b else (f"{diff.a} (A)", f"{diff.b} (B)")
+
+
+def _about(diff: SpecificationDiff | LogDiff) -> str:
+    if isinstance(diff, SpecificationDiff):
+        return f"two specifications over {diff.log}"
+    return f"two runs, {diff.alignment}"
+
+
+def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> Iterator[Html]:
+    """Yield each change: its headline, and its sentences with their times as links."""
+    if diff.is_empty:
+        yield element("p", "Nothing differs.")
+    if isinstance(diff, SpecificationDiff):
+        for each in diff.specs:
+            if each.edits or each.is_different:
+                yield _change(each.title, each.new.verdict, list(each.sentences(diff.first_ns)), first_ns)
+        for names, where in ((diff.removed, diff.old), (diff.added, diff.new)):
+            yield from (element("p", text(f"{name}: only in {where.filename}")) for name in names)
+        return
+    if diff.is_empty:
+        return
+    for spec in diff.specs:
+        yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.starts_ns)), first_ns)
+    if diff.objects:
+        yield _change("who moved differently", None, diff.movements, first_ns)
+    if diff.signals:
+        yield _change("signals with other values", None, diff.signal_changes, first_ns)
+    for which, names in (("A", diff.only_a), ("B", diff.only_b)):
+        if names:
+            yield element("p", text(f"Only in {which}: {', '.join(names)}"))
+    if diff.decision is not None:
+        title = f"decision {diff.decision.number} is the first that differs"
+        yield _change(title, None, list(map(Sentence, diff.decision.lines())), first_ns)
+
+
+def _decision_panels(decision: DecisionDiff | None, labels: tuple[str, str]) -> list[Html]:
+    """Return places for the first decision that differs, of both runs, with its gradient maps."""
+    if decision is None:
+        return []
+    names = zip(("decision-a", "decision-b"), labels, strict=True)
+    return [panel(name, text(f"{label}: decision {decision.number}")) for name, label in names]
+
+
+def _change(
+    title: str, verdict: str | None, sentences: Sequence[Sentence], first_ns: tuple[int, int]
+) -> Html:
+    marks = [] if verdict is None else [chip(verdict)]
+    name = element("span", text(title), **{"class": "name"})
+    summary = element("div", *marks, name, **{"class": "summary"})
+    lines = [element("p", *_with_run(sentence, first_ns)) for sentence in sentences]
+    return element("div", summary, *lines, **{"class": "verdict change"})
+
+
+def _with_run(sentence: Sentence, first_ns: tuple[int, int]) -> Iterator[Html]:
+    """Yield a sentence whose times say which run they are of."""
+    is_b = first_ns[0] != first_ns[1] and any(
+        isinstance(part, Instant) and part.first_ns == first_ns[1] for part in sentence.parts
+    )
+    is_b = is_b or sentence.startswith("B: ")
+    for piece in sentence_html(sentence, first_ns[1] if is_b else first_ns[0]):
+        yield Html(piece.replace("data-time-ns", 'data-run="b" data-time-ns')) if is_b else piece
+
+
+def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dict[str, Any]:
+    """Return which curves belong together, how times correspond, and the time at which the page opens."""
+    first_ns: int | None = None
+    decision: DecisionDiff | None = None
+    nodes: list[dict[str, Any]] = []
+    places = [_places(report) for report in (a, b)]
+    if isinstance(diff, SpecificationDiff):
+        knots = [[0.0, (a.replayed.first_ns - b.replayed.first_ns) / 1e9]]
+        for spec in diff.specs:
+            if first_ns is None and spec.first is not None:
+                first_ns = spec.first.time_ns
+            titles = spec.old.title, spec.new.title
+            nodes += _node_pairs(spec.title, titles, (spec.old, spec.new), places)
+            for edit in spec.cause:
+                if edit.old_nodes and edit.new_nodes and edit.old_nodes[0]:
+                    pair = edit.old_nodes[0], edit.new_nodes[0]
+                    nodes += _node_pair(f"{spec.title}: {edit.new}", titles, pair, places)
+    else:
+        decision = diff.decision
+        knots = [
+            [(knot.a_ns - a.replayed.first_ns) / 1e9, (knot.b_ns - b.replayed.first_ns) / 1e9]
+            for knot in diff.alignment.knots
+        ]
+        found = (
+            [each.apart_ns for each in diff.objects],
+            [] if decision is None else [decision.a_ns],
+            [spec.first_ns for spec in diff.specs],
+            [*(each.first_ns for each in diff.objects), *(each.first_ns for each in diff.signals)],
+        )
+        known = ([at for at in times_ns if at is not None] for times_ns in found)
+        first_ns = next((min(times_ns) for times_ns in known if times_ns), None)
+        for run_spec in diff.specs:
+            titles = run_spec.a.title, run_spec.b.title
+            nodes += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), places)
+    return {
+        "knots": knots,
+        "nodes": nodes,
+        "decision": decision and decision.number,
+        "first": None if first_ns is None else (first_ns - a.replayed.first_ns) / 1e9,
+    }
+
+
+_Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]
+"""By the title of a result: its place on the page, and those of its nodes."""
+
+
+def _places(report: RunReport) -> _Places:
+    return {
+        each.result.title: (
+            index,
+            {node: place for place, node in enumerate(shown_nodes(each.result.formula))},
+        )
+        for index, each in enumerate(report.drawn)
+    }
+
+
+def _node_pairs(
+    title: str, titles: tuple[str, str], results: tuple[SpecResult, SpecResult], places: Sequence[_Places]
+) -> Iterator[dict[str, Any]]:
+    """Yield the roots of two results, and their nodes of one name."""
+    yield from _node_pair(title, titles, (0, 0), places)
+    named = {node.name: node.id for node in reversed(results[1].nodes) if node.name and node.id}
+    seen: set[str] = set()
+    for node in results[0].nodes[1:]:
+        if node.name in named and node.name not in seen:
+            seen.add(node.name)
+            yield from _node_pair(node.name, titles, (node.id, named[node.name]), places)
+
+
+def _node_pair(
+    label: str, titles: tuple[str, str], ids: tuple[int, int], places: Sequence[_Places]
+) -> Iterator[dict[str, Any]]:
+    """Yield two nodes as the page finds them, if it shows both."""
+    found = [
+        [own[title][0], own[title][1][identifier]]
+        for own, title, identifier in zip(places, titles, ids, strict=True)
+        if title in own and identifier in own[title][1]
+    ]
+    if len(found) == 2:
+        yield {"label": label, "a": found[0], "b": found[1]}

@@ -13,8 +13,19 @@ from spatial_replay.errors import NoAutomatonError, SpecificationError
 from spatial_replay.lazy import Printed
 from spatial_replay.sanity.conditions import FactDiagrams, is_solid, members
 from spatial_replay.sanity.examples import Example, shortest_example
-from spatial_replay.sanity.relaxations import SpecReading, automaton_of, loosened, reading_of
-from spatial_replay.sanity.shortest_words import Answer, Runs, Side, UndecidedError, Word, WordSearch, joint
+from spatial_replay.sanity.shortest_words import (
+    Answer,
+    Runs,
+    Side,
+    SpecReading,
+    UndecidedError,
+    Word,
+    WordSearch,
+    automaton_of,
+    joint,
+    loosened,
+    reading_of,
+)
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (

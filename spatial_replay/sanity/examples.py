@@ -28,8 +28,7 @@ from spatial_replay.sanity.conditions import (
     without_radius,
 )
 from spatial_replay.sanity.linear import Inequality, solve
-from spatial_replay.sanity.relaxations import conjuncts
-from spatial_replay.sanity.shortest_words import Word, WordSearch
+from spatial_replay.sanity.shortest_words import Word, WordSearch, conjuncts
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.formula import (
     Atom,

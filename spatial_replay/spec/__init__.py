@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.spec.checks import check_names, instantiate, object_names, signal_names
+    from spatial_replay.spec.checks import check_names, object_names, signal_names
     from spatial_replay.spec.format import format_formula, format_specification
     from spatial_replay.spec.load import load_specification, parse_specification
 
@@ -18,7 +18,6 @@ __all__ = [
     "check_names",
     "format_formula",
     "format_specification",
-    "instantiate",
     "load_specification",
     "object_names",
     "parse_specification",

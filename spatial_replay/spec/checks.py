@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 from lark import Token
 
-from spatial_replay.errors import UsageError
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
 from spatial_replay.spec.format import format_relation
 from spatial_replay.spec.formula import (
@@ -41,7 +40,6 @@ from spatial_replay.spec.walks import (
     logged_signals,
     named_members,
     rewritten,
-    substitute,
     terms_of,
     units_of,
 )
@@ -364,18 +362,3 @@ def _places(specification: Specification, source: SourceText) -> tuple[dict[str,
         if first.type in ("CONST", "REGION", "GROUP", "DEF", "SPEC") and second.type == "NAME":
             defined.setdefault(second.value, span_of(second))
     return places, defined
-
-
-def instantiate(spec: NamedSpec, parameter_value: str) -> Formula:
-    """Return the formula of a template about one object.
-
-    Args:
-        spec: a spec with an object parameter.
-        parameter_value: the name of the object.
-
-    Raises:
-        UsageError: for a spec without a parameter.
-    """
-    if spec.parameter is None:
-        raise UsageError(f"spec {spec.name!r} is not a template; evaluate it as it is")
-    return substitute(spec.formula, {spec.parameter: TrackedName(parameter_value)})

@@ -11,9 +11,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from spatial_replay.annotate.scene.scene_frames import DrawnEntity, SceneFrame
-from spatial_replay.report.compact import json_text, sentence_parts, singles
 from spatial_replay.report.data import NodeSeries, choose_samples
-from spatial_replay.report.panels import MOST_CORNERS, MOST_FRAMES, ReportedScene
+from spatial_replay.report.panels import (
+    MOST_CORNERS,
+    MOST_FRAMES,
+    ReportedScene,
+    json_text,
+    sentence_parts,
+    singles,
+)
 
 NUMBERS = st.one_of(
     st.floats(-10, 10), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-300, -1e-300])

@@ -10,9 +10,9 @@ from hypothesis import given
 from examples import examples
 from laws.strategies_spec import Vocabulary, formula_texts, noise, specification_texts
 from spatial_replay import SpecificationError, parse_specification
-from spatial_replay.spec import check_names, format_formula, format_specification, instantiate, object_names
-from spatial_replay.spec.formula import Formula, Variable, operands_of, operator_of
-from spatial_replay.spec.walks import base_of, has_rate, iter_formulas
+from spatial_replay.spec import check_names, format_formula, format_specification, object_names
+from spatial_replay.spec.formula import Formula, TrackedName, Variable, operands_of, operator_of
+from spatial_replay.spec.walks import base_of, has_rate, iter_formulas, substitute
 
 
 def formula_of(text: str) -> Formula:
@@ -118,7 +118,7 @@ def test_object_and_signal_names_are_exactly_those_used(text: str) -> None:
 def test_an_instance_of_a_template_is_about_its_object(text: str) -> None:
     specification = parse_specification(text)
     template = next(spec for spec in specification.specs if spec.parameter == "ego")
-    instance = instantiate(template, "car 7")
+    instance = substitute(template.formula, {"ego": TrackedName("car 7")})
     terms = [base_of(term) for each in iter_formulas(instance) for term in getattr(each, "terms", ())]
     assert Variable("ego") not in terms
     direct = re.sub(r"\bego\b", '"car 7"', text.replace("spec ahead(ego)", "spec ahead"))

@@ -15,8 +15,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanMap,
     PlanTarget,
 )
-from spatial_replay.report.compact import Packing, json_text
-from spatial_replay.report.panels import MOST_CELLS, ReportedDecisions, decisions_value
+from spatial_replay.report.panels import MOST_CELLS, Packing, ReportedDecisions, decisions_value, json_text
 
 
 def grid(time_ns: int = 0, *, rows: int = 2, columns: int = 3, value: float = 1.0) -> Grid:

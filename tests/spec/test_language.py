@@ -15,7 +15,7 @@ from spatial_replay import (
     load_specification,
     parse_specification,
 )
-from spatial_replay.spec import check_names, format_formula, format_specification, instantiate, object_names
+from spatial_replay.spec import check_names, format_formula, format_specification, object_names
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
@@ -152,19 +152,6 @@ def test_groups_stand_for_their_members() -> None:
         "enlarge(center(g), 1)": Enlarged(Centre(Group("g", ("a", "b"))), 1.0),
     }.items():
         assert atom_of(text.format(written)).terms[0] == term
-
-
-def test_a_template_is_instantiated_with_its_object() -> None:
-    specification = parse_specification(
-        'group people = class "person"\nspec near(ego) = G (ego dist (people except ego) >= 1)'
-    )
-    spec = specification.specs[0]
-    assert spec.parameter == "ego"
-    assert format_formula(instantiate(spec, "robot 1")) == (
-        'G ("robot 1" dist (people except "robot 1") >= 1)'
-    )
-    with pytest.raises(UsageError, match="not a template"):
-        instantiate(parse_specification("a ovlp b").specs[0], "a")
 
 
 @pytest.mark.parametrize(

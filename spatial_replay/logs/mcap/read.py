@@ -63,7 +63,7 @@ from spatial_replay.logs.messages import (
 )
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.remote import RemoteFile, file_size, open_file, plan_reads
+from spatial_replay.logs.remote import RemoteFile, open_file, plan_reads
 from spatial_replay.text import Instant, Sentence, counted, listed
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
@@ -610,25 +610,12 @@ class LogSummary:
     """Content of an MCAP log.
 
     Attributes:
-        name: the file's base name.
-        size: in bytes.
-        library: the software that wrote it, as it names itself.
-        messages: in all channels.
-        chunks: how many parts of the file are compressed on their own.
-        start_ns, end_ns: log times of the first and the last message; None in a log without messages.
         channels: by topic.
         metadata: records in the order of the file; a name may occur more than once.
         attachments: in the order of the file.
         faults: what is damaged, each with its place.
     """
 
-    name: str
-    size: int
-    library: str
-    messages: int
-    chunks: int
-    start_ns: int | None
-    end_ns: int | None
     channels: tuple[ChannelSummary, ...]
     metadata: tuple[tuple[str, Mapping[str, str]], ...]
     attachments: tuple[AttachmentSummary, ...]
@@ -643,17 +630,9 @@ class LogSummary:
 def summarise_mcap(source: McapSource) -> LogSummary:
     """Summarise an MCAP log; a log without a summary of its own is read as a whole for this."""
     with source.open_walk() as walk:
-        counts, start_ns, end_ns = _counts(walk)
-        directory, opened = walk.directory, (walk.stream, walk.directory, walk.faults, source.name)
+        counts, opened = _counts(walk), (walk.stream, walk.directory, walk.faults, source.name)
         channels = [ChannelSummary(channel, counts[number]) for number, channel in walk.channels.items()]
         return LogSummary(
-            name=source.name,
-            size=file_size(source.path),
-            library=directory.header.library if directory.header else "",
-            messages=counts.total(),
-            chunks=sum(place.compressed for place in directory.chunks),
-            start_ns=start_ns,
-            end_ns=end_ns,
             channels=tuple(sorted(channels, key=lambda each: each.channel.topic)),
             metadata=tuple(iter_metadata(*opened)),
             attachments=tuple(
@@ -663,16 +642,11 @@ def summarise_mcap(source: McapSource) -> LogSummary:
         )
 
 
-def _counts(walk: ChunkWalk) -> tuple[Counter[int], int | None, int | None]:
-    """Count messages by channel; return also the times of the first and the last."""
-    statistics = walk.directory.statistics
-    if statistics is not None:
-        counts = Counter(statistics.channel_message_counts)
-        times = [statistics.message_start_time, statistics.message_end_time] if counts.total() else []
-    else:
-        counts, times = Counter(), []
-        for _, messages in walk.iter_messages(walk.places):
-            counts.update(messages.channel.tolist())
-            times += messages.log_time_ns.tolist()
-            times = [min(times), max(times)] if times else []
-    return counts, (times[0] if times else None), (times[-1] if times else None)
+def _counts(walk: ChunkWalk) -> Counter[int]:
+    """Count messages by channel."""
+    if walk.directory.statistics is not None:
+        return Counter(walk.directory.statistics.channel_message_counts)
+    counts: Counter[int] = Counter()
+    for _, messages in walk.iter_messages(walk.places):
+        counts.update(messages.channel.tolist())
+    return counts
