@@ -84,5 +84,5 @@ def data_frame(value: object) -> Any:
 
 def drawn_as_svg(value: Displayed) -> str | None:
     """Return a value as SVG, or None if it cannot be drawn here."""
-    drawing: str | None = import_module("spatial_replay.notebook.automaton_view").automaton_svg(value)
+    drawing: str | None = import_module("spatial_replay.notebook.evaluation_view").automaton_svg(value)
     return drawing

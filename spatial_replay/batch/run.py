@@ -96,9 +96,14 @@ def read_specification_text(path: Path | str) -> SpecificationText:
 
 def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, folder: Path) -> SpecFile:
     """Return a specification file that was read and parsed; paths are shown relative to a folder."""
-    meaning = f"{parsed.profile}\n{format_specification(parsed)}"
-    digest = hashlib.sha256(meaning.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
-    return SpecFile(_shown(path, folder), text, digest, tuple(spec_lines(parsed).items()), parsed.warnings)
+    lines = tuple(spec_lines(parsed).items())
+    return SpecFile(_shown(path, folder), text, meaning_hash(parsed), lines, parsed.warnings)
+
+
+def meaning_hash(file: Specification) -> str:
+    """Return a hash of what a specification means: layout and comments do not count."""
+    meaning = f"{file.profile}\n{format_specification(file)}"
+    return hashlib.sha256(meaning.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
 
 
 def _shown(file: Path | str, folder: Path) -> str:

@@ -81,8 +81,11 @@ FAMILIES = {
     "learn": "tune",
     "report": "replay",
     "export": "replay",
+    "explain": "replay",
     "recover": "clip",
+    "verify": "clip",
     "falsify": "record",
+    "serve": "watching",
 }
 """Commands that share the module of another one."""
 

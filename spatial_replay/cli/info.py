@@ -396,7 +396,7 @@ def _lines(
                 each.name,
                 ", ".join(each.classes),
                 counted(each.samples, "sample"),
-                _unreadable(each.unreadable),
+                f"{each.unreadable:,} unknown" if each.unreadable else "",
             )
             for each in overview.objects
         )
@@ -459,10 +459,6 @@ def _clock(time_ns: int) -> str:
         return f"{time_ns / 1e9:.3f} s"
     seconds, fraction_ns = divmod(time_ns, 10**9)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{fraction_ns // 10**6:03d}Z"
-
-
-def _unreadable(count: int) -> str:
-    return f"{count:,} unknown" if count else ""
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:

@@ -67,7 +67,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
     results, others = worst_of(replayed.results)
     # escaped here, so that what is printed is as wide as what is measured
-    titles = [escaped(_titled(result)) for result in results]
+    titles = [escaped(f"{each.title} [{each.spec.id}]" if each.spec.id else each.title) for each in results]
     width = max(map(len, titles), default=0)
     titled: set[str] = set()
     for title, result in zip(titles, results, strict=True):
@@ -124,11 +124,6 @@ def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = N
     one = ", --each VAR=OBJECT shows one" if any(each.object is not None for each in others) else ""
     counts = counts_text([each.verdict for each in others] if verdicts is None else verdicts)
     return f"… and {len(others):,} more: {counts}; --json has all{one}"
-
-
-def _titled(result: SpecResult) -> str:
-    """Return the name of a result with the id of its requirement."""
-    return f"{result.title} [{result.spec.id}]" if result.spec.id else result.title
 
 
 def _numbers(result: SpecResult, first_ns: int) -> str:

@@ -6,7 +6,6 @@ earlier ones; this is the only module that knows the package `cma`.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import deque
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay import __version__
-from spatial_replay.batch.run import workers_of
+from spatial_replay.batch.run import meaning_hash, workers_of
 from spatial_replay.batch.store import LocalFolder
 from spatial_replay.batch.workers import Progress, WorkerLost, Workers, no_progress
 from spatial_replay.compare.clips import cut_clip
@@ -45,7 +44,6 @@ from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS
 from spatial_replay.sanity import refuse_decided
 from spatial_replay.sources.open_log import open_source
-from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.walks import declared_unit
@@ -826,17 +824,11 @@ def _identity(simulation: Simulation, space: Space, seed: int) -> dict[str, Any]
         "format": FORMAT,
         "version": __version__,
         "simulation": simulation.name,
-        "specifications": [
-            _digest(f"{each.profile}\n{format_specification(each)}") for each in simulation.files
-        ],
+        "specifications": list(map(meaning_hash, simulation.files)),
         "varied": {each.name: [each.low, json_number(each.high)] for each in space.parameters},
         "seed": seed,
         **simulation.identity,
     }
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]
 
 
 def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:

@@ -17,13 +17,13 @@ from spatial_replay.lazy import Printed
 
 _VIEWS: Mapping[str, str] = MappingProxyType(
     {
-        "spatial_replay.automata.automaton": "automaton_view",
+        "spatial_replay.automata.automaton": "evaluation_view",
         "spatial_replay.compare.runs": "study_view",
         "spatial_replay.compare.specifications": "study_view",
         "spatial_replay.monitor.result": "evaluation_view",
-        "spatial_replay.planning.decisions": "planning_view",
-        "spatial_replay.planning.maps": "planning_view",
-        "spatial_replay.planning.read": "planning_view",
+        "spatial_replay.planning.decisions": "study_view",
+        "spatial_replay.planning.maps": "study_view",
+        "spatial_replay.planning.read": "study_view",
         "spatial_replay.spec.formula": "evaluation_view",
         "spatial_replay.trace.trace": "evaluation_view",
         "spatial_replay.tuning.tuned": "study_view",

@@ -260,7 +260,8 @@ def page_data(report: RunReport) -> PageData:
     times_ns = np.unique(
         np.concatenate([report.scene.times_ns, *(each.result.times_ns for each in drawn)]).astype(np.int64)
     )
-    curves = [_curves(each) for each in drawn if len(each.result.times_ns)]
+    results = [each.result for each in drawn if len(each.result.times_ns)]
+    curves = [NodeSeries(each.times_ns, each.series[list(named_nodes(each.formula))]) for each in results]
     room = _room(drawn, len(times_ns))
     shown_ns = _shown_times(report, times_ns, room // 2)
     kept = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
@@ -298,10 +299,6 @@ def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
         for index, number in enumerate(report.drawn_numbers)
         for place, node in enumerate(shown_nodes(report.results[number].result.formula))
     }
-
-
-def _curves(each: ReportedResult) -> NodeSeries:
-    return NodeSeries(each.result.times_ns, each.result.series[list(named_nodes(each.result.formula))])
 
 
 def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:

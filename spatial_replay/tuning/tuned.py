@@ -212,15 +212,12 @@ class ExactSearch:
             for corner in (low, high):
                 if all(self._holds(run, corner, level, self._joint.results) for run in (*good, *bad)):
                     return Feasibility(tuple(corner))
-            axis = max(self._joint.axes, key=lambda axis: self._share(axis, low, high))
+            axis = max(self._joint.axes, key=lambda axis: (high[axis] - low[axis]) / self._steps[axis])
             if high[axis] > low[axis]:
                 middle = (low[axis] + high[axis]) // 2
                 boxes.append((_with(low, [axis], middle + 1), list(high)))
                 boxes.append((list(low), _with(high, [axis], middle)))
         return Feasibility(None, is_proven=not boxes)
-
-    def _share(self, axis: int, low: Sequence[int], high: Sequence[int]) -> float:
-        return (high[axis] - low[axis]) / self._steps[axis]
 
     def _contract(
         self, runs: Sequence[int], corner: list[int], opposite: Sequence[int], level: float
