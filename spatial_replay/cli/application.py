@@ -84,8 +84,7 @@ FAMILIES = {
     "explain": "replay",
     "recover": "clip",
     "verify": "clip",
-    "falsify": "record",
-    "serve": "watching",
+    "serve": "replay",
 }
 """Commands that share the module of another one."""
 
