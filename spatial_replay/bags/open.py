@@ -8,7 +8,6 @@ yields columns of a chunk at a time rather than one object for each message.
 from __future__ import annotations
 
 import re
-from bisect import bisect_right
 from collections.abc import Collection, Mapping
 from copy import copy
 from dataclasses import replace
@@ -98,16 +97,14 @@ class McapLog(MessageReader):
         return directory_remarks(self.name, self._directory, self.metadata()) if is_first else ()
 
     @cached_property
-    def _topic_of(self) -> Mapping[int, str]:
-        return {number: channel.topic for number, channel in self._walk.channels.items()}
-
-    def _channel(self, number: int) -> Channel:
-        return self._walk.channels[number]
+    def _declared(self) -> Mapping[int, Channel]:
+        # reading may come across channels that the index lacks
+        return dict(self._walk.channels)
 
     @property
     def channel_topics(self) -> frozenset[str]:
         """The topics of its channels, without a look at their definitions."""
-        return frozenset(self._topic_of.values())
+        return frozenset(channel.topic for channel in self._declared.values())
 
     @property
     def start_ns(self) -> int | None:
@@ -165,7 +162,7 @@ class McapLog(MessageReader):
             return tuple(iter_metadata(stream, self._directory, FaultList(), self.name))
 
     def _columns(
-        self, rank: int, place: ChunkPlace, messages: Messages, wanted: dict[int, str], first: int, last: int
+        self, rank: int, place: ChunkPlace, messages: Messages, wanted: list[int], first: int, last: int
     ) -> MessageColumns:
         """Return the wanted messages in a place; those of channels that the index lacks go to the faults."""
         self._walked += len(messages)
@@ -174,18 +171,10 @@ class McapLog(MessageReader):
             what = f"at byte {place.offset}: some messages are of a channel {unknown[0]} that is not declared"
             self._faults.add(f"{self.name}: {what} in the index")
         times = messages.log_time_ns
-        is_chosen = np.isin(messages.channel, list(wanted)) & (times >= first) & (times < last)
-        rows = np.flatnonzero(is_chosen)
+        rows = np.flatnonzero(np.isin(messages.channel, wanted) & (times >= first) & (times < last))
         chosen = select(messages, rows)
-        return MessageColumns(
-            [wanted[number] for number in chosen.channel.tolist()],
-            chosen.log_time_ns,
-            chosen.publish_time_ns,
-            chosen.sequence,
-            chosen.payloads,
-            places_in(rank, rows),
-            np.searchsorted(self._numbers, chosen.channel),
-        )
+        both_ns = chosen.log_time_ns, chosen.publish_time_ns
+        return self._made(chosen.channel, both_ns, chosen.sequence, chosen.payloads, places_in(rank, rows))
 
 
 METADATA_FILE = "metadata.yaml"
@@ -298,7 +287,8 @@ class BagFolder(MessageReader):
         def read(number: int, file: _File) -> Columns:
             for each in file.iter_columns(topics, first, last, as_recorded=as_recorded):
                 place, first_channel = np.int64(number) << 48, self._first_channels[number]
-                yield replace(each, place=place + each.place, channel=first_channel + each.channel)
+                channel = first_channel + each.channel
+                yield replace(each, channels=self._channels, channel=channel, place=place + each.place)
 
         reads = [partial(read, number, file) for number, file in enumerate(self._files)]
         if as_recorded or len(reads) == 1:
@@ -323,14 +313,8 @@ class BagFolder(MessageReader):
                     begin, size = number, 0
 
     @cached_property
-    def _topic_of(self) -> Mapping[int, str]:
-        topics = (file._topic_of[number] for file in self._files for number in file._numbers.tolist())
-        return dict(enumerate(topics))
-
-    def _channel(self, number: int) -> Channel:
-        at = bisect_right(self._first_channels, number) - 1
-        file = self._files[at]
-        return file._channel(int(file._numbers[number - self._first_channels[at]]))
+    def _declared(self) -> Mapping[int, Channel]:
+        return dict(enumerate(channel for file in self._files for channel in file._channels.values()))
 
     def attachments(self) -> tuple[Attachment, ...]:
         return tuple(each for file in self._files for each in file.attachments())
@@ -341,7 +325,7 @@ class BagFolder(MessageReader):
     @cached_property
     def _first_channels(self) -> tuple[int, ...]:
         """The number of the first channel of each file."""
-        return tuple(accumulate((file.channel_count for file in self._files[:-1]), initial=0))
+        return tuple(accumulate((len(file._channels) for file in self._files[:-1]), initial=0))
 
     def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         if self._metadata is None:
@@ -384,8 +368,8 @@ class BagFolder(MessageReader):
         payloads: list[bytes] = []
         places: list[int] = []
         lost: dict[str, list[Sentence]] = {}
-        for place, payload in enumerate(packed.payloads):
-            topic, when = packed.topics[place], Instant(int(packed.log_time_ns[place]), 0)
+        for place, (topic, payload) in enumerate(zip(packed.topics, packed.payloads, strict=True)):
+            when = Instant(int(packed.log_time_ns[place]), 0)
             try:
                 if not payload.startswith(_CDR_BEGIN):
                     payloads.append(unpacked(payload))

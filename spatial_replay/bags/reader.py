@@ -23,7 +23,7 @@ import numpy as np
 
 from spatial_replay.bags.decoders import Decoder, Topic, decoder_of
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Integers, concatenated, select
+from spatial_replay.geometry.arrays import Integers, concatenated, equal_places, select
 from spatial_replay.logs.mcap.read import too_many_waiting
 from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
@@ -53,43 +53,32 @@ class Message(NamedTuple):
     payload: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class MessageColumns:
-    """M messages.
+@dataclass(frozen=True, slots=True, eq=False)
+class MessageColumns(Messages):
+    """M messages, on the channels of `MessageReader.channels`: several publishers of one topic have several.
 
     Attributes:
-        topics: (M,) names.
-        log_time_ns, publish_time_ns, sequence: (M,) int64.
-        payloads: M messages, each in its topic's encoding.
         place: (M,) int64, numbers that increase in the order in which the messages were recorded.
-        channel: (M,) int64, the numbers of their channels in `MessageReader.channels`: several publishers
-            of one topic have several channels.
     """
 
-    topics: Sequence[str] = ()
-    log_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
-    publish_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
-    sequence: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
-    payloads: Sequence[bytes] = ()
     place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
-    channel: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
-    def __len__(self) -> int:
-        return len(self.topics)
-
-    def of_topics(self, topics: Collection[str]) -> MessageColumns:
-        """Return the messages of some topics, in the same order."""
-        places = [place for place, topic in enumerate(self.topics) if topic in topics]
-        return self if len(places) == len(self) else select(self, np.array(places, np.int64))
+    @property
+    def topic_ranks(self) -> Integers:
+        """(M,) int64, of the topic of each message among all topics in order."""
+        names = {channel.topic for channel in self.channels.values()}
+        rank = {name: place for place, name in enumerate(sorted(names))}
+        of_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
+        for number, channel in self.channels.items():
+            of_channel[number] = rank[channel.topic]
+        return of_channel[self.channel]
 
     def ordered(self) -> MessageColumns:
         """Return the same messages by log time, topic and sequence; equal ones keep their order."""
         times = self.log_time_ns
         if (times[1:] > times[:-1]).all():
             return self
-        rank = {topic: number for number, topic in enumerate(sorted(set(self.topics)))}
-        topics = np.fromiter(map(rank.__getitem__, self.topics), np.int64, len(self))
-        return select(self, np.lexsort((self.sequence, topics, times)))
+        return select(self, np.lexsort((self.sequence, self.topic_ranks, times)))
 
     def count_before(self, time_ns: int) -> int:
         """Count the messages, which are in order, before a time."""
@@ -225,7 +214,8 @@ def without_jumps(
     topics = dict[str, _Recorded]()
     for each in columns:
         first_ns = int(each.log_time_ns[0]) if first_ns is None and len(each) else first_ns
-        for topic, rows in _rows_by_topic(each.topics):
+        for rows in equal_places(each.topic_ranks):
+            topic = each.channels[int(each.channel[rows[0]])].topic
             if topic not in checked:
                 continue
             recorded = topics.setdefault(topic, _Recorded(disorder_ns))
@@ -237,17 +227,6 @@ def without_jumps(
                     f" others that were logged more than {disorder_ns / 1e9:g} s earlier; {JUMP_REMEDY}"
                 )
         yield each
-
-
-def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slice]]:
-    names = sorted(set(topics))
-    if len(names) < 2:
-        yield from ((name, slice(None)) for name in names)
-        return
-    number = {name: code for code, name in enumerate(names)}
-    codes = np.fromiter(map(number.__getitem__, topics), np.int64, len(topics))
-    rows = np.split(np.argsort(codes, kind="stable"), np.cumsum(np.bincount(codes))[:-1])
-    yield from zip(names, rows, strict=True)
 
 
 class _Recorded:
@@ -318,25 +297,34 @@ class MessageReader(ABC):
 
     @property
     @abstractmethod
-    def _topic_of(self) -> Mapping[int, str]:
-        """The topics of channels, by the numbers that the log gives them."""
-
-    @abstractmethod
-    def _channel(self, number: int) -> Channel:
-        """Return the channel to which the log gives a number."""
+    def _declared(self) -> Mapping[int, Channel]:
+        """The channels, by the numbers that the log gives them."""
 
     @cached_property
     def _numbers(self) -> Integers:
         """The numbers that the log gives channels, in order."""
-        return np.array(sorted(self._topic_of), np.int64)
+        return np.array(sorted(self._declared), np.int64)
 
-    def _wanted(self, topics: Collection[str]) -> dict[int, str]:
-        return {number: topic for number, topic in self._topic_of.items() if topic in topics}
+    @cached_property
+    def _channels(self) -> Mapping[int, Channel]:
+        """The channels, by dense numbers."""
+        return {rank: self._declared[number] for rank, number in enumerate(self._numbers.tolist())}
 
-    @property
-    def channel_count(self) -> int:
-        """The number of channels, of whatever topics."""
-        return len(self._numbers)
+    def _wanted(self, topics: Collection[str]) -> list[int]:
+        """Return the numbers that the log gives the channels of some topics."""
+        return [number for number, channel in self._declared.items() if channel.topic in topics]
+
+    def _made(
+        self,
+        numbers: Integers,
+        times_ns: tuple[Integers, Integers],
+        sequence: Integers,
+        payloads: Sequence[bytes],
+        place: Integers,
+    ) -> MessageColumns:
+        """Return messages, given the numbers that the log gives their channels, and log and publish times."""
+        channel = np.searchsorted(self._numbers, numbers)
+        return MessageColumns(self._channels, channel, sequence, *times_ns, payloads, place)
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         """Return the channels of some topics by the numbers of `MessageColumns.channel`, which are dense.
@@ -344,8 +332,7 @@ class MessageReader(ABC):
         A copy of a log declares them: their schema, encoding and metadata are those of the log. ROS types
         without a definition in the log get that of the standard type, if there is one.
         """
-        numbered = enumerate(self._numbers.tolist())
-        return {rank: self._channel(number) for rank, number in numbered if self._topic_of[number] in topics}
+        return {number: channel for number, channel in self._channels.items() if channel.topic in topics}
 
     def attachments(self) -> tuple[Attachment, ...]:
         """Return the files in the log; those that are damaged are left out."""

@@ -503,11 +503,9 @@ class Ros1Bag(MessageReader):
         return all(one.end_ns <= other.start_ns for one, other in pairwise(ordered))
 
     @cached_property
-    def _topic_of(self) -> Mapping[int, str]:
-        return {number: each.topic for number, each in self._directory.connections.items()}
-
-    def _channel(self, number: int) -> Channel:
-        return channel_of(self._topic(self._directory.connections[number], 0))
+    def _declared(self) -> Mapping[int, Channel]:
+        connections = self._directory.connections
+        return {number: channel_of(self._topic(each, 0)) for number, each in connections.items()}
 
     def _messages(
         self,
@@ -553,14 +551,13 @@ class Ros1Bag(MessageReader):
             int.from_bytes(payload[:4], "little") if number in headed else 0
             for number, payload in zip(numbers, payloads, strict=True)
         ]
-        return MessageColumns(
-            [wanted[number].topic for number in numbers],
-            table.time_ns[rows],
-            table.time_ns[rows],
+        times_ns = table.time_ns[rows]
+        return self._made(
+            table.connection[rows],
+            (times_ns, times_ns),
             np.array(sequence, np.int64),
             payloads,
             places_in(rank, np.flatnonzero(rows)),
-            np.searchsorted(self._numbers, table.connection[rows]),
         )
 
     def _topic(self, connection: Connection, count: int) -> Topic:

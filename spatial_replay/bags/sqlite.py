@@ -362,11 +362,8 @@ class SqliteBag(MessageReader):
         return start_ns if isinstance(start_ns, int) else None
 
     @cached_property
-    def _topic_of(self) -> Mapping[int, str]:
-        return {number: topic.name for number, topic in self._described.items()}
-
-    def _channel(self, number: int) -> Channel:
-        return channel_of(self._described[number], self._distribution)
+    def _declared(self) -> Mapping[int, Channel]:
+        return {number: channel_of(each, self._distribution) for number, each in self._described.items()}
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         wanted = self._wanted(topics)
@@ -384,7 +381,7 @@ class SqliteBag(MessageReader):
             try:
                 found = database.execute(query, (*sorted(wanted), first, last - 1))
                 for rows in self._sound(_batches(found)):
-                    yield self._columns(rows, wanted)
+                    yield self._columns(rows)
                     after = key(rows[-1])
                 return
             except sqlite3.Error as error:
@@ -396,7 +393,7 @@ class SqliteBag(MessageReader):
                 key=key,
             )
             for rows in self._sound(_batches(_contents(database, following, lost))):
-                yield self._columns(rows, wanted)
+                yield self._columns(rows)
         self._report_lost(damage, intact, lost)
 
     def _report_lost(self, damage: str, intact: Sequence[RowHead], lost: Collection[_Span]) -> None:
@@ -428,12 +425,10 @@ class SqliteBag(MessageReader):
             if sound:
                 yield sound
 
-    def _columns(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> MessageColumns:
-        places, numbers, times, payloads = zip(*rows, strict=True)
-        topics = [wanted[number] for number in numbers]
-        channel = np.searchsorted(self._numbers, np.array(numbers, np.int64))
-        times_ns, place = np.array(times, np.int64), np.array(places, np.int64)
-        return MessageColumns(topics, times_ns, times_ns, np.zeros_like(place), payloads, place, channel)
+    def _columns(self, rows: Sequence[Row]) -> MessageColumns:
+        *columns, payloads = zip(*rows, strict=True)
+        place, numbers, times_ns = (np.array(each, np.int64) for each in columns)
+        return self._made(numbers, (times_ns, times_ns), np.zeros_like(place), payloads, place)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -89,6 +89,18 @@ class Messages:
     def nbytes(self) -> int:
         """The size of the payloads in bytes."""
         return sum(map(len, self.payloads))
+
+    @property
+    def topics(self) -> list[str]:
+        """The topic of each message."""
+        names = {number: channel.topic for number, channel in self.channels.items()}
+        return [names[number] for number in self.channel.tolist()]
+
+    def of_topics(self, topics: Collection[str]) -> Self:
+        """Return the messages of some topics, in the same order."""
+        numbers = [number for number, channel in self.channels.items() if channel.topic in topics]
+        chosen = np.flatnonzero(np.isin(self.channel, numbers))
+        return self if len(chosen) == len(self) else select(self, chosen)
 
 
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:

@@ -25,6 +25,7 @@ from spatial_replay.bags.reader import DISORDER_NS, JUMP_REMEDY, Message, Messag
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
 from spatial_replay.mapping.binding import BY_PLACE, Codes
 from spatial_replay.mapping.mapping_file import parse_mapping
@@ -204,10 +205,11 @@ class _Assembling:
 
     def _add_step(self, arrived: MessageColumns) -> None:
         """Distribute messages: transforms to the frame tree, all others to the readers of their topics."""
-        numbers = map(self._number_of_topic.get, arrived.topics, repeat(-1))
+        topics = arrived.topics
+        numbers = map(self._number_of_topic.get, topics, repeat(-1))
         number_of_message = np.fromiter(numbers, np.int64, len(arrived))
         stamped: list[_Stamped] = []
-        come = set(arrived.topics)
+        come = set(topics)
         for number, reader in enumerate(self._readers.values()):
             if reader.name not in come or (
                 self._knows_static and reader.planned.is_static and not reader.is_mapped
@@ -323,8 +325,10 @@ class _Assembling:
         log_ns, publish_ns, sequence = (np.array(each, np.int64) for each in numbers)
         place = self._recorded + np.arange(len(messages))
         self._recorded += len(messages)
-        channel = np.zeros(len(messages), np.int64)
-        return MessageColumns(topics, log_ns, publish_ns, sequence, payloads, place, channel)
+        codes = {topic: code for code, topic in enumerate(dict.fromkeys(topics))}
+        channels = {code: Channel(topic, "", None) for topic, code in codes.items()}
+        channel = np.array([codes[topic] for topic in topics], np.int64)
+        return MessageColumns(channels, channel, sequence, log_ns, publish_ns, payloads, place)
 
     def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
         self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {what}"))

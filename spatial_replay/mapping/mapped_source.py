@@ -254,7 +254,8 @@ class _CopiedMessages:
         taken, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
-        return taken.raw(self._channels)
+        columns = taken.channel, taken.sequence, taken.log_time_ns, taken.publish_time_ns
+        return Messages(self._channels, *columns, taken.payloads)
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:

@@ -30,7 +30,6 @@ from spatial_replay.annotate.events import (
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, UsageError
-from spatial_replay.geometry.arrays import select
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.geometry.measure import Operand, contacts
 from spatial_replay.logs.mcap.write import LogWriter
@@ -206,7 +205,8 @@ class Recording:
         own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
         written = own
         if beside is not None and len(beside):
-            kept = _kept(beside)
+            # a replay does not keep messages on our topics, such as planning times
+            kept = beside.of_topics({each.topic for each in beside.channels.values()} - DERIVED)
             own, written = merge([own, kept]), merge([own, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
             self._images |= image_topics(beside.channels.values())
@@ -288,14 +288,6 @@ def refuse_templates(files: Sequence[Specification]) -> None:
 
 
 _OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
-
-
-def _kept(messages: Messages) -> Messages:
-    """Return messages without those on topics that a replay does not keep, such as planning times."""
-    derived = [number for number, channel in messages.channels.items() if channel.topic in DERIVED]
-    if not derived:
-        return messages
-    return select(messages, np.flatnonzero(~np.isin(messages.channel, derived)))
 
 
 GATHER_S: Final = 0.2

@@ -738,7 +738,7 @@ class Player:
         time_ns = self._playback.time_ns
         if CURVES_TOPIC in topics:
             self._send_curves(time_ns)
-        self._viewers.publish(_on_topics(self._playback.seek(time_ns), topics))
+        self._viewers.publish(self._playback.seek(time_ns).of_topics(topics))
         self._viewers.send_state(self._session.state)
         self._viewers.send_time(time_ns)
 
@@ -765,8 +765,3 @@ class Player:
             self._viewers.send_playback()
         elif self._turns % _PLAYBACK_EVERY == 0:
             self._viewers.send_playback()
-
-
-def _on_topics(messages: Messages, topics: Collection[str]) -> Messages:
-    numbers = [number for number, channel in messages.channels.items() if channel.topic in topics]
-    return select(messages, np.flatnonzero(np.isin(messages.channel, numbers)))

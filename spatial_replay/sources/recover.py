@@ -166,7 +166,7 @@ def _write(
             at = {"log_time_ns": each.log_time_ns, "create_time_ns": each.create_time_ns}
             writer.add_attachment(each.name, each.media_type, each.data, **at)
         for columns in reader.iter_columns(names):
-            messages = samples.usable(columns.raw(channels))
+            messages = samples.usable(columns)
             writer.write_messages(messages)
             for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
                 saved[channels[int(number)].topic] += int(count)

@@ -10,6 +10,7 @@ import pytest
 from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay import LogError, Trace, UsageError
 from spatial_replay.bags.reader import MessageColumns
+from spatial_replay.logs.messages import Channel
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.topic_reader import ReadingPlan
@@ -408,7 +409,8 @@ def test_columns_of_messages_make_the_same_samples() -> None:
     plan = ReadingPlan.of(parse_mapping("topics: {/p: {}}"), feed.topics())
     raw = feed.raw()
     columns = MessageColumns(
-        topics=[message.topic for message in raw],
+        channels={0: Channel("/p", "cdr", None)},
+        channel=np.zeros(len(raw), np.int64),
         log_time_ns=np.array([message.log_time_ns for message in raw]),
         publish_time_ns=np.array([message.publish_time_ns for message in raw]),
         sequence=np.array([message.sequence for message in raw]),
