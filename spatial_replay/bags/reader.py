@@ -91,15 +91,10 @@ class MessageColumns(Messages):
 
     def messages(self) -> list[Message]:
         """Return the messages one by one."""
-        columns = zip(
-            self.topics,
-            self.log_time_ns.tolist(),
-            self.publish_time_ns.tolist(),
-            self.sequence.tolist(),
-            self.payloads,
-            strict=True,
-        )
-        return list(map(Message._make, columns))
+        return [
+            Message(topic, each.log_time_ns, each.publish_time_ns, each.sequence, each.payload)
+            for topic, each in zip(self.topics, self.rows(), strict=True)
+        ]
 
 
 Columns: TypeAlias = Iterator[MessageColumns]

@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -63,6 +63,16 @@ def _none() -> Integers:
     return np.zeros(0, np.int64)
 
 
+class Row(NamedTuple):
+    """One message of `Messages`."""
+
+    channel: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    payload: bytes
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
     """M messages in the order (time, channel, sequence), byte for byte as in the log.
@@ -81,6 +91,18 @@ class Messages:
     log_time_ns: Integers = field(default_factory=_none)
     publish_time_ns: Integers = field(default_factory=_none)
     payloads: Sequence[bytes] = ()
+
+    @classmethod
+    def from_rows(cls, channels: Mapping[int, Channel], rows: Sequence[Row]) -> Messages:
+        """Return the messages one by one as columns."""
+        *numbers, payloads = zip(*rows, strict=True) if rows else [()] * len(Row._fields)
+        channel, sequence, log_ns, publish_ns = (np.array(each, np.int64) for each in numbers)
+        return Messages(channels, channel, sequence, log_ns, publish_ns, payloads)
+
+    def rows(self) -> Iterator[Row]:
+        """Iterate over the messages one by one."""
+        columns = (self.channel, self.sequence, self.log_time_ns, self.publish_time_ns)
+        return map(Row._make, zip(*(each.tolist() for each in columns), self.payloads, strict=True))
 
     def __len__(self) -> int:
         return len(self.payloads)

@@ -266,11 +266,9 @@ def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
 
 def planner_messages(messages: Messages) -> Iterator[PlannerMessage]:
     """Iterate over the messages on the planner's topics, in their order."""
-    topics = {number: channel.topic for number, channel in messages.channels.items()}
-    columns = messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads
-    for number, time_ns, payload in zip(*columns, strict=True):
-        if topics[number] in PLANNER_TOPICS:
-            yield PlannerMessage(time_ns, topics[number], payload)
+    for topic, row in zip(messages.topics, messages.rows(), strict=True):
+        if topic in PLANNER_TOPICS:
+            yield PlannerMessage(row.log_time_ns, topic, row.payload)
 
 
 class Rerun:

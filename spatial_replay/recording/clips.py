@@ -14,11 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
-import numpy as np
-
 from spatial_replay.errors import OutputError, UsageError, system_reason
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import TRIGGER, Channel, Messages
+from spatial_replay.logs.messages import TRIGGER, Channel, Messages, Row
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.monitor.monitor import Monitor, Update
 from spatial_replay.recording.log import (
@@ -196,33 +194,11 @@ class TriggeredClip:
 
 
 class _Held(NamedTuple):
-    """A message in the ring; `size` is what it takes in memory."""
+    """A message, a sample or an occurrence of the run in the ring; `size` is what it takes in memory."""
 
     time_ns: int
-    channel: int
-    sequence: int
-    publish_ns: int
-    payload: bytes
-    size: int
-
-
-class _HeldSample(NamedTuple):
-    """A sample in the ring."""
-
-    time_ns: int
-    sample: Sample
-    size: int
-
-
-class _HeldEvent(NamedTuple):
-    """Occurrences of the run in the ring."""
-
-    time_ns: int
-    event: RunEvent
+    content: Row | Sample | RunEvent
     size: int = _MESSAGE_BYTES
-
-
-_Item: TypeAlias = _Held | _HeldSample | _HeldEvent
 
 
 class _Open:
@@ -232,7 +208,7 @@ class _Open:
         self, path: Path, files: Sequence[Specification], about: Mapping[str, str], fired: str, at_ns: int
     ) -> None:
         self.path, self.reasons, self.at_ns = path, [fired], at_ns
-        self.waiting: deque[_Item] = deque()
+        self.waiting: deque[_Held] = deque()
         self.waiting_bytes = 0
         self.begin_ns = self.until_ns = at_ns
         self.first_ns: int | None = None
@@ -249,7 +225,7 @@ class _Open:
         self._last_ns: dict[int, int] = {}
         self._sample_ns = -1
 
-    def put(self, item: _Item) -> None:
+    def put(self, item: _Held) -> None:
         self.waiting.append(item)
         self.waiting_bytes += item.size
         self.last_s = time.monotonic()
@@ -257,30 +233,24 @@ class _Open:
     def write(self, most_bytes: float = _SLICE_BYTES) -> None:
         """Write some of what waits."""
         samples: list[Sample] = []
-        messages: list[_Held] = []
+        messages: list[Row] = []
         events: list[RunEvent] = []
         size = 0
         while self.waiting and size < most_bytes:
             item = self.waiting.popleft()
             size += item.size
             self.first_ns = item.time_ns if self.first_ns is None else min(self.first_ns, item.time_ns)
-            if isinstance(item, _Held):
-                messages.append(item)
-            elif isinstance(item, _HeldEvent):
-                events.append(item.event)
+            if isinstance(item.content, Row):
+                messages.append(item.content._replace(log_time_ns=item.time_ns))
+            elif isinstance(item.content, RunEvent):
+                events.append(item.content)
             elif item.time_ns > self._sample_ns:
-                samples.append(item.sample)
+                samples.append(item.content)
                 self._sample_ns = item.time_ns
         self.waiting_bytes -= size
         if not (samples or messages or events):
             return
-        beside = Messages()
-        if messages:
-            columns = zip(*(each[:4] for each in messages), strict=True)
-            log_ns, channel, sequence, publish_ns = (np.array(each, np.int64) for each in columns)
-            payloads = [each.payload for each in messages]
-            beside = Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
-        self._recording.add(Trace.from_samples(samples), beside)
+        self._recording.add(Trace.from_samples(samples), Messages.from_rows(self.channels, messages))
         for event in events:
             self._recording.report(event)
 
@@ -338,10 +308,10 @@ class ClipLog(RecorderLog):
         self._monitors = [Monitor(file, units=units) for file in files]
         self._changes = VerdictChanges(files)
         warm_up(files, ())
-        self._samples: deque[_HeldSample] = deque()
+        self._samples: deque[_Held] = deque()
         self._messages: deque[_Held] = deque()
         self._static: deque[_Held] = deque(maxlen=_MOST_STATIC)
-        self._events: deque[_HeldEvent] = deque(maxlen=_MOST_EVENTS)
+        self._events: deque[_Held] = deque(maxlen=_MOST_EVENTS)
         self._missed: dict[Missed, deque[int]] = {
             "sample": deque(maxlen=_MOST_MISSED),
             "message": deque(maxlen=_MOST_MISSED),
@@ -377,13 +347,13 @@ class ClipLog(RecorderLog):
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Take the next samples and messages into the ring; write what belongs to an open clip."""
-        come: list[_Held | _HeldSample] = [*self._held_messages(messages)]
-        come += [_HeldSample(each.time_ns, each, _sample_bytes(each)) for each in samples]
+        come = [*self._held_messages(messages)]
+        come += [_Held(each.time_ns, each, _sample_bytes(each)) for each in samples]
         # in the order of time, so that the ring holds what is around the sample that fires
         for item in sorted(come, key=lambda each: each.time_ns):
             self._hold(item)
-            if isinstance(item, _HeldSample):
-                self._evaluate(item.sample)
+            if isinstance(item.content, Sample):
+                self._evaluate(item.content)
         with suppress(queue.Empty):
             # before anything came, there is nothing to keep: the first of it fires
             while self._newest_ns >= 0:
@@ -401,7 +371,7 @@ class ClipLog(RecorderLog):
 
     def report(self, event: RunEvent) -> None:
         """Take in what happens to the run; fire if any event does."""
-        held = _HeldEvent(event.time_ns, event)
+        held = _Held(event.time_ns, event)
         self._events.append(held)
         if self._open is not None and event.time_ns <= self._open.until_ns:
             self._open.put(held)
@@ -450,29 +420,17 @@ class ClipLog(RecorderLog):
     def _held_messages(self, messages: Messages) -> Iterator[_Held]:
         self._channels = messages.channels or self._channels
         static = {n for n, each in messages.channels.items() if each.topic.rsplit("/", 1)[-1] == _STATIC}
-        columns = zip(
-            messages.log_time_ns.tolist(),
-            messages.channel.tolist(),
-            messages.sequence.tolist(),
-            messages.publish_time_ns.tolist(),
-            messages.payloads,
-            strict=True,
-        )
-        for time_ns, channel, sequence, publish_ns, payload in columns:
-            size = _MESSAGE_BYTES + len(payload)
-            held = _Held(time_ns, channel, sequence, publish_ns, payload, size)
-            if channel in static:
+        for row in messages.rows():
+            held = _Held(row.log_time_ns, row, _MESSAGE_BYTES + len(row.payload))
+            if row.channel in static:
                 self._static.append(held)
             yield held
 
-    def _hold(self, item: _Held | _HeldSample) -> None:
-        if isinstance(item, _Held):
-            self._messages.append(item)
-        else:
-            self._samples.append(item)
+    def _hold(self, item: _Held) -> None:
+        kind: type = Sample if isinstance(item.content, Sample) else Row
+        (self._samples if kind is Sample else self._messages).append(item)
         self.held_bytes += item.size
         self._newest_ns = max(self._newest_ns, item.time_ns)
-        kind = type(item)
         newest_ns = max(self._progress[kind][0], item.time_ns) if kind in self._progress else item.time_ns
         self._progress[kind] = newest_ns, time.monotonic()
         self._evict()
@@ -504,20 +462,20 @@ class ClipLog(RecorderLog):
             clip.put(item)
         clip.until_ns = max(clip.until_ns, at_ns + self._after_ns)
 
-    def _between(self, begin_ns: int, end_ns: int) -> list[_Item]:
-        every: list[_Item] = [*self._messages, *self._samples, *self._events]
+    def _between(self, begin_ns: int, end_ns: int) -> list[_Held]:
+        every = [*self._messages, *self._samples, *self._events]
         chosen = [each for each in every if begin_ns <= each.time_ns <= end_ns]
         return sorted(chosen, key=lambda each: each.time_ns)
 
     def _evict(self) -> None:
         """Let go of what is too old and of what is too much, the oldest first."""
         # samples may come behind messages, and one of them may fire
-        reached_ns, came_s = self._progress.get(_HeldSample, (self._newest_ns, 0.0))
+        reached_ns, came_s = self._progress.get(Sample, (self._newest_ns, 0.0))
         if time.monotonic() - came_s > _LATE_S:
             reached_ns = self._newest_ns
         oldest_ns = reached_ns - self._before_ns - _LATE_NS
         while self._samples or self._messages:
-            ring: deque[_Held] | deque[_HeldSample] = self._messages
+            ring = self._messages
             if not self._messages or (self._samples and self._samples[0].time_ns < self._messages[0].time_ns):
                 ring = self._samples
             is_over = self.held_bytes > self._trigger.most_bytes

@@ -19,9 +19,8 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
 from types import FrameType, MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, Self, TypeAlias
 
-import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
 
@@ -34,6 +33,7 @@ from spatial_replay.logs.messages import (
     PLAN_PATH,
     Channel,
     Messages,
+    Row,
     Schema,
     Source,
     protobuf_channel,
@@ -262,16 +262,6 @@ _TOGETHER_BYTES: Final = 8 * 2**20
 _PAUSE_S = 0.001
 
 
-class _Waiting(NamedTuple):
-    """One message in the queue."""
-
-    channel: int
-    sequence: int
-    time_ns: int
-    publish_ns: int
-    payload: bytes
-
-
 class MessageQueue:
     """Messages from any thread, on their way to the one thread that writes them.
 
@@ -302,7 +292,7 @@ class MessageQueue:
         self.lock = threading.RLock()
         self.channels: dict[str, MessageChannel] = {}
         self._declared: Mapping[int, Channel] = MappingProxyType({})
-        self._queue: queue.SimpleQueue[_Waiting] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Row] = queue.SimpleQueue()
         self._bytes_in = self._bytes_out = 0
         self.is_closed = False
         self.process = os.getpid()
@@ -352,7 +342,7 @@ class MessageQueue:
         if self.failure is not None:
             raise self.failure
 
-    def put(self, message: _Waiting) -> bool:
+    def put(self, message: Row) -> bool:
         """Queue a message; return False if it was dropped. Call it with the lock held."""
         size = len(message.payload)
         while self._is_full(size):
@@ -370,7 +360,7 @@ class MessageQueue:
 
     def take(self) -> Messages:
         """Return some of the messages that wait, none if there are none; for the writing thread."""
-        taken: list[_Waiting] = []
+        taken: list[Row] = []
         size = 0
         with suppress(queue.Empty):
             while size < _TOGETHER_BYTES:
@@ -378,11 +368,7 @@ class MessageQueue:
                 taken.append(message)
                 size += len(message.payload)
         self._bytes_out += size
-        if not taken:
-            return Messages()
-        *numbers, payloads = zip(*taken, strict=True)
-        channel, sequence, log_ns, publish_ns = (np.array(each, np.int64) for each in numbers)
-        return Messages(self._declared, channel, sequence, log_ns, publish_ns, payloads)
+        return Messages.from_rows(self._declared, taken)
 
     def _is_full(self, size: int) -> bool:
         waiting_bytes = self._bytes_in - self._bytes_out
@@ -446,7 +432,7 @@ class MessageChannel:
 
     def _put(self, time_ns: int, publish_ns: int, payload: bytes) -> None:
         self._last_ns = time_ns
-        if self._queue.put(_Waiting(self._number, self.written, time_ns, publish_ns, payload)):
+        if self._queue.put(Row(self._number, self.written, time_ns, publish_ns, payload)):
             self.written += 1
         else:
             self.dropped += 1
@@ -915,10 +901,8 @@ class Recorder(SampleWriter):
         return self._box
 
     def _write_decision(self, messages: Messages) -> None:
-        topics = messages.channels
-        columns = messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads
-        for number, time_ns, payload in zip(*columns, strict=True):
-            self._messages.channel(topics[number]).copy(time_ns, payload)
+        for row in messages.rows():
+            self._messages.channel(messages.channels[row.channel]).copy(row.log_time_ns, row.payload)
 
     def channel(
         self,

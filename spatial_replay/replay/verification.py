@@ -169,12 +169,9 @@ class FirstDifferences:
 
     def add(self, messages: Messages) -> None:
         """Compare the next messages of the evaluation."""
-        topics = {number: channel.topic for number, channel in messages.channels.items()}
-        rows = zip(messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads, strict=True)
-        for number, time_ns, payload in rows:
-            topic = topics[number]
+        for topic, row in zip(messages.topics, messages.rows(), strict=True):
             if topic not in self._found:
-                self._compare(topic, time_ns, payload)
+                self._compare(topic, row.log_time_ns, row.payload)
 
     def finish(self) -> dict[str, Sentence]:
         """Compare what the log has beyond the evaluation; return the first difference of each topic."""
