@@ -7,10 +7,10 @@ numbers, so that equal logs give equal files.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import wraps
+from itertools import repeat
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self, TypeVar
@@ -20,7 +20,7 @@ import numpy as np
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
-from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.remote import LogFile, each_ahead
 from spatial_replay.text import Sentence, encodable
 from spatial_replay.trace.trace import Pauses, Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
@@ -628,12 +628,7 @@ def read_blocks(
 
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     """Yield the same blocks, each read while the previous one is processed."""
-    thread = ThreadPoolExecutor(1, "reading-ahead")
-    try:
-        waiting = thread.submit(next, blocks, None)
-        while (block := waiting.result()) is not None:
-            waiting = thread.submit(next, blocks, None)
-            yield block
-    finally:
-        # garbage collection may end this within the start of any thread, which must not wait for another one
-        thread.shutdown(wait=False, cancel_futures=True)
+    for block in each_ahead(lambda _: next(blocks, None), repeat(None)):
+        if block is None:
+            return
+        yield block

@@ -23,7 +23,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import Any, BinaryIO, Final, TypeAlias, cast
+from typing import Any, BinaryIO, Final, TypeAlias, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
 from spatial_replay.errors import (
@@ -111,6 +111,39 @@ class RangeStream(io.RawIOBase):
             if each not in self._fetching:
                 self._fetching[each] = self._thread.submit(self._file.fetch, self._batches[each])
         self._fetching[batch].result()
+
+
+_Item = TypeVar("_Item")
+_Read = TypeVar("_Read")
+
+
+def each_ahead(
+    read: Callable[[_Item], _Read],
+    items: Iterable[_Item],
+    at_once: int = 1,
+    most: int = 0,
+    size: Callable[[_Item], int] = lambda _: 1,
+) -> Iterator[_Read]:
+    """Yield what a function reads for each item, in order, while threads read the next ones.
+
+    As many as there are threads are always read ahead, and more as long as their sizes are `most` together.
+    """
+    threads = ThreadPoolExecutor(at_once, "reading-ahead")
+    waiting: deque[tuple[int, Future[_Read]]] = deque()
+    ahead = 0
+    try:
+        for item in items:
+            waiting.append((size(item), threads.submit(read, item)))
+            ahead += size(item)
+            while ahead > most and len(waiting) > at_once:
+                first, reading = waiting.popleft()
+                ahead -= first
+                yield reading.result()
+        while waiting:
+            yield waiting.popleft()[1].result()
+    finally:
+        # garbage collection may end this within the start of any thread, which must not wait for another one
+        threads.shutdown(wait=False, cancel_futures=True)
 
 
 def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
@@ -387,17 +420,7 @@ class RemoteFile(PathLike[str]):
 
     def iter_pieces(self, pieces: Sequence[Range], at_once: int = _AT_ONCE) -> Iterator[bytes]:
         """Read ranges at the same time, and yield the bytes of each in their order; none of them is held."""
-        threads = ThreadPoolExecutor(max(1, min(at_once, len(pieces))), "remote-reading")
-        waiting: deque[Future[bytes]] = deque()
-        try:
-            for piece in pieces:
-                waiting.append(threads.submit(self._range, piece))
-                if len(waiting) >= at_once:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            threads.shutdown(wait=False, cancel_futures=True)
+        return each_ahead(self._range, pieces, at_once)
 
     def iter_whole(self) -> Iterator[bytes]:
         """Read the file from its beginning to its end, in parts."""
@@ -771,11 +794,7 @@ class RemoteFolder:
             MissingFileError: one is not there; it may have been joined with others by another batch.
                 UsageError, RemoteError: one cannot be read.
         """
-        threads = ThreadPoolExecutor(_FILES_AT_ONCE, "remote-reading")
-        try:
-            yield from threads.map(self._read, names)
-        finally:
-            threads.shutdown(wait=False, cancel_futures=True)
+        return each_ahead(self._read, names, _FILES_AT_ONCE)
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file, which is whole or, where that fails, as before.

@@ -9,9 +9,8 @@ out only when no later chunk can hold an earlier one.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -63,7 +62,7 @@ from spatial_replay.logs.messages import (
 )
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.remote import RemoteFile, open_file, plan_reads
+from spatial_replay.logs.remote import RemoteFile, each_ahead, open_file, plan_reads
 from spatial_replay.text import Instant, Sentence, counted, listed
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
@@ -162,23 +161,10 @@ def iter_records(
         except DamageError as damage:
             return damage
 
-    waiting: deque[tuple[ChunkPlace, Future[bytes | DamageError]]] = deque()
-    ahead = 0
-    threads = ThreadPoolExecutor(cores(), "reading")
+    records = each_ahead(read, places, cores(), _AHEAD_BYTES, lambda place: max(place.length, place.size))
     try:
-        for place in places:
-            waiting.append((place, threads.submit(read, place)))
-            ahead += max(place.length, place.size)
-            while ahead > _AHEAD_BYTES and len(waiting) > cores():
-                first, reading_first = waiting.popleft()
-                ahead -= max(first.length, first.size)
-                yield first, reading_first.result()
-        while waiting:
-            first, reading_first = waiting.popleft()
-            yield first, reading_first.result()
+        yield from zip(places, records, strict=True)
     finally:
-        # garbage collection may end this within the start of any thread, which must not wait for another one
-        threads.shutdown(wait=False, cancel_futures=True)
         with reading:
             is_over = True
 
