@@ -73,33 +73,28 @@ class Events:
         """
         starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
         if len(times_ns) == 1 and len(starts):
-            return self._state_at(int(times_ns[0]), max_age_ns, starts)
+            # all objects at once, as there are more of them than times
+            at = starts + np.add.reduceat(self.time_ns <= times_ns, starts, dtype=np.int64) - 1
+            row, code = self._standing(at, starts, times_ns, max_age_ns)
+            return self.name[starts], row[None], code[None]
         ends = np.append(starts[1:], len(self.name))[: len(starts)]
         rows = np.full((len(times_ns), len(starts)), ABSENT, np.int64)
         classes = np.zeros((len(times_ns), len(starts)), np.int64)
         for column, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
             at = np.searchsorted(self.time_ns[start:end], times_ns, "right") - 1 + start
-            has_appeared = at >= start
-            at = np.maximum(at, start)
-            row = self.row[at]
-            is_old = times_ns - self.time_ns[at] > max_age_ns
-            is_absent = ~has_appeared | (row == LEFT) | (times_ns >= self.expires_ns[at])
-            rows[:, column] = np.where(is_absent, ABSENT, np.where(is_old, STALE, row))
-            classes[:, column] = self.class_code[at]
+            rows[:, column], classes[:, column] = self._standing(at, start, times_ns, max_age_ns)
         return self.name[starts], rows, classes
 
-    def _state_at(
-        self, time_ns: int, max_age_ns: int, starts: Integers
-    ) -> tuple[Integers, Integers, Integers]:
-        """Return the state at one time: all objects at once, as there are more of them than times."""
-        at = starts + np.add.reduceat(self.time_ns <= time_ns, starts, dtype=np.int64) - 1
+    def _standing(
+        self, at: Integers, starts: Integers | int, times_ns: Integers, max_age_ns: int
+    ) -> tuple[Integers, Integers]:
+        """Return rows and class codes by the events `at` some times; those before `starts` are of others."""
         has_appeared = at >= starts
         at = np.maximum(at, starts)
         row = self.row[at]
-        is_old = time_ns - self.time_ns[at] > max_age_ns
-        is_absent = ~has_appeared | (row == LEFT) | (time_ns >= self.expires_ns[at])
-        rows = np.where(is_absent, ABSENT, np.where(is_old, STALE, row))
-        return self.name[starts], rows[None], self.class_code[at][None]
+        is_old = times_ns - self.time_ns[at] > max_age_ns
+        is_absent = ~has_appeared | (row == LEFT) | (times_ns >= self.expires_ns[at])
+        return np.where(is_absent, ABSENT, np.where(is_old, STALE, row)), self.class_code[at]
 
 
 def events_from_messages(
