@@ -21,10 +21,9 @@ from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
 from spatial_replay.bags.reader import DISORDER_NS, Message
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.live.client import Client, Connected, Disconnected, Inbox, Offered, Received, Warned
-from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages, is_kept, protobuf_channel
-from spatial_replay.logs.objects import decode_objects
+from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages, is_kept
+from spatial_replay.logs.objects import OBJECTS_CHANNEL, decode_objects
 from spatial_replay.logs.read_options import FaultKinds
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
@@ -786,7 +785,7 @@ def open_viewing(
     """
     with importing("serving takes foxglove-sdk", extra="live"):
         from spatial_replay.serve.server import RunServer
-    channels = [*Recording(MemorySink(), files).channels, protobuf_channel(OBJECTS, ObjectStates)]
+    channels = [*Recording(MemorySink(), files).channels, OBJECTS_CHANNEL]
     server = RunServer(channels, host, port, fire, origins)
     try:
         viewing = Viewing(files, _axes(mapping), server)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
+from typing import Final
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
@@ -23,6 +24,7 @@ from spatial_replay.geometry.arrays import (
     starts_from_counts,
 )
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
+from spatial_replay.logs.messages import OBJECTS, Messages, messages_of, protobuf_channel
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.wire import Bytes, LayoutError, WireTemplate, Words, payloads_of, rows_of
 from spatial_replay.text import Instant, Sentence
@@ -31,6 +33,9 @@ from spatial_replay.trace.trace import ABSENT, Trace, class_order, require_few
 
 UNKNOWN, ZERO = -2, -1
 """Slots of numbers that a message does not hold, after its last slot: they read as NaN and 0."""
+
+
+OBJECTS_CHANNEL: Final = protobuf_channel(OBJECTS, ObjectStates)
 
 
 class WrongMessageError(Exception):
@@ -352,6 +357,11 @@ def _signal(name: str, groups: Sequence[_Group], count: int) -> Floats:
         if name in group.layout.signals:
             values[group.samples] = group.numbers[:, group.layout.signals[name]]
     return values
+
+
+def sample_messages(trace: Trace, first: int) -> Messages:
+    """Return the samples of a trace as messages, numbered from `first`."""
+    return messages_of(OBJECTS_CHANNEL, trace.times_ns, encode_objects(trace), first)
 
 
 def encode_objects(trace: Trace) -> list[bytes]:

@@ -39,7 +39,6 @@ from spatial_replay.logs.messages import (
     DERIVED,
     ENDING,
     METADATA,
-    OBJECTS,
     PLAN_METADATA,
     RECORDED_PREFIX,
     VERDICTS,
@@ -49,12 +48,9 @@ from spatial_replay.logs.messages import (
     Sink,
     image_topics,
     merge,
-    messages_of,
-    protobuf_channel,
 )
-from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.objects import sample_messages
 from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.monitor.monitor import SpecUpdate, Update
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stream import find_instances
@@ -202,7 +198,7 @@ class Recording:
 
     def _own(self, trace: Trace, beside: Messages | None) -> Messages:
         """Return samples and messages beside them as they are written; count and hash them."""
-        own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
+        own = sample_messages(trace, self._samples)
         written = own
         if beside is not None and len(beside):
             # a replay does not keep messages on our topics, such as planning times
@@ -285,9 +281,6 @@ def refuse_templates(files: Sequence[Specification]) -> None:
                     f"{spec.name}({spec.parameter}) in {file.filename} is a template: it stands for objects "
                     "that are not known before the end; record without it and replay it over the log"
                 )
-
-
-_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
 
 
 GATHER_S: Final = 0.2

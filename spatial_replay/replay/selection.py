@@ -28,14 +28,11 @@ from spatial_replay.logs.messages import (
     SourceOf,
     is_kept,
     merge,
-    messages_of,
-    protobuf_channel,
     read_ahead,
     read_blocks,
 )
-from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.objects import sample_messages
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.atoms.terms import look_back
@@ -322,7 +319,7 @@ class Selection:
             # in the source, messages of one time come in the order of its numbers of channels
             return merge([chosen])
         trace = self.inside(block.trace)
-        return merge([chosen, messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)])
+        return merge([chosen, sample_messages(trace, first)])
 
     def instances(self, file: Specification) -> list[Instance]:
         """Return what is to be evaluated of a specification; for templates, the source is read for objects.
@@ -380,9 +377,6 @@ class Selection:
     def _missing_names(self, names: LogNames) -> list[Diagnostic]:
         remarks = [remark for file in self.files for remark in names.check(file, self.options.each)]
         return [remark for remark in remarks if remark.severity == "error"]
-
-
-_OBJECTS: Final = protobuf_channel(OBJECTS, ObjectStates)
 
 
 def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
