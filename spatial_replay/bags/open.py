@@ -45,7 +45,7 @@ from spatial_replay.logs.mcap.index import (
 from spatial_replay.logs.mcap.read import ChunkWalk, directory_remarks, most_waiting
 from spatial_replay.logs.messages import MAGIC, Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.remote import LogFile, open_file
+from spatial_replay.logs.remote import BAG_METADATA, LogFile, open_file
 from spatial_replay.text import Instant, Sentence
 
 
@@ -177,7 +177,6 @@ class McapLog(MessageReader):
         return self._made(chosen.channel, both_ns, chosen.sequence, chosen.payloads, places_in(rank, rows))
 
 
-METADATA_FILE = "metadata.yaml"
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 _CDR_BEGIN = b"\x00"
@@ -192,7 +191,7 @@ _File: TypeAlias = McapLog | SqliteBag
 def files_of_bag_around(path: Path) -> tuple[str, ...]:
     """Return the names of all files of the bag that a file is in; none where no metadata lists it."""
     try:
-        with path.with_name(METADATA_FILE).open("rb") as stream:
+        with path.with_name(BAG_METADATA).open("rb") as stream:
             listed = bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1)).files
     except (OSError, LogError):
         return ()
@@ -206,7 +205,7 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _metadata(self) -> BagMetadata | None:
-        path = self._path / METADATA_FILE
+        path = self._path / BAG_METADATA
         try:
             with path.open("rb") as stream:
                 return bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1))
@@ -216,7 +215,7 @@ class BagFolder(MessageReader):
             raise MissingFileError.of(path, error) from None
         except LogError as error:
             what = f"cannot be used: {error}"
-        self._faults.add(f"{self.name}: {METADATA_FILE} {what}; the files in the folder were read without it")
+        self._faults.add(f"{self.name}: {BAG_METADATA} {what}; the files in the folder were read without it")
         return None
 
     @cached_property
@@ -230,7 +229,7 @@ class BagFolder(MessageReader):
                 self._faults.add(f"{self.name}: its file {name!r} is missing; what it holds is lost")
         for name in sorted(set(present) - set(listed)):
             self._remarks.add(
-                f"{self.name}: the file {name!r} is not listed in {METADATA_FILE}; it was not read"
+                f"{self.name}: the file {name!r} is not listed in {BAG_METADATA}; it was not read"
             )
         opened = [self._opened(self._path / name) for name in listed if (self._path / name).is_file()]
         files = tuple(each for each in opened if each is not None)
@@ -331,7 +330,7 @@ class BagFolder(MessageReader):
         if self._metadata is None:
             # each file compares its own counts
             return columns
-        name = name or f"{self.name}/{METADATA_FILE}"
+        name = name or f"{self.name}/{BAG_METADATA}"
         for topic in self._topics:
             type_name = self._metadata.types.get(topic.name, topic.type)
             # recorders write pkg/Type and pkg/msg/Type for one type
@@ -380,7 +379,7 @@ class BagFolder(MessageReader):
                         self._remarks.add(
                             Sentence(
                                 f"{self.name}: messages on {topic!r} are plain, the first at ",
-                                Sentence(when, f", although {METADATA_FILE} declares them as compressed"),
+                                Sentence(when, f", although {BAG_METADATA} declares them as compressed"),
                                 "; they are read as they are",
                             )
                         )

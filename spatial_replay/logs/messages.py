@@ -22,7 +22,7 @@ from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.logs.remote import LogFile, each_ahead
 from spatial_replay.text import Sentence, encodable
-from spatial_replay.trace.trace import Pauses, Sample, Trace, within
+from spatial_replay.trace.trace import LATEST_NS, Pauses, Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 if TYPE_CHECKING:
@@ -123,6 +123,12 @@ class Messages:
         numbers = [number for number, channel in self.channels.items() if channel.topic in topics]
         chosen = np.flatnonzero(np.isin(self.channel, numbers))
         return self if len(chosen) == len(self) else select(self, chosen)
+
+    def within(self, start_ns: int, end_ns: int) -> Self:
+        """Return the messages logged from one time to before another, in the same order."""
+        times_ns = self.log_time_ns
+        inside = (times_ns >= start_ns) & (times_ns <= min(end_ns - 1, LATEST_NS))
+        return self if inside.all() else select(self, np.flatnonzero(inside))
 
 
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:

@@ -200,11 +200,7 @@ class _Blocks:
 
     def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
         """Yield a block, or nothing while there is nothing to yield."""
-        if self.start_ns or self.end_ns is not None:
-            inside = messages.log_time_ns >= self.start_ns
-            if self.end_ns is not None:
-                inside &= messages.log_time_ns < self.end_ns
-            messages = select(messages, np.flatnonzero(inside))
+        messages = messages.within(self.start_ns, FOREVER if self.end_ns is None else self.end_ns)
         for fault in trace.faults:
             self.faults.add(fault)
         self.reader.move_faults(self.faults)
@@ -254,8 +250,7 @@ class _CopiedMessages:
         taken, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
-        columns = taken.channel, taken.sequence, taken.log_time_ns, taken.publish_time_ns
-        return Messages(self._channels, *columns, taken.payloads)
+        return taken.raw(self._channels)
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:

@@ -51,7 +51,6 @@ from spatial_replay.replay.selection import (
     LogNames,
     ReplayOptions,
     Selection,
-    between,
     first_sample_ns,
     look_before,
 )
@@ -98,7 +97,7 @@ class OwnMessages:
     def add(self, block: Block) -> None:
         """Add the next block of the log."""
         window = self._selection.window
-        messages = between(block.messages, window.start_ns, window.end_ns)
+        messages = block.messages.within(window.start_ns, window.end_ns)
         self._span(messages.log_time_ns)
         self._span(self._selection.inside(block.trace).times_ns)
         self._count(messages)

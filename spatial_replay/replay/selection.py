@@ -45,7 +45,7 @@ from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import listed, time_text
-from spatial_replay.trace.trace import FOREVER, Trace, window_of, within
+from spatial_replay.trace.trace import FOREVER, Trace, within
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
@@ -314,7 +314,7 @@ class Selection:
             first: the number of the block's first sample in the window.
         """
         messages = block.messages
-        chosen = between(messages, self.window.start_ns, self.window.end_ns)
+        chosen = messages.within(self.window.start_ns, self.window.end_ns)
         if any(channel.topic == OBJECTS for channel in messages.channels.values()):
             # in the source, messages of one time come in the order of its numbers of channels
             return merge([chosen])
@@ -414,7 +414,7 @@ class _ClippedSource(SourceOf):
             yield Block(Trace.from_samples(()), self.latched)
         for block in self.source.iter_blocks(first, last):
             # an external log is read from before the window, for what is valid in it
-            yield replace(block, messages=between(block.messages, first, last))
+            yield replace(block, messages=block.messages.within(first, last))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""
@@ -468,13 +468,7 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
             if not any(map(source.is_wanted, topics)):
                 return
     for block in read_blocks(source, None, end_ns):
-        yield between(block.messages, 0, end_ns)
-
-
-def between(messages: Messages, start_ns: int, end_ns: int) -> Messages:
-    """Return messages from one time to before another."""
-    begin, end = window_of(messages.log_time_ns, start_ns, end_ns)
-    return messages if end - begin == len(messages) else select(messages, np.arange(begin, end))
+        yield block.messages.within(0, end_ns)
 
 
 def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:

@@ -474,8 +474,7 @@ def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str],
     size = samples = 0
     for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
         if place.start_ns < start_ns or place.end_ns >= end_ns:
-            times = messages.log_time_ns
-            messages = select(messages, np.flatnonzero((times >= start_ns) & (times < end_ns)))
+            messages = messages.within(start_ns, end_ns)
         waiting.append(messages)
         size += messages.nbytes
         samples += walk.sample_count(messages)
