@@ -87,20 +87,10 @@ class MessageHash:
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
-        if not len(messages):
-            return
-        topics = sorted({channel.topic for channel in messages.channels.values()})
-        codes = np.zeros(max(messages.channels) + 1, np.int64)
-        for number, channel in messages.channels.items():
-            codes[number] = topics.index(channel.topic)
-        codes = codes[messages.channel]
-        for code in np.flatnonzero(np.bincount(codes)).tolist():
-            rows = np.flatnonzero(codes == code)
+        for topic, rows in messages.by_topic():
             payloads = [messages.payloads[row] for row in rows.tolist()]
             lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
-            hashes = self._topics.setdefault(
-                topics[code], (hashlib.sha256(), hashlib.sha256(), hashlib.sha256())
-            )
+            hashes = self._topics.setdefault(topic, (hashlib.sha256(), hashlib.sha256(), hashlib.sha256()))
             _take_in(hashes[0], _integers(messages.log_time_ns[rows]))
             _take_in(hashes[1], _integers(lengths))
             _take_in(hashes[2], b"".join(payloads))

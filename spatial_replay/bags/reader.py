@@ -23,7 +23,7 @@ import numpy as np
 
 from spatial_replay.bags.decoders import Decoder, Topic, decoder_of
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Integers, concatenated, equal_places, select
+from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.logs.mcap.read import too_many_waiting
 from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
@@ -62,16 +62,6 @@ class MessageColumns(Messages):
     """
 
     place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
-
-    @property
-    def topic_ranks(self) -> Integers:
-        """(M,) int64, of the topic of each message among all topics in order."""
-        names = {channel.topic for channel in self.channels.values()}
-        rank = {name: place for place, name in enumerate(sorted(names))}
-        of_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
-        for number, channel in self.channels.items():
-            of_channel[number] = rank[channel.topic]
-        return of_channel[self.channel]
 
     def ordered(self) -> MessageColumns:
         """Return the same messages by log time, topic and sequence; equal ones keep their order."""
@@ -209,8 +199,7 @@ def without_jumps(
     topics = dict[str, _Recorded]()
     for each in columns:
         first_ns = int(each.log_time_ns[0]) if first_ns is None and len(each) else first_ns
-        for rows in equal_places(each.topic_ranks):
-            topic = each.channels[int(each.channel[rows[0]])].topic
+        for topic, rows in each.by_topic():
             if topic not in checked:
                 continue
             recorded = topics.setdefault(topic, _Recorded(disorder_ns))

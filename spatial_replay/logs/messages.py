@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self, TypeVa
 import numpy as np
 
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Integers, concatenated, select
+from spatial_replay.geometry.arrays import Integers, concatenated, equal_places, select
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.logs.remote import LogFile, each_ahead
 from spatial_replay.text import Sentence, encodable
@@ -117,6 +117,26 @@ class Messages:
         """The topic of each message."""
         names = {number: channel.topic for number, channel in self.channels.items()}
         return [names[number] for number in self.channel.tolist()]
+
+    @property
+    def topic_ranks(self) -> Integers:
+        """(M,) int64, of the topic of each message among all topics in order."""
+        names = {channel.topic for channel in self.channels.values()}
+        rank = {name: place for place, name in enumerate(sorted(names))}
+        of_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
+        for number, channel in self.channels.items():
+            of_channel[number] = rank[channel.topic]
+        return of_channel[self.channel]
+
+    def by_channel(self) -> Iterator[tuple[Channel, Integers]]:
+        """Iterate over the channels that have messages, each with the places of these."""
+        for places in equal_places(self.channel):
+            yield self.channels[int(self.channel[places[0]])], places
+
+    def by_topic(self) -> Iterator[tuple[str, Integers]]:
+        """Iterate over the topics that have messages, in order, each with the places of these."""
+        for places in equal_places(self.topic_ranks):
+            yield self.channels[int(self.channel[places[0]])].topic, places
 
     def of_topics(self, topics: Collection[str]) -> Self:
         """Return the messages of some topics, in the same order."""

@@ -148,10 +148,7 @@ class OwnMessages:
 
     def _count(self, messages: Messages) -> None:
         """Count messages in the window; topics that turn out to have many leave the memory."""
-        for number, channel in messages.channels.items():
-            chosen = np.flatnonzero(messages.channel == number)
-            if not len(chosen):
-                continue
+        for channel, chosen in messages.by_channel():
             if channel not in self._counts:
                 self._few[channel] = []
             self._counts[channel] = self._counts.get(channel, 0) + len(chosen)
@@ -655,7 +652,6 @@ class Playback:
 
 def _last(events: Messages) -> Messages:
     places = [
-        np.flatnonzero(events.channel == number)[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :]
-        for number, channel in events.channels.items()
+        own[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :] for channel, own in events.by_channel()
     ]
     return select(events, np.sort(np.concatenate([np.empty(0, np.int64), *places])))

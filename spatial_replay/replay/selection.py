@@ -445,9 +445,8 @@ def _latched(source: Source, start_ns: int) -> Messages:
     latest: dict[tuple[Channel, str], Messages] = {}
     frames: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
     for messages in _messages_before(source, start_ns):
-        for number, channel in messages.channels.items():
-            own = np.flatnonzero(messages.channel == number)
-            if channel.topic == OBJECTS or not len(own):
+        for channel, own in messages.by_channel():
+            if channel.topic == OBJECTS:
                 continue
             if channel not in frames:
                 frames[channel] = _frame_names(channel)

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
 
 from spatial_replay import __version__
@@ -66,14 +65,9 @@ class Collector:
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
-        topics = {number: channel.topic for number, channel in messages.channels.items()}
-        collected = [number for number, topic in topics.items() if topic in _COLLECTED]
-        chosen = np.flatnonzero(np.isin(messages.channel, collected))
-        columns = (messages.channel, messages.sequence, messages.log_time_ns)
-        numbers = zip(*(column[chosen].tolist() for column in columns), strict=True)
-        for place, (channel, sequence, time_ns) in zip(chosen.tolist(), numbers, strict=True):
-            payload = messages.payloads[place]
-            match topics[channel]:
+        chosen = messages.of_topics(_COLLECTED)
+        for topic, (_, sequence, time_ns, _, payload) in zip(chosen.topics, chosen.rows(), strict=True):
+            match topic:
                 case log_topics.AUTOMATON:
                     state = AutomatonState.FromString(payload)
                     self.paths[state.specification, state.object or None].add(time_ns, tuple(state.states))

@@ -574,10 +574,9 @@ class PlaybackThinning:
         most = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
         kept = np.ones(len(messages), np.bool_)
         payloads: dict[int, bytes] = {}
-        for number, channel in messages.channels.items():
+        for channel, own in messages.by_channel():
             if channel.topic in _NEVER_THINNED:
                 continue
-            own = np.flatnonzero(messages.channel == number)
             times_ns, which = np.unique(messages.log_time_ns[own], return_inverse=True)
             # one time more than that comes by chance
             count = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most

@@ -17,7 +17,6 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import foxglove
-import numpy as np
 from foxglove import Parameter, Service, ServiceRequest
 from foxglove import websocket as protocol
 from jsonschema import Draft202012Validator
@@ -522,9 +521,8 @@ class RunServer(PublishingServer, protocol.ServerListener):
             if channel not in self._channels:
                 self._advertise(channel)
         super().publish(messages)
-        for number, channel in messages.channels.items():
-            own = np.flatnonzero(messages.channel == number)
-            if len(own) and channel in self._channels and _is_state(channel):
+        for channel, own in messages.by_channel():
+            if channel in self._channels and _is_state(channel):
                 time_ns = int(messages.log_time_ns[own[-1]])
                 newest = own[messages.log_time_ns[own] == time_ns].tolist()
                 sent = self._channels[channel]
