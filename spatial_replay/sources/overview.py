@@ -210,9 +210,8 @@ def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
     except LogError:
         reader = None
     for columns in reader.iter_columns({each.name for each in reader.topics()}) if reader else ():
-        names = np.array(columns.topics)
-        for name in dict.fromkeys(columns.topics):
-            of_topics[name].append(columns.log_time_ns[names == name])
+        for name, rows in columns.by_topic():
+            of_topics[name].append(columns.log_time_ns[rows])
     topics = {name: np.concatenate(each) for name, each in sorted(of_topics.items())}
     start_ns = min((int(each[0]) for each in topics.values()), default=0)
     end_ns = max((int(each[-1]) for each in topics.values()), default=0)
