@@ -167,11 +167,6 @@ class PlannedRun:
     yaws: str = ""
     others: Mapping[str, Verdict] = field(default_factory=dict)
 
-    @property
-    def satisfied(self) -> bool:
-        """Whether the run ended with the specification satisfied, for the planner and for the log."""
-        return self.ended == "hold" and self.verdict == Verdict.SATISFIED
-
 
 def record_plan(
     scenario: str,

@@ -257,18 +257,14 @@ def _subject(formula: Formula) -> frozenset[str]:
 
 def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[NamedSpec]:
     """Yield the named conjuncts of a spec; the spec itself, if it has others."""
-    waiting = [spec]
-    while waiting:
-        part = waiting.pop()
-        formula = part.formula
-        operands = (
-            formula.operands if isinstance(formula, Boolean) and formula.operator in ("and", "spec") else ()
-        )
-        below = [specs.get(each.name or "") for each in operands]
-        if operands and all(below):
-            waiting += [each for each in reversed(below) if each]
-        else:
-            yield part
+    formula, names = spec.formula, list[str]()
+    if isinstance(formula, Boolean) and formula.operator in ("and", "spec"):
+        names = [each.name or "" for each in formula.operands]
+    if names and all(name in specs for name in names):
+        for name in names:
+            yield from _parts(specs[name], specs)
+    else:
+        yield spec
 
 
 class _Examiner:
