@@ -145,7 +145,7 @@ def test_where_nothing_is_found_what_was_covered_is_said(tmp_path: Path) -> None
         # the first run varies nothing; a look around tries every tenth
         assert sum(each.runs) == 24
         assert min(each.runs) >= 1
-        assert min(least for least in each.least if least is not None) >= found.lowest.robustness
+        assert min(least for least in each.least_robustness if least is not None) >= found.lowest.robustness
     assert json.loads((tmp_path / "found" / "failures.json").read_text())["runs"] == 25
 
 
