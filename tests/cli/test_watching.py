@@ -98,7 +98,10 @@ def test_a_file_that_is_broken_at_the_start_is_waited_for(
     ("options", "said"),
     [
         (("--watch",), "give --spec FILE"),
-        (("--spec", str(RECORDINGS / "table.spatial"), "--watch", "--json", "-"), "--json is not for --watch"),
+        (
+            ("--spec", str(RECORDINGS / "table.spatial"), "--watch", "--json", "-"),
+            "--json is not for --watch",
+        ),
         (("--spec", "none/none.spatial", "--watch"), "none.spatial: no such file"),
     ],
 )

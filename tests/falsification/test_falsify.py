@@ -212,10 +212,7 @@ def test_a_folder_of_something_else_is_left_as_it_is(folder: Path, tmp_path: Pat
     other = sr.parse_specification("spec apart = G (robot dist person >= 0.4)")
     for options, message in [
         ({"seed": 3}, "holds another search: its seed is 0; give another folder"),
-        (
-            {"vary": {"speed": (1.0, 2.0)}},
-            "it varies speed from 0.6 to 1.4, and this one speed from 1.0 to 2.0",
-        ),
+        ({"vary": {"speed": (1.0, 2.0)}}, "it varies speed from 0.6 to 1.4, .* and this one speed from 1.0"),
         ({"specifications": other}, "it has other specifications"),
     ]:
         given = {"specifications": APART, "vary": VARIED, **options}
