@@ -13,7 +13,7 @@ from spatial_replay.annotate.robustness import curved_nodes
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_template import FRAMES, SceneBounds
 from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
-from spatial_replay.annotate.standing import FinalStanding, named_parts, part_title
+from spatial_replay.annotate.standing import FinalStanding, part_title
 from spatial_replay.logs.messages import (
     CAMERA_ANNOTATIONS,
     CAMERA_CALIBRATION,
@@ -155,13 +155,13 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
     ]
     curves += [
         _Curve(
-            part_title(node.name, tree),
+            part_title(node, tree),
             f"{_curves_path(tree, identifier)}.{'value' if looks_ahead(node) else 'now'}[:]",
             unit_of(node, units),
         )
         for tree in trees
         for identifier, node in curved_nodes(tree.formula).items()
-        if identifier and node.name
+        if identifier
     ]
     times = {"enabled": True, "value": f"{CURVES_TOPIC}.time[:]"}
     whole = {"xAxisVal": "currentCustom", "xAxisPath": times, "isSynced": False}
@@ -237,7 +237,8 @@ def _titled(identifier: str, title: str, config: Config) -> Panel:
 
 def _parts(trees: Sequence[ReportedTree]) -> list[tuple[str, Formula]]:
     """Return the named specs of all results, with their titles."""
-    return [(part_title(name, tree), node) for tree in trees for name, (_, node) in named_parts(tree).items()]
+    parts = ((tree, *part) for tree in trees for part in curved_nodes(tree.formula).items())
+    return [(part_title(node, tree), node) for tree, identifier, node in parts if identifier]
 
 
 class _Curve(NamedTuple):

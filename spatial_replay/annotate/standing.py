@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
-from spatial_replay.annotate.robustness import Codes, standing_codes
+from spatial_replay.annotate.robustness import Codes, curved_nodes, standing_codes
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
@@ -117,9 +117,10 @@ class StandingEncoder:
             for index, (tree, unit) in enumerate(zip(trees, self._units, strict=True))
         ]
         for index, tree in enumerate(trees):
-            for name, (node, formula) in named_parts(tree).items():
-                title, unit = part_title(name, tree), unit_of(formula, units)
-                self._entries.append(_Entry(title, unit, index, node, 0 if looks_ahead(formula) else 1))
+            for node, formula in curved_nodes(tree.formula).items():
+                title, unit = part_title(formula, tree), unit_of(formula, units)
+                if node:
+                    self._entries.append(_Entry(title, unit, index, node, 0 if looks_ahead(formula) else 1))
         self._last = [np.full((len(list(iter_nodes(tree.formula))), 4, 1), np.nan) for tree in trees]
         self._words = [""] * len(trees)
         self._violated_ns = [LATEST_NS] * len(trees)
@@ -281,20 +282,11 @@ class StandingEncoder:
         return WireTemplate.of(message)
 
 
-def named_parts(tree: ReportedTree) -> dict[str, tuple[int, Formula]]:
-    """Return the names that exactly one node below the root has, each with its id and node."""
-    named = [(node.name, identifier, node) for identifier, _, node in iter_nodes(tree.formula) if node.name]
-    names = [name for name, _, _ in named]
-    return {
-        name: (identifier, node) for name, identifier, node in named if identifier and names.count(name) == 1
-    }
-
-
 def _finite(numbers: Floats) -> Floats:
     """Return numbers without those that are infinite, which no curve and no table can show."""
     return np.where(np.isinf(numbers), np.nan, numbers)
 
 
-def part_title(name: str, tree: ReportedTree) -> str:
+def part_title(part: Formula, tree: ReportedTree) -> str:
     """Return what a named spec within a result is known by."""
-    return f"{name} in {tree.title}"
+    return f"{part.name} in {tree.title}"

@@ -38,7 +38,7 @@ AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finis
 NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number, in its part, of a window or shift in seconds, -1 for none
-NODE_WIDTH = 12  # a part's own row is longer than those of its nodes
+NODE_WIDTH = 11
 # codes of parts' nodes
 LITERAL = 0  # signal a
 PART_AND, PART_OR = 2, 3
@@ -57,14 +57,11 @@ BINARY_NODES = (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER)
 # columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run,
 # and where the table begins in each channel (of parts without windows)
 PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
-# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: which bounds follow from the table alone until the root has
-# ended, since what may still come outdoes all that is open; eight bits higher up, which do even once it has
+# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: which bounds follow from the table alone, since what may still
+# come outdoes all that is open
 PART_KNOWN = 7
-EVEN_IF_OVER = 1 << 8
-# the unit, and how far from the first sample on the root joins what its operand is; -1 if it never ends
-PART_END_UNIT, PART_ENDS_AT = 8, 9
-PART_HAS_NOW = 10  # whether it says what it is at the newest sample, too
-PART_IS_MONOTONE = 11  # whether what the root joins by the minimum never falls, or the other way round
+PART_HAS_NOW = 8  # whether it says what it is at the newest sample, too
+PART_IS_MONOTONE = 9  # whether what the root joins by the minimum never falls, or the other way round
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
-from itertools import islice
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -189,11 +188,6 @@ class SignalTable:
     def elapsed(self, unit: int, distance: int, sign: int) -> int:
         """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
         return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
-
-    def elapsed_at(self, signal: int) -> tuple[int, int] | None:
-        """Return the unit and the distance of what `elapsed` adds; None for another row."""
-        code, _, _, unit, distance, _ = next(islice(self._rows, signal, None))
-        return (unit, distance) if code == codes.ELAPSED else None
 
     def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
         """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
@@ -423,10 +417,6 @@ def operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
     return (a,)
 
 
-NEVER = codes.SAMPLES, NOTHING
-"""The end of a root that has none."""
-
-
 class _Direction(NamedTuple):
     """Operands of a root that joins by the minimum; for the maximum it is the reverse.
 
@@ -463,27 +453,12 @@ def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
     return _DIRECTIONS.get(rows[-1][codes.NODE_CODE])
 
 
-def root_end(rows: tuple[Row, ...], signals: SignalTable) -> tuple[int, int]:
-    """Return how far from the first sample on a root joins what its operand is, and in which unit."""
-    left = rows[-1][codes.NODE_A]
-    if left == NOTHING:
-        return NEVER
-    code, signal, *_ = rows[left]
-    return (signals.elapsed_at(signal) or NEVER) if code == codes.LITERAL else NEVER
-
-
-def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
+def known_bounds(rows: tuple[Row, ...]) -> int:
     """Return which bounds follow from a part's table, whatever is open, a bit for each.
 
     Later samples may always violate `G x`, so its lower bound is -inf. Its upper one is as
     great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
     The table then says what follows from what has closed, if the same holds for all of its variables.
-
-    Once a root with a window is over, what comes does not violate it any more, but may still satisfy what
-    never ends below it.
-
-    Args:
-        is_bounded: whether the root has a window, within which it joins all that its operand is.
     """
     way = _direction_of(rows)
     if way is None:
@@ -500,9 +475,9 @@ def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
         else:
             outdone.append(code == way.release and outdone[b])
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
-    known = 1 << way.worst if is_bounded or rows[-1][codes.NODE_A] == NOTHING else 0
+    known = 1 << way.worst if rows[-1][codes.NODE_A] == NOTHING else 0
     if all(outdone[node] for node in variables):
-        known |= (1 | codes.EVEN_IF_OVER) << way.best
+        known |= 1 << way.best
     return known
 
 
@@ -605,7 +580,7 @@ def _joined_rows(
     rows[operands_at:first].reshape(-1)[: len(operands)] = operands
     for number, own in enumerate(parts):
         rows[first : first + len(own) - 1] = array_of_rows(own[:-1], width)
-        rows[parts_at + number] = own[-1]
+        rows[parts_at + number, : len(own[-1])] = own[-1]
         rows[parts_at + number, [codes.PART_FIRST, codes.PART_END]] = first, first + len(own) - 1
         first += len(own) - 1
     return rows
@@ -634,11 +609,10 @@ class _Parts:
         key = nodes, has_now
         if key not in self._built:
             self._built[key] = len(self.rows)
-            self.rows.append((*_with_times(nodes), self._own_row(nodes, part, signals, has_now=has_now)))
+            self.rows.append((*_with_times(nodes), self._own_row(nodes, part, has_now=has_now)))
         return self._built[key]
 
-    def _own_row(self, nodes: tuple[Row, ...], part: PartRows, signals: SignalTable, *, has_now: bool) -> Row:
-        end = NEVER if part.is_flat else root_end(nodes, signals)
+    def _own_row(self, nodes: tuple[Row, ...], part: PartRows, *, has_now: bool) -> Row:
         row = (
             0,
             len(nodes),
@@ -647,8 +621,7 @@ class _Parts:
             part.tables,
             part.end_corner,
             self.table_size,
-            known_bounds(nodes, is_bounded=end != NEVER),
-            *end,
+            known_bounds(nodes),
             int(has_now),
             int(is_monotone(nodes)),
         )

@@ -393,9 +393,6 @@ class OnlineRun:
         self._stamps[begin : begin + count] = times_ns
         if self._position == 0:
             self._start_ns = int(self._stamps[begin])
-            for _, parts in self._open:
-                for part in parts:
-                    part.state[windows.HEAD, windows.START_NS] = self._start_ns
         arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
         numbers = first_leaf, t, count, self._position, begin, self._start_ns
         if not self._open:

@@ -48,10 +48,10 @@ EXTRA_ROWS = SETS + 5
 # newest sample, and from CHANGED to before CHANGED_END (the newest sample and 0 if nowhere else)
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
 STARTS = 9  # and then, of each window in seconds: where it starts at each position, and what comes after it
-# columns of the first row: how many samples are forgotten, the time of the first one, the base, whether
-# anything is absorbed, how many samples windows in seconds know
-OFFSET, START_NS, BASE, IS_BEGUN, ENTERED = range(5)
-KNOWN = 5  # for each set, up to where its columns are known
+# columns of the first row: how many samples are forgotten, the base, whether anything is absorbed,
+# how many samples windows in seconds know
+OFFSET, BASE, IS_BEGUN, ENTERED = range(4)
+KNOWN = 4  # for each set, up to where its columns are known
 NEXT = KNOWN + SETS  # of each window in seconds, the next positions to begin and to close
 
 
@@ -529,22 +529,11 @@ def _at_first(
 
 
 @inlined
-def _is_known(rows: Integers, stamps: Integers, state: Integers, mode: int, last: int) -> bool:
+def _is_known(rows: Integers, state: Integers, mode: int) -> bool:
     """Return whether a bound follows from the table alone (see `program`)."""
     part = len(rows) - 1
-    known = rows[part, codes.PART_KNOWN] >> mode
-    is_free = known & codes.EVEN_IF_OVER > 0 or not _is_over(rows, stamps, state, last)
     is_constant = state[HEAD, IS_BEGUN] > 0 and rows[part, codes.PART_VARIABLES] == 0
-    return bool(is_constant or (known & 1 > 0 and is_free))
-
-
-@inlined
-def _is_over(rows: Integers, stamps: Integers, state: Integers, last: int) -> bool:
-    """Return whether no later sample can fall into the window of a root that counts from the first one."""
-    part, elapsed = len(rows) - 1, state[HEAD, OFFSET] + last
-    if rows[part, codes.PART_END_UNIT] != codes.SAMPLES:
-        elapsed = stamps[last] - state[HEAD, START_NS]
-    return bool(0 <= rows[part, codes.PART_ENDS_AT] <= elapsed)
+    return bool(is_constant or rows[part, codes.PART_KNOWN] >> mode & 1 > 0)
 
 
 @kernel
@@ -580,7 +569,7 @@ def run_windows(
             into = says + mode + (mode != codes.OPEN_END)
             if mode != codes.OPEN_END and not bounds >> (mode - 1) & 1:
                 continue
-            if mode != codes.OPEN_END and _is_known(rows, stamps, state, mode, last):
+            if mode != codes.OPEN_END and _is_known(rows, state, mode):
                 corner = 0 if mode == codes.OPEN_LOW else corners - 1
                 columns[into, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
                 continue
