@@ -15,7 +15,9 @@ from examples import examples
 from laws.strategies_monitor import HEADER, WORDS, Recording, recordings, specifications
 from laws.strategies_spec import formula_texts
 from spatial_replay import Specification
+from spatial_replay.compare.clips import cut_clip
 from spatial_replay.compare.edits import unify_regions
+from spatial_replay.logs.messages import MemorySource
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, NamedSpec
 
@@ -212,3 +214,11 @@ def test_a_clip_has_the_verdicts_the_robustness_and_the_witnesses_of_the_log(spe
                 [its.deciding.lower, its.deciding.upper, its.deciding.value],
                 equal_nan=True,
             )
+
+
+def test_a_clip_of_a_missed_response_leaves_out_what_came_before(tmp_path):
+    specification = sr.parse_specification("spec s = G (p >= 0 -> q >= 0)")
+    numbers = [(1.0, -0.5) if k == 30 else (-1.0, 1.0) for k in range(60)]
+    samples = [sr.Sample(k * 10**8, {}, {"p": p, "q": q}) for k, (p, q) in enumerate(numbers)]
+    clip = cut_clip(MemorySource.from_samples(samples), [specification], tmp_path / "clip.mcap")
+    assert (clip.start_ns, clip.replayed.samples) == (30 * 10**8, 1)
