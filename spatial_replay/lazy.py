@@ -70,7 +70,7 @@ class Printed:
 
 def page_of(lines: Iterable[str]) -> str:
     """Return lines of text as HTML."""
-    return f"<pre>{escape(chr(10).join(lines))}</pre>"
+    return f'<pre style="white-space:pre-wrap">{escape(chr(10).join(lines))}</pre>'
 
 
 def _notebook() -> Any:

@@ -522,7 +522,7 @@ class Ros1Bag(MessageReader):
             content = read_chunk(stream, chunk.offset)
         except DamageError as damage:
             self._fault(chunk, Sentence(f"{damage}; the ", span, " are lost"))
-            return MessageColumns()
+            return MessageColumns(self._channels)
         table, breaks_off = record_table(content)
         if breaks_off:
             self._fault(chunk, Sentence("a record breaks off; some of the ", span, " are lost"))

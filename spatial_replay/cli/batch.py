@@ -362,7 +362,7 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     from spatial_replay.batch.store import ResultsFolder, result_files
 
     if outputs.baseline is None:
-        given = {"--update-baseline": outputs.update_baseline, "--tolerance": outputs.tolerance}
+        given = {"--update-baseline": outputs.update_baseline, "--tolerance": outputs.tolerance is not None}
         refuse_given(given, "applies to a baseline; add --baseline RESULTS")
         return Tolerance(), None
     with naming_option("--tolerance"):

@@ -67,8 +67,6 @@ from spatial_replay.text import counted, requirement_text, time_text
 from spatial_replay.trace.trace import duration_ns_from_text, time_point_from_text
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from spatial_replay.monitor.result import SpecResult
     from spatial_replay.monitor.verdict import Semantics
     from spatial_replay.replay.document import Explanation

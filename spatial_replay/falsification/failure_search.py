@@ -847,14 +847,14 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
         (content,) = files.read([_SEARCH])
         other = json.loads(content)
         key = next((key for key in identity if other.get(key) != identity[key]), None)
-        varied = [_varied_text(each["varied"]) for each in (other, identity)]
+        varied = [_varied_text(each["varied"]) for each in (other, identity) if key == "varied"]
     except (AttributeError, LookupError, TypeError, ValueError):
         raise LogError(f"{files.path / _SEARCH} is damaged; delete {files}, or give another folder") from None
     if key is not None:
         what = {
             "seed": f"its seed is {other.get('seed')}",
             "simulation": f"it is of {other.get('simulation')}",
-            "varied": f"it varies {varied[0]}, and this one {varied[1]}",
+            "varied": f"it varies {', and this one '.join(varied)}",
             "specifications": "it has other specifications",
             "version": f"it is of version {other.get('version')}",
         }.get(key, f"its {key} is {other.get(key)}")

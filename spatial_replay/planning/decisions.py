@@ -212,6 +212,11 @@ class Step(Displayed):
         return self.aim.progress if self.aim is not None else Guards((), ())
 
     @property
+    def constraints(self) -> Guards:
+        """Constraint set: propositions that must not hold on the way; empty without an aim."""
+        return self.aim.constraints if self.aim is not None else Guards((), ())
+
+    @property
     def candidates(self) -> tuple[Candidate, ...]:
         """The objects considered for the aim."""
         return self.aim.candidates if self.aim is not None else ()

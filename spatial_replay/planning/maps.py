@@ -7,6 +7,7 @@ conjunct limits a cell, and what blocks it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
@@ -55,6 +56,9 @@ OUT_OF_REACH: Final = 3
 UNKNOWN: Final = 4
 REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
 """Why a cell is blocked, by its number in `GradientMap.blocked`."""
+
+_AT_ONCE: Final = 1 << 20
+"""So many values are measured at once: what that takes is about 60 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,26 +225,41 @@ def proposition_maps(
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
     cells = workspace.grid if grid is None else grid
     turns = workspace.turns(tracked.yaw)
-    shape = len(turns), *cells.shape
     moves = np.array([concerns(each, name) for each in propositions], np.bool_)
     concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
     others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
     obstacles = [each for each in sorted(sample.objects) if each not in (name, *workspace.supports)]
-    distances = _obstacle_distances(propositions, name, obstacles)
-    here = Trace.from_samples([sample])
-    everywhere = _trace_over_poses(here, tracked, name, cells.centres(), turns)
-    found = leaf_values(TraceScene(everywhere, regions), [*concerned, *distances], {})[:2]
-    found = found.reshape(*found.shape[:2], *shape)
+    formulas = [*concerned, *_obstacle_distances(propositions, name, obstacles)]
+    here, centres = Trace.from_samples([sample]), cells.centres()
+    shape = len(turns), len(centres)
+    to_obstacles = np.empty((len(obstacles) + 1, *shape))
+    pieces: list[tuple[slice, Floats]] = []
+    for places in _slices(len(centres), math.prod(shape) * len(formulas)):
+        posed = _trace_over_poses(here, tracked, name, centres[places], turns)
+        values = leaf_values(TraceScene(posed, regions), formulas, {})[:2]
+        values = values.reshape(*values.shape[:2], len(turns), -1)
+        static = _static_distance(posed, name, workspace.obstacles).reshape(len(turns), -1)
+        to_obstacles[:, :, places] = [*values[0, len(concerned) :], static]
+        pieces.append((places, values[:, : len(concerned)]))
     # propositions that do not depend on the object have the same value in every cell
-    fixed = leaf_values(TraceScene(here, regions), others, {})[:2, :, :, None, None]
+    fixed = leaf_values(TraceScene(here, regions), others, {})[:2, :, :, None]
     # where all is known, as in most maps, both ends are one array
-    bounds = np.empty((max(len(found), len(fixed)), len(propositions), *shape))
-    bounds[:, moves], bounds[:, ~moves] = found[:, : len(concerned)], fixed
-    static = _static_distance(everywhere, name, workspace.obstacles).reshape(1, *shape)
-    to_obstacles = np.concatenate((found[0, len(concerned) :], static))
+    ends = max(len(fixed), *(len(values) for _, values in pieces))
+    bounds = np.empty((ends, len(propositions), *shape))
+    bounds[:, ~moves] = fixed
+    for places, values in pieces:
+        bounds[:, moves, :, places] = values
+    bounds = bounds.reshape(ends, -1, len(turns), *cells.shape)
+    to_obstacles = to_obstacles.reshape(-1, len(turns), *cells.shape)
     about = MapSubject(tuple(propositions), regions, sample)
     ways = to_obstacles.min(axis=0), to_obstacles, turns, (*obstacles, "")
     return PropositionMaps(name, cells, bounds[0], bounds[-1], *ways, about)
+
+
+def _slices(count: int, values: int) -> Iterator[slice]:
+    """Iterate over slices of so many places, which have so many values in all."""
+    size = max(1, count * _AT_ONCE // max(values, 1))
+    yield from (slice(first, first + size) for first in range(0, count, size))
 
 
 def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: Sequence[str]) -> list[Atom]:

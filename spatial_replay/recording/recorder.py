@@ -954,6 +954,11 @@ class Recorder(SampleWriter):
         """The logs that the trigger has left so far, complete ones only."""
         return () if self._clips is None else self._clips.written
 
+    @property
+    def held_bytes(self) -> int:
+        """Samples and messages that wait for the trigger."""
+        return 0 if self._clips is None else self._clips.held_bytes
+
     def take_remarks(self) -> tuple[str, ...]:
         """Return what the trigger has done since the last call, and what it could not hold."""
         return () if self._clips is None else self._clips.take_remarks()

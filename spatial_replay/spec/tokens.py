@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import islice, pairwise
+from itertools import pairwise
 from types import MappingProxyType
 
 from lark import Token
@@ -172,7 +172,7 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
             written = _word(token, result, following, macros)
             if written.type == "ERROR":
                 # so far and no further, or a text full of such words would take quadratic time
-                after = islice(tokens, index + 1, index + 1000)
+                after = tokens[index + 1 : index + 1000]
                 if following[0].value in macros or _holds_formula(after):
                     _report(token, faults)
                 else:
@@ -201,7 +201,7 @@ def _plain(token: Token) -> str:
     return str(token.value).lower().removesuffix("_")
 
 
-def _holds_formula(after: Iterable[Token]) -> bool:
+def _holds_formula(after: Sequence[Token]) -> bool:
     """Return whether what follows is no list of arguments: up to its closing bracket, it relates objects."""
     depth = 0
     for token in after:

@@ -15,6 +15,7 @@ import pytest
 
 from bags.bag_files import (
     MAPPING,
+    SECOND,
     START_NS,
     TEXT,
     Sent,
@@ -135,6 +136,22 @@ def test_a_damaged_chunk_of_a_bag_costs_only_itself(tmp_path: Path) -> None:
     assert 150 < len(messages) < 180
     assert "are lost" in reported[0] and "at byte" in reported[0]
     assert any("declares 60 messages on '/a'" in each for each in reported)
+
+
+def test_a_damaged_chunk_among_chunks_that_overlap_costs_only_itself(tmp_path: Path) -> None:
+    # words come a second late, so each chunk holds some from before the one before
+    late = sorted(SENT, key=lambda each: each.time_ns + SECOND * (each.topic == "/words"))
+    path = write_ros1(tmp_path / "drive.bag", late, compression="bz2")
+    whole, reported = read(path)
+    assert (len(whole), reported) == (len(SENT), ())
+    data = bytearray(path.read_bytes())
+    middle = data.index(b"BZh9", len(data) // 2)
+    data[middle + 20] ^= 0xFF
+    path.write_bytes(data)
+    messages, reported = read(path)
+    assert 150 < len(messages) < len(whole)
+    assert messages == [each for each in whole if each in messages]
+    assert "are lost" in reported[0]
 
 
 def test_a_bag_without_its_index_is_read(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def bench_planned_runs(bench: Any) -> None:
             )
             thought = [each.planning_s for each in runs]
             bench.quantile(f"{scenario}: planning", thought, 0.5, unit="run", limit_s=1.0)
-            failed = [each.reason for each in runs if not each.satisfied]
+            failed = [each.reason for each in runs if each.verdict != "satisfied"]
             bench.remark(f"{scenario}: {len(runs) - len(failed)} of {len(runs)} runs end satisfied")
             for reason in failed:
                 bench.remark(f"{scenario}: {reason}")
