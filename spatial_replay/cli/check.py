@@ -179,7 +179,8 @@ def check(
     from spatial_replay.sanity import doctor as examine
 
     if dfa is None:
-        refuse_given({"--result": of is not None, "--hz": hz is not None}, "is for an automaton; add --dfa FILE")
+        given = {"--result": of is not None, "--hz": hz is not None}
+        refuse_given(given, "is for an automaton; add --dfa FILE")
     if as_json and dfa == "-":
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
     if form != "text" and (as_json or dfa == "-"):

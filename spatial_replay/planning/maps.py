@@ -232,24 +232,24 @@ def proposition_maps(
     formulas = [*concerned, *_obstacle_distances(propositions, name, obstacles)]
     here, centres = Trace.from_samples([sample]), cells.centres()
     shape = len(turns), len(centres)
-    to_obstacles = np.empty((len(obstacles) + 1, *shape))
+    to_obstacles: Floats = np.empty((len(obstacles) + 1, *shape))
     pieces: list[tuple[slice, Floats]] = []
     for places in _slices(len(centres), math.prod(shape) * len(formulas)):
         posed = _trace_over_poses(here, tracked, name, centres[places], turns)
-        values = leaf_values(TraceScene(posed, regions), formulas, {})[:2]
-        values = values.reshape(*values.shape[:2], len(turns), -1)
         static = _static_distance(posed, name, workspace.obstacles).reshape(len(turns), -1)
+        values = leaf_values(TraceScene(posed, regions), formulas, {})[:2]
+        values = values.reshape(*values.shape[:2], *static.shape)
         to_obstacles[:, :, places] = [*values[0, len(concerned) :], static]
         pieces.append((places, values[:, : len(concerned)]))
     # propositions that do not depend on the object have the same value in every cell
     fixed = leaf_values(TraceScene(here, regions), others, {})[:2, :, :, None]
     # where all is known, as in most maps, both ends are one array
     ends = max(len(fixed), *(len(values) for _, values in pieces))
-    bounds = np.empty((ends, len(propositions), *shape))
+    bounds: Floats = np.empty((ends, len(propositions), *shape))
     bounds[:, ~moves] = fixed
     for places, values in pieces:
         bounds[:, moves, :, places] = values
-    bounds = bounds.reshape(ends, -1, len(turns), *cells.shape)
+    bounds = bounds.reshape(ends, len(propositions), len(turns), *cells.shape)
     to_obstacles = to_obstacles.reshape(-1, len(turns), *cells.shape)
     about = MapSubject(tuple(propositions), regions, sample)
     ways = to_obstacles.min(axis=0), to_obstacles, turns, (*obstacles, "")
