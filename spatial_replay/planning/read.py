@@ -206,6 +206,7 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
                     f"{source.name} has lost the sample at {message.time_ns} ns, on which a decision depends"
                 )
             rerun.repeat(decision)
+            rerun.taken()
             if decision.HasField("outcome"):
                 steps[decision.number] = replace(steps[decision.number], message=decision)
             elif rerun.last is not None:
@@ -288,7 +289,7 @@ class Rerun:
         self.is_moving = False
 
     def taken(self) -> Messages:
-        """Return the messages of what was repeated since the last call."""
+        """Return the messages of what was repeated since the last call, and keep them no longer."""
         written = merge(self._written)
         self._written.clear()
         return written
@@ -729,6 +730,7 @@ class _Redoing:
         """Repeat a decision or its outcome; return whether the same was done."""
         before = self._new.last
         self._old.repeat(decision)
+        self._old.taken()
         self._new.repeat(decision)
         messages, old, new = self._new.taken(), self._old.last, self._new.last
         if old is None or new is None:
