@@ -1,6 +1,8 @@
 """The colours of robustness: blue where it is positive, vermillion where it is negative, grey where unknown.
 
 Blue and vermillion, and their mixtures with grey, are distinguishable with every common colour blindness.
+Pages, panel and terminals have shades of their own, for contrast: `report/page.py`, `panel/src/decisions.ts`
+and `cli/terminal.py`.
 """
 
 from __future__ import annotations
