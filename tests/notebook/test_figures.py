@@ -48,4 +48,5 @@ def test_matplotlib_loads_when_something_is_drawn(used):
 def test_a_notebook_shows_the_text_of_a_result():
     found = sr.doctor(sr.parse_specification("spec late = G (cup dist jug < 0.5)"))
     shown = found._repr_html_()
-    assert unescape(shown) == f"<pre>{chr(10).join(found.lines())}</pre>"
+    lines = chr(10).join(found.lines())
+    assert unescape(shown) == f'<pre style="white-space:pre-wrap">{lines}</pre>'
