@@ -18,6 +18,7 @@ import pytest
 import spatial_replay
 
 PROJECT = Path(__file__).parent.parent / "pyproject.toml"
+TOOL = PROJECT.parent / "tools/check_house"
 
 
 def package_files() -> list[Path]:
@@ -88,3 +89,64 @@ def imported_modules(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             modules.add(node.module.partition(".")[0])
     return modules
+
+
+NEW_MODULE = '''
+"""Objects and their neighbours."""
+from contextlib import contextmanager
+
+
+def nearest(nodes, each):
+    found = [each for each in nodes if each]
+    for here, node in found:
+        match node:
+            case {"own": own}:
+                return own
+    return [known := 1]
+
+
+class Group:
+    @property
+    def tested(self): ...
+
+    def is_closed(self): ...
+
+    def _reduced(self):
+        def kept(): ...
+
+    @contextmanager
+    def locked(self): ...
+
+    def feed(self): ...
+'''
+
+
+def test_the_house_limits_names_of_its_dialect_but_not_its_size(tmp_path: Path) -> None:
+    pytest.importorskip("grimp")
+    tool = tmp_path / "tools/check_house"
+    tool.parent.mkdir()
+    tool.write_text(
+        re.sub(r"(named by a participle|names of DIALECT)\": [\d_]+", r'\1": 0', TOOL.read_text())
+    )
+    package = tmp_path / "spatial_replay"
+    package.mkdir()
+    (package / "__init__.py").write_text("from spatial_replay.groups import Group as Group\n")
+    (package / "groups.py").write_text(NEW_MODULE)
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+
+    check = subprocess.run(
+        [sys.executable, str(tool), "--dialect"], capture_output=True, text=True, check=False
+    )
+
+    assert check.returncode == 1, check.stderr
+    lines = [line for line in check.stdout.splitlines() if line.startswith("spatial_replay/")]
+    assert lines == [
+        f"spatial_replay/groups.py:{place}"
+        for place in ("7: each", "7: found", "8: here", "10: own", "12: known", "21: _reduced", "22: kept")
+    ]
+    faults = [line for line in check.stdout.splitlines() if "A change that lowers it" in line]
+    assert [line.partition(":")[0] for line in faults] == [
+        "local variables are bound to names of DIALECT",
+        "functions are named by a participle",
+    ]
+    assert "2 modules\n" in check.stdout
