@@ -87,6 +87,43 @@ def test_an_open_position_and_orientation_widen_the_interval(
 
 
 @examples(60)
+@given(LENGTHS, LENGTHS, PLACES, st.floats(-pi, pi), st.floats(0, 2 * pi), SHARES, st.floats(0, pi), SHARES)
+def test_an_open_angle_of_the_hitch_widens_the_interval(
+    front: float, hitch: float, x: float, low: float, bend: float, share: float, turn: float, way: float
+) -> None:
+    """The truck is a point between the position and the hitch."""
+    truck = (
+        "<truckShape><truckDims><length>0</length><width>0</width><wheelbase>1</wheelbase>"
+        "<distFromRearToRearAxle>0</distFromRearToRearAxle><cabinLength>1</cabinLength>"
+        f"<distFromRearAxleToHitch>{hitch}</distFromRearAxleToHitch></truckDims>"
+        f"<originXShift>{-hitch}</originXShift></truckShape>"
+    )
+    trailer = (
+        "<trailerDims><length>8</length><width>2</width><wheelbase>5</wheelbase>"
+        f"<distFromFrontToHitch>{front}</distFromFrontToHitch></trailerDims>"
+    )
+    interval = "<{0}><intervalStart>{1}</intervalStart><intervalEnd>{2}</intervalEnd></{0}>".format
+    scenario = read(
+        f"<semiTrailerTruckShape>{truck}{trailer}</semiTrailerTruckShape>",
+        f"<initialState><position><point><x>{x}</x><y>0</y></point></position>"
+        + interval("orientation", low, low + turn)
+        + interval("hitchAngle", low, low + bend)
+        + "<time><exact>0</exact></time></initialState>",
+    )
+    angle, hitch_angle = low + way * turn, low + share * bend
+    ahead, behind = 2 * hitch, front - 4
+    truth = rectangle(
+        8,
+        2,
+        x + ahead * cos(angle) + behind * cos(angle + hitch_angle),
+        ahead * sin(angle) + behind * sin(angle + hitch_angle),
+        angle + hitch_angle,
+    )
+    tip = Footprint.disc(x + hitch * cos(angle), hitch * sin(angle), 0)
+    assert_within(scenario, Footprint.union([tip, truth]))
+
+
+@examples(60)
 @given(LENGTHS, LENGTHS, PLACES, PLACES, SHARES, SHARES, SHARES, SHARES)
 def test_an_obstacle_anywhere_in_an_occupancy_is_within_the_interval(
     length: float, width: float, x: float, y: float, long: float, wide: float, along: float, across: float

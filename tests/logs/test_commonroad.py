@@ -94,6 +94,58 @@ def test_shapes_are_unions_around_the_centre(write: Write) -> None:
     assert sorted(corner.vertices.tolist()) == [[10, 0], [10, 1], [11, 0]]
 
 
+def tags(**numbers: float) -> str:
+    return "".join(f"<{name}>{number}</{name}>" for name, number in numbers.items())
+
+
+TRUCK = (
+    "<truckShape><truckDims>"
+    + tags(
+        length=6, width=2, wheelbase=4, distFromRearToRearAxle=1, cabinLength=2, distFromRearAxleToHitch=0.5
+    )
+    + "</truckDims><originXShift>-1</originXShift></truckShape>"
+)
+TRAILER = tags(length=10, width=2, wheelbase=7, distFromFrontToHitch=1)
+SEMI_TRAILER = f"<semiTrailerTruckShape>{TRUCK}<trailerDims>{TRAILER}</trailerDims></semiTrailerTruckShape>"
+
+
+def corners(footprint: Footprint) -> list[list[list[float]]]:
+    return [sorted((part.vertices.round(9) + 0.0).tolist()) for part in footprint.parts]
+
+
+def test_the_position_of_a_rectangle_is_shifted_from_its_centre(write: Write) -> None:
+    shifted = f"<rectangle>{tags(length=4, width=2, originXShift=-1.5)}</rectangle>"
+    first, turned = samples(
+        write(scenario(car(1, state(0), state(1, point(5, 0), exact(pi / 2)), shape=shifted)))
+    )
+    assert first.objects["1"].footprint == Footprint.box(-0.5, -1, 3.5, 1)
+    assert corners(turned.objects["1"].footprint) == [[[4, -0.5], [4, 3.5], [6, -0.5], [6, 3.5]]]
+
+
+def test_a_rectangle_without_an_orientation_is_uncertain_as_far_as_its_corners_turn(write: Write) -> None:
+    shifted = f"<rectangle>{tags(length=4, width=2, originXShift=-1.5)}</rectangle>"
+    (found,) = samples(write(scenario(car(1, state(0, angle=""), shape=shifted))))
+    assert found.objects["1"].uncertainty == pytest.approx(2 * (3.5**2 + 1) ** 0.5)
+
+
+def test_a_truck_is_placed_by_its_own_shift(write: Write) -> None:
+    (found,) = samples(write(scenario(car(1, state(0, point(7, 3)), shape=TRUCK))))
+    assert found.objects["1"].footprint == Footprint.box(5, 2, 11, 4)
+
+
+def test_a_trailer_turns_about_its_hitch(write: Write) -> None:
+    """The truck's middle is 1 m ahead of its position, its rear axle 1 m behind, its hitch 0.5 m behind."""
+    bent = state(1).replace("</state>", f"<hitchAngle>{exact(pi / 2)}</hitchAngle></state>")
+    reversing = state(2, angle=exact(pi)).replace(
+        "</state>", f"<hitchAngle>{exact(-pi / 2)}</hitchAngle></state>"
+    )
+    straight, turned, back = samples(write(scenario(car(1, state(0), bent, reversing, shape=SEMI_TRAILER))))
+    truck = [[-2, -1], [-2, 1], [4, -1], [4, 1]]
+    assert corners(straight.objects["1"].footprint) == [truck, [[-9.5, -1], [-9.5, 1], [0.5, -1], [0.5, 1]]]
+    assert corners(turned.objects["1"].footprint) == [truck, [[-1.5, -9], [-1.5, 1], [0.5, -9], [0.5, 1]]]
+    assert corners(back.objects["1"].footprint)[1] == [[-0.5, -9], [-0.5, 1], [1.5, -9], [1.5, 1]]
+
+
 def test_a_scenario_of_standing_obstacles_is_one_sample(write: Write) -> None:
     building = f'<environmentObstacle id="7"><type>building</type><shape>{BOX}</shape></environmentObstacle>'
     (found,) = samples(write(scenario(building, car(8, state(0), kind="staticObstacle"))))
@@ -162,6 +214,14 @@ def test_an_occupancy_is_an_outline_that_the_obstacle_is_within(write: Write) ->
         (car(2, state(1)).replace("<shape>", "<form>").replace("</shape>", "</form>"), "no <shape>"),
         (car(2, state(1), shape=""), "<shape> is empty"),
         (car(2, state(1), shape="<sphere/>"), "<sphere> is not a shape"),
+        (car(2, state(1), shape=BOX.replace("<width>", "<tilt>1</tilt><width>")), "unknown <tilt>"),
+        (car(2, state(1), shape="<circle><radius>1</radius><arc/></circle>"), "unknown <arc>"),
+        (car(2, state(1), shape=SEMI_TRAILER.replace("wheelbase", "axles")), "unknown <axles>"),
+        (car(2, state(1), shape=TRUCK.replace("<originXShift>-1</originXShift>", "")), "no <originXShift>"),
+        (
+            car(2, state(1), state(2, BOX.replace("</rect", "<originXShift>1</originXShift></rect"))),
+            "a region has no originXShift",
+        ),
         (car(2, state(1), shape="<circle><radius>-1</radius></circle>"), "radius is -1"),
         (car(2, state(1), shape="<polygon/>"), "no <point>"),
         (car(2, kind="staticObstacle"), "no <initialState>"),

@@ -172,6 +172,8 @@ _LONGEST_STEP = 15
 """Digits of the number of a time step."""
 _LONGEST_INTERVAL = 100_000
 """Time steps."""
+_SHAPES = "<rectangle>, <circle> or <polygon>"
+_TRUCK_LENGTHS = ("wheelbase", "distFromRearToRearAxle", "cabinLength", "distFromRearAxleToHitch")
 
 
 class ScenarioError(Exception):
@@ -180,10 +182,24 @@ class ScenarioError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class OutlinePart:
-    """A polygon, or (one vertex and a radius) a disc, in metres."""
+    """A polygon, or (one vertex and a radius) a disc, in metres.
+
+    Attributes:
+        hitch_x: distance of a trailer's hitch ahead of the origin; its vertices are relative to the hitch.
+    """
 
     vertices: Points
     radius: float = 0.0
+    hitch_x: float | None = None
+
+    def turned(self, hitch_angle: float) -> Points:
+        """Return the vertices in the obstacle's frame, at an angle of the hitch in radians."""
+        if self.hitch_x is None:
+            return self.vertices
+        along_x, along_y = cos(hitch_angle), sin(hitch_angle)
+        return [
+            (self.hitch_x + along_x * x - along_y * y, along_y * x + along_x * y) for x, y in self.vertices
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +209,7 @@ class ObstacleState:
     Attributes:
         x, y: in metres.
         angle: of its outline, in radians.
+        hitch_angle: of its trailer, if it has one, in radians.
         oriented: whether its orientation is that angle, rather than unknown.
         uncertainty: how far, in metres, its true outline may be from the one given.
         region: an outline in the world that takes the place of the obstacle's own.
@@ -202,6 +219,7 @@ class ObstacleState:
     x: float = 0.0
     y: float = 0.0
     angle: float = 0.0
+    hitch_angle: float = 0.0
     oriented: bool = False
     uncertainty: float = 0.0
     region: tuple[OutlinePart, ...] | None = None
@@ -214,7 +232,7 @@ class ObstacleState:
         parts = self.region if self.region is not None else outline
         along_x, along_y = cos(self.angle), sin(self.angle)
         vertices: list[float] = []
-        for x, y in (vertex for part in parts for vertex in part.vertices):
+        for x, y in (vertex for part in parts for vertex in part.turned(self.hitch_angle)):
             vertices += (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
         counts, radii = [len(part.vertices) for part in parts], [part.radius for part in parts]
         yaw = self.angle if self.oriented else nan
@@ -325,7 +343,7 @@ def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
     if element.name == "phantomObstacle":
         # it may be there or not: an object of every open group, about which nothing is known
         return _Obstacle(name, class_name, [], dict.fromkeys(_moving_states(element, [], report), UNKNOWN))
-    outline = _parts_of(_required(element, "shape"))
+    outline = _outline_of(_required(element, "shape"))
     if element.name == "environmentObstacle":
         return _Obstacle(name, class_name, outline, fixed=ObstacleState())
     role = element.child("role")
@@ -372,35 +390,108 @@ def _state_or_unknown(element: Element, outline: Sequence[OutlinePart], report: 
         return UNKNOWN
 
 
-def _parts_of(shape: Element) -> list[OutlinePart]:
-    """Return the rectangles, circles and polygons in an element.
+def _outline_of(shape: Element) -> list[OutlinePart]:
+    """Return the outline of an obstacle around the position of its states.
 
     Raises:
         ScenarioError: there is none, or something else.
     """
-    parts = [_part(child) for child in shape.children]
-    if not parts:
-        raise ScenarioError(f"<{shape.name}> is empty; give <rectangle>, <circle> or <polygon>")
-    return parts
+    if not shape.children:
+        raise ScenarioError(
+            f"<{shape.name}> is empty; give {_SHAPES}, <truckShape> or <semiTrailerTruckShape>"
+        )
+    return [part for child in shape.children for part in _outline_parts(child)]
+
+
+def _outline_parts(element: Element) -> list[OutlinePart]:
+    if element.name == "rectangle":
+        return [_rectangle(element, origin_x_shift=_number_or_zero(element, "originXShift"))]
+    if element.name == "truckShape":
+        return [_truck(element)]
+    if element.name == "semiTrailerTruckShape":
+        _refuse_unknown(element, "truckShape", "trailerDims")
+        truck = _required(element, "truckShape")
+        return [_truck(truck), _trailer(_required(element, "trailerDims"), _hitch_x(truck))]
+    return [_part(element)]
+
+
+def _truck(element: Element) -> OutlinePart:
+    _refuse_unknown(element, "truckDims", "originXShift")
+    dimensions = _required(element, "truckDims")
+    _refuse_unknown(dimensions, "length", "width", *_TRUCK_LENGTHS)
+    length, width = _size(dimensions, "length"), _size(dimensions, "width")
+    return OutlinePart(_corners(length, width, (-_number(element, "originXShift"), 0.0)))
+
+
+def _hitch_x(truck: Element) -> float:
+    """Return how far the hitch of a truck is ahead of the origin, in metres."""
+    dimensions = _required(truck, "truckDims")
+    rear_axle = _size(dimensions, "distFromRearToRearAxle") - _size(dimensions, "length") / 2
+    return _number(dimensions, "distFromRearAxleToHitch") + rear_axle - _number(truck, "originXShift")
+
+
+def _trailer(dimensions: Element, hitch_x: float) -> OutlinePart:
+    _refuse_unknown(dimensions, "length", "width", "wheelbase", "distFromFrontToHitch")
+    length, width = _size(dimensions, "length"), _size(dimensions, "width")
+    center = (_number(dimensions, "distFromFrontToHitch") - length / 2, 0.0)
+    return OutlinePart(_corners(length, width, center), hitch_x=hitch_x)
+
+
+def _parts_of(region: Element) -> list[OutlinePart]:
+    """Return the rectangles, circles and polygons of a region in the world.
+
+    Raises:
+        ScenarioError: there is none, or something else.
+    """
+    if not region.children:
+        raise ScenarioError(f"<{region.name}> is empty; give {_SHAPES}")
+    return [_part(child) for child in region.children]
 
 
 def _part(element: Element) -> OutlinePart:
     if element.name == "polygon":
+        _refuse_unknown(element, "point")
         vertices = [_point(point) for point in element.all("point")]
         if not vertices:
             raise ScenarioError("<polygon> has no <point>; give at least one")
         return OutlinePart(vertices)
-    middle = element.child("center")
-    x, y = _point(middle) if middle is not None else (0.0, 0.0)
     if element.name == "circle":
-        return OutlinePart([(x, y)], _size(element, "radius"))
+        _refuse_unknown(element, "radius", "center")
+        return OutlinePart([_center(element)], _size(element, "radius"))
     if element.name == "rectangle":
-        length, width = _size(element, "length"), _size(element, "width")
-        angle = _number(element, "orientation") if element.child("orientation") is not None else 0.0
-        corners = ((-length, -width), (length, -width), (length, width), (-length, width))
-        c, s = cos(angle) / 2, sin(angle) / 2
-        return OutlinePart([(x + a * c - b * s, y + a * s + b * c) for a, b in corners])
-    raise ScenarioError(f"<{element.name}> is not a shape; give <rectangle>, <circle> or <polygon>")
+        if element.child("originXShift") is not None:
+            raise ScenarioError("a region has no originXShift; give the rectangle its <center>")
+        return _rectangle(element)
+    raise ScenarioError(f"<{element.name}> is not a shape; give {_SHAPES}")
+
+
+def _rectangle(element: Element, origin_x_shift: float = 0.0) -> OutlinePart:
+    _refuse_unknown(element, "length", "width", "center", "orientation", "originXShift")
+    length, width = _size(element, "length"), _size(element, "width")
+    angle = _number_or_zero(element, "orientation")
+    x, y = _center(element)
+    center = (x - origin_x_shift * cos(angle), y - origin_x_shift * sin(angle))
+    return OutlinePart(_corners(length, width, center, angle))
+
+
+def _corners(length: float, width: float, center: tuple[float, float], angle: float = 0.0) -> Points:
+    x, y = center
+    c, s = cos(angle) / 2, sin(angle) / 2
+    corners = ((-length, -width), (length, -width), (length, width), (-length, width))
+    return [(x + a * c - b * s, y + a * s + b * c) for a, b in corners]
+
+
+def _center(element: Element) -> tuple[float, float]:
+    center = element.child("center")
+    return _point(center) if center is not None else (0.0, 0.0)
+
+
+def _refuse_unknown(element: Element, *names: str) -> None:
+    """Refuse a child of another name, because it may place the outline elsewhere."""
+    for child in element.children:
+        if child.name not in names:
+            wanted = ", ".join(f"<{name}>" for name in names)
+            raise ScenarioError(f"<{element.name}> has an unknown <{child.name}>; give {wanted} only")
 
 
 def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
@@ -415,24 +506,35 @@ def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
         return UNKNOWN
     else:
         x, y, away = _around(_parts_of(position))
-    low, high = _orientation(element)
-    # a point of the outline at a distance r of the centre moves by 2 r sin(h/2) when that turns by h
-    reach = max((hypot(*vertex) for part in outline for vertex in part.vertices), default=0.0)
-    turned = 2 * reach * sin(min(high - low, 2 * pi) / 4)
-    state = ObstacleState(x, y, (low + high) / 2, oriented=low == high, uncertainty=away + turned)
-    return state if all(map(isfinite, (x, y, low, high, away))) else UNKNOWN
+    low, high = _angle(element, "orientation", (-pi, pi))
+    hitch_low, hitch_high = _angle(element, "hitchAngle", (0.0, 0.0))
+    hitch_angle = (hitch_low + hitch_high) / 2
+    trailers = [part for part in outline if part.hitch_x is not None]
+    turned = _turned_away([part.turned(hitch_angle) for part in outline], high - low)
+    turned += _turned_away([trailer.vertices for trailer in trailers], hitch_high - hitch_low)
+    if not all(map(isfinite, (x, y, low, high, away, hitch_angle))):
+        return UNKNOWN
+    return ObstacleState(x, y, (low + high) / 2, hitch_angle, low == high, uncertainty=away + turned)
 
 
-def _orientation(element: Element) -> tuple[float, float]:
-    orientation = element.child("orientation")
-    if orientation is None:
-        return -pi, pi
-    if orientation.child("exact") is not None:
-        exact = _number(orientation, "exact")
+def _turned_away(outlines: Sequence[Points], angle: float) -> float:
+    """Return how far a vertex can be from its place if the outlines turn within an angle around it."""
+    # a vertex at a distance r of the origin moves by 2 r sin(h/2) when that turns by h
+    reach = max((hypot(*vertex) for outline in outlines for vertex in outline), default=0.0)
+    return 2 * reach * sin(min(angle, 2 * pi) / 4)
+
+
+def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[float, float]:
+    """Return the least and the greatest value of an angle in radians."""
+    angle = state.child(name)
+    if angle is None:
+        return default
+    if angle.child("exact") is not None:
+        exact = _number(angle, "exact")
         return exact, exact
-    low, high = _number(orientation, "intervalStart"), _number(orientation, "intervalEnd")
+    low, high = _number(angle, "intervalStart"), _number(angle, "intervalEnd")
     if low > high:
-        raise ScenarioError(f"orientation is from {low:g} to {high:g}; give its start before its end")
+        raise ScenarioError(f"{name} is from {low:g} to {high:g}; give its start before its end")
     return low, high
 
 
@@ -515,6 +617,10 @@ def _number(element: Element, name: str) -> float:
         return float(text)
     except ValueError:
         raise ScenarioError(f"{name} is {text[:60]!r}; give a number") from None
+
+
+def _number_or_zero(element: Element, name: str) -> float:
+    return _number(element, name) if element.child(name) is not None else 0.0
 
 
 def _required(element: Element, name: str) -> Element:
