@@ -214,12 +214,10 @@ def _opened(
             raise UsageError("a video or topic is given twice; each camera counts once")
         wanted: list[str | None] = [*topics] or [None] * len(sources)
         each_source = [*sources] * len(topics) if topics else sources
-        opened = [
+        return [
             open_frames(source, topic=topic, rate=rate)
             for source, topic in zip(each_source, wanted, strict=True)
         ]
-        warn(*(each.remark for each in opened if each.remark is not None))
-        return [*opened]
     refuse_given({"--topic": topics, "--rate": rate is not None}, "does not apply to a camera; leave it out")
     return [CameraFrames(camera, length_ns=length_ns)]
 

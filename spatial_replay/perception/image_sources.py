@@ -332,7 +332,7 @@ class CameraFrames:
         faults: what was lost so far.
     """
 
-    channel = None
+    channel = remark = None
     copy_fault = "a camera's frames are not compressed"
 
     def __init__(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -331,6 +332,8 @@ class VideoFile:
             raise UsageError(f"the rate is {rate!r}; give frames a second, above 0")
         self.name, self._path, self._rate = path.name, path, rate
         self.faults: list[str] = []
+        self._last_pts: int | None = None
+        self._goes_back = False
         av = load_av()
         try:
             with path.open("rb"):
@@ -365,6 +368,8 @@ class VideoFile:
             self.close()
             raise LogError(f"{self.name}: its frames of {context.width} x {context.height} are too large")
         self._decoder = Decoder(context)
+        self._has_stamps = self._stream.start_time is not None
+        self._own_rate = float(self._stream.average_rate or 0)
 
     @property
     def copy_fault(self) -> str | None:
@@ -378,12 +383,13 @@ class VideoFile:
 
     @property
     def remark(self) -> str | None:
-        """That its own stamps are not taken, if it has any; None otherwise."""
-        stream = self._stream
-        if self._rate is None or stream.start_time is None:
+        """That its own stamps are ignored; None without a rate, or if it has no stamps or they go back.
+
+        It is complete once all frames are read.
+        """
+        if self._rate is None or not self._has_stamps or self._goes_back:
             return None
-        own = stream.average_rate
-        rate = f" ({float(own):g} frames a second)" if own else ""
+        rate = f" ({self._own_rate:g} frames a second)" if self._own_rate else ""
         return (
             f"{self.name} has time stamps{rate}; {self._rate:g} frames a second are taken instead of them:"
             " leave out --rate unless they are wrong"
@@ -409,6 +415,8 @@ class VideoFile:
                     kept = None
                 if first is None:
                     continue
+                if time_ns < last_ns and found.is_true:
+                    raise LogError(self._order_fault(count, stamp, last_ns - time_ns))
                 if time_ns <= last_ns:
                     self.faults.append(f"{self.name}: frame {count} is not after the one before it; left out")
                     continue
@@ -441,23 +449,36 @@ class VideoFile:
         finally:
             self.close()
 
+    def _order_fault(self, number: int, stamp_ns: int, back_ns: int) -> str:
+        return (
+            f"{self.name} has time stamps that go back: frame {number} has {stamp_ns / 1e9:.3f} s,"
+            f" {back_ns / 1e9:.3f} s less than the frame before it; give its frame rate, as in"
+            f" --rate {self._own_rate or 30:g}"
+        )
+
     def _decoded(self) -> Iterator[Decoded]:
-        """Yield frames, each with its bytes if it can be copied."""
+        """Yield frames in the order of showing, each with its bytes if it can be copied."""
         av = load_av()
+        # an .avi has no times of showing: the frames shown take the times of decoding, in their order
+        is_avi = self._container.format.name == "avi"
+        is_reordered = is_avi and self._stream.codec_context.has_b_frames
+        slots: deque[int] = deque()
         convert = None
         if self.copy_fault is None:
             convert = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
         for packet in self._container.demux(self._stream):
-            # an .avi has no stamps but the order of decoding; without B frames it is that of showing, too,
-            # and what FFmpeg guesses is one frame late
-            if self._container.format.name == "avi" and not self._stream.codec_context.has_b_frames:
-                packet.pts = packet.dts
+            # the pts that FFmpeg guesses for an .avi are late, and out of order with B frames
+            if is_avi:
+                packet.pts = None if is_reordered else packet.dts
+            slot = packet.dts if is_reordered and packet.size else None
+            if slot is not None:
+                slots.append(slot)
             if packet.is_corrupt:
                 self.faults.append(f"{self.name}: a packet is damaged")
             copies: list[bytes] = []
             found = []
             try:
-                found = self._decoder.decode(packet, copies)
+                found = self._decoder.decode(packet, (copies, slot))
             except av.InvalidDataError as error:
                 self.faults.append(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
             # the filter takes the packet's content
@@ -465,8 +486,14 @@ class VideoFile:
                 # one that is damaged has been reported above
                 with suppress(av.InvalidDataError):
                     copies += [bytes(each) for each in convert.filter(packet)]
-            for each in found:
-                yield each._replace(of=b"".join(each.of))
+            for decoded in found:
+                copies, slot = decoded.of
+                # a key frame is not shown before it is decoded: frames lost ahead of it leave their slots
+                while decoded.frame.key_frame and slot is not None and slots and slots[0] < slot:
+                    slots.popleft()
+                if slots:
+                    decoded.frame.pts, decoded.frame.time_base = slots.popleft(), self._stream.time_base
+                yield decoded._replace(of=b"".join(copies))
 
     def _length_ns(self) -> int:
         """Return how long the file says that the video is; 0 if it does not."""
@@ -480,6 +507,9 @@ class VideoFile:
 
     def _stamp_ns(self, frame: Any, count: int) -> int:
         if self._rate is not None:
+            if frame.pts is not None:
+                self._goes_back |= self._last_pts is not None and frame.pts < self._last_pts
+                self._last_pts = frame.pts
             return round(count * 1e9 / self._rate)
         if frame.pts is None or frame.time_base is None:
             raise LogError(

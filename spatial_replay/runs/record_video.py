@@ -224,6 +224,7 @@ class FrameSource(Protocol):
         channel: the topic that the frames' `data` are messages of; None where they are H.264.
         faults: what was lost so far.
         copy_fault: why `data` cannot be copied into a log; None if it can.
+        remark: on the options it was opened with, once all frames are read; None without any.
     """
 
     name: str
@@ -234,6 +235,9 @@ class FrameSource(Protocol):
 
     @property
     def copy_fault(self) -> str | None: ...
+
+    @property
+    def remark(self) -> str | None: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
 
@@ -346,7 +350,8 @@ def record_seen(
             advance(1)
     endings = tuple(each for monitor in monitors for each in monitor.endings())
     faults = tuple(dict.fromkeys(fault for camera in cameras for fault in camera.faults))
-    remarks = (*observer.remarks(), *alone.remarks(first_ns, last_ns))
+    of_sources = [camera.remark for camera in cameras if camera.remark is not None]
+    remarks = (*of_sources, *observer.remarks(), *alone.remarks(first_ns, last_ns))
     fits = tuple(zip(names, observer.fits, strict=True))
     return SeenRun(samples, (last_ns - first_ns) / 1e9, endings, fits, remarks, faults, tuple(kept))
 

@@ -26,10 +26,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_approach(folder, 2)
     frames = list(film(approaching(COUNT), COUNT))
     plain = f"keyint={KEYS}:min-keyint={KEYS}:scenecut=0:bframes=0"
-    for name, codec in (("h264", "libx264"), ("hevc", "libx265"), ("reordered", "libx264")):
-        form = "x264-params" if codec == "libx264" else "x265-params"
-        parameters = plain.replace("bframes=0", "bframes=2:b-adapt=0") if name == "reordered" else plain
-        with av.open(str(folder / f"{name}.{'mp4' if name == 'reordered' else 'mkv'}"), "w") as container:
+    for name in ("h264.mkv", "hevc.mkv", "reordered.mp4", "reordered.avi"):
+        codec, form = ("libx265", "x265-params") if "hevc" in name else ("libx264", "x264-params")
+        parameters = plain.replace("bframes=0", "bframes=2:b-adapt=0") if "reordered" in name else plain
+        with av.open(str(folder / name), "w") as container:
             stream = container.add_stream(codec, rate=25)
             height, width = frames[0].image.shape[:2]
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
@@ -140,6 +140,45 @@ def test_frames_shown_before_a_missing_one_but_decoded_after_it_are_not_believed
     shown = seen(folder / "out.mcap")
     untrue = {number for number in order[gone:] if number < KEYS}
     assert {number for number in shown if shown[number] != NAMES} == untrue - {order[gone]}
+
+
+def test_an_avi_with_b_frames_has_the_frames_and_times_of_the_same_film_as_mp4(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("reordered.mp4", "reordered.avi"):
+        assert record(folder, folder / name, folder / f"{name}.mcap") == 0
+    assert "left out" not in capsys.readouterr().err
+    assert read_trace(folder / "reordered.avi.mcap") == read_trace(folder / "reordered.mp4.mcap")
+    times_ns = [frame.time_ns for frame in open_frames(folder / "reordered.avi")]
+    assert times_ns == [number * PERIOD_NS for number in range(COUNT)]
+
+
+def test_a_lossy_avi_with_b_frames_has_its_own_times_again_from_the_next_key_frame_on(folder: Path) -> None:
+    whole = {frame.time_ns: frame.image for frame in open_frames(folder / "reordered.avi")}
+    frames = open_frames(without(folder / "reordered.avi", folder / "lossy.avi", {1}))
+    shown = {frame.time_ns: frame.image for frame in frames if frame.image.any()}
+    assert len(frames.faults) == 1
+    assert {number * PERIOD_NS for number in range(KEYS, COUNT)} <= set(shown)
+    assert all(np.array_equal(image, whole[time_ns]) for time_ns, image in shown.items())
+
+
+def test_a_film_whose_stamps_go_back_is_refused_and_takes_a_rate_without_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swapped = folder / "swapped.mkv"
+    with av.open(str(folder / "reordered.mp4")) as video, av.open(str(swapped), "w") as container:
+        stream = container.add_stream_from_template(video.streams.video[0])
+        for index, packet in enumerate(packet for packet in video.demux(video=0) if packet.size):
+            packet.pts = packet.dts = round(index / 25 / packet.time_base)
+            packet.stream = stream
+            container.mux(packet)
+    assert record(folder, swapped, folder / "out.mcap") == 3
+    assert "swapped.mkv has time stamps that go back: frame" in capsys.readouterr().err
+    assert record(folder, swapped, folder / "out.mcap", "--rate", "25") == 0
+    assert "swapped.mkv" not in capsys.readouterr().err
+    assert read_trace(folder / "out.mcap").times_ns.tolist() == [
+        PERIOD_NS * number for number in range(COUNT)
+    ]
 
 
 def test_each_frame_of_a_lossy_topic_has_its_own_stamp_and_comes_out(folder: Path) -> None:
