@@ -111,7 +111,8 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     "triggers",
     metavar="WHEN",
     multiple=True,
-    help="Write a clip when: violated, 'NAME satisfied', 'NAME < 0.2', event, manual; repeat for several.",
+    help="Write a clip when: violated, 'NAME satisfied', 'NAME < 0.2', 'NAME < 0.2 possible', event, manual;"
+    " repeat for several.",
 )
 @click.option(
     "--before",

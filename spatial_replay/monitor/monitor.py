@@ -263,6 +263,26 @@ class Monitor:
         known = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
         return tuple(_ending(spec, final, last, unit) for spec, final, last, unit in known)
 
+    @property
+    def names(self) -> Collection[str]:
+        """The named specs, wherever they occur."""
+        return self._monitored.places.keys()
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """Return the ends of the value of a named spec if the run ends here, over everything unknown.
+
+        Raises:
+            UsageError: no node has the name.
+        """
+        if name not in self.names:
+            raise UsageError(no_such_node(name, sorted(self.names)))
+        spec, identifier = self._monitored.places[name]
+        final = self._live.finals[spec]
+        if final is None:
+            return float("-inf"), float("inf")
+        lower, upper = final[identifier].tolist()
+        return lower, upper
+
     def update(self, sample: Sample) -> Update:
         """Add the next sample and return its numbers and verdicts.
 

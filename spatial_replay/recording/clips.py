@@ -44,9 +44,18 @@ MANUAL: Final = "manual"
 """The condition that nothing fulfils: such a trigger fires by hand."""
 
 _VERDICTS: Final = ("violated", "satisfied")
-_BELOW: Final = re.compile(r"(?P<name>.+?)\s*<=?\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
+_BELOW: Final = re.compile(
+    r"(?P<name>.+?)\s*<=?\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)(?P<possible>\s+possible)?$"
+)
 
 Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
+
+
+class _Below(NamedTuple):
+    """The number that a robustness falls below: certainly, or possibly."""
+
+    number: float
+    is_possible: bool
 
 
 @named_arguments
@@ -56,9 +65,10 @@ class Trigger:
 
     Attributes:
         when: "violated" or "satisfied" for any spec, "NAME violated" for one. "NAME < 0.2" fires when its
-            robustness falls below a number, "event" at any change of a verdict or of a lasting sign. "manual"
-            is for `Recorder.trigger` alone, which always fires. Several are given as a sequence. Names are
-            checked by the recorder, which has the specifications.
+            robustness is certainly below a number, "NAME < 0.2 possible" when it may be. "event" fires at any
+            change of a verdict or of a lasting sign. "manual" is for `Recorder.trigger` alone, which always
+            fires. Several are given as a sequence. Names are checked by the recorder, which has the
+            specifications.
         before_s, after_s: how much time is kept, on the clock of the samples.
         most_bytes: how much memory the ring takes; when that does not hold `before_s`, it is reported.
     """
@@ -84,8 +94,11 @@ class Trigger:
         return [each.strip() for each in ([self.when] if isinstance(self.when, str) else self.when)]
 
 
-def condition_of(text: str, files: Sequence[Specification]) -> Condition:
+def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[Monitor]) -> Condition:
     """Return a function of the updates with a sample that says why a trigger holds, or None.
+
+    Args:
+        monitors: of the files, which give the updates.
 
     Raises:
         UsageError: it is none, or names no spec.
@@ -117,12 +130,15 @@ def condition_of(text: str, files: Sequence[Specification]) -> Condition:
     if name not in names:
         hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
         raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
-    if isinstance(what, float):
-        return lambda updates, _: f"{name} below {what:g}" if _standing(updates, name)[1] < what else None
-    return lambda updates, _: f"{name} {what}" if _standing(updates, name)[0] == what else None
+    if isinstance(what, _Below):
+        monitor = next(each for each in monitors if name in each.names)
+        below = f"{name} {'possibly ' if what.is_possible else ''}below {what.number:g}"
+        end = 0 if what.is_possible else 1
+        return lambda updates, _: below if monitor.interval(name)[end] < what.number else None
+    return lambda updates, _: f"{name} {what}" if _verdict(updates, name) == what else None
 
 
-def _parsed(text: str) -> tuple[str, str | float]:
+def _parsed(text: str) -> tuple[str, str | _Below]:
     """Return the spec that a condition names, "" for none, and a verdict, `EVENT`, `MANUAL`, or the number
     that its robustness falls below.
 
@@ -134,27 +150,22 @@ def _parsed(text: str) -> tuple[str, str | float]:
         return "", text
     if name and verdict in _VERDICTS:
         return name.strip(), verdict
-    if (found := _BELOW.match(text)) is not None:
+    if (match := _BELOW.match(text)) is not None:
         with suppress(ValueError):
-            return found["name"], float(found["number"])
+            return match["name"], _Below(float(match["number"]), match["possible"] is not None)
     hint = nearest_hint(text, [*_VERDICTS, EVENT, MANUAL])
     raise UsageError(
         f"the trigger {text!r} is not understood; {f'{hint}; ' if hint else ''}write 'violated',"
-        " 'NAME violated', 'NAME satisfied', 'NAME < 0.2', 'event' or 'manual'"
+        " 'NAME violated', 'NAME satisfied', 'NAME < 0.2', 'NAME < 0.2 possible', 'event' or 'manual'"
     )
 
 
-def _standing(updates: Sequence[Update], name: str) -> tuple[str, float]:
-    """Return the verdict of a spec and its robustness; "" and NaN while it has none."""
+def _verdict(updates: Sequence[Update], name: str) -> str:
+    """Return the verdict of a spec; "" while it has none."""
     for update in updates:
-        for spec in update.specs:
-            if spec.spec.name == name:
-                number = math.nan if spec.numbers is None else float(spec.numbers[0, 0])
-                return str(spec.verdict), number
         if name in update.places and update.specs[update.places[name][0]].numbers is not None:
-            node = update.node(name)
-            return str(node.verdict), float(node.value)
-    return "", math.nan
+            return str(update.node(name).verdict)
+    return ""
 
 
 _SLICE_BYTES: Final = 8 * 2**20
@@ -297,15 +308,15 @@ class ClipLog(RecorderLog):
         self._folder, self._files, self._about = folder, files, dict(about or {})
         self._trigger = trigger
         texts = trigger.texts
-        self._conditions = [(text, condition_of(text, files)) for text in texts]
+        units = Axes.from_metadata(self._about).units
+        self._monitors = [Monitor(file, units=units) for file in files]
+        self._conditions = [(text, condition_of(text, files, self._monitors)) for text in texts]
         self._held_before = dict.fromkeys(texts, False)
         self._before_ns, self._after_ns = round(trigger.before_s * 1e9), round(trigger.after_s * 1e9)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{folder}: {system_reason(error)}") from None
-        units = Axes.from_metadata(self._about).units
-        self._monitors = [Monitor(file, units=units) for file in files]
         self._changes = VerdictChanges(files)
         warm_up(files, ())
         self._samples: deque[_Held] = deque()

@@ -492,6 +492,26 @@ def test_a_recorder_keeps_what_is_around_its_trigger(tmp_path: Path, when: str, 
     assert len([each for each in messages_of(clip.path) if each[0] == "/camera"]) == 16
 
 
+@pytest.mark.parametrize(
+    ("when", "at", "name"),
+    [
+        ("far < 2.05", 20, "0001-far-below-2-05.mcap"),
+        ("far < 2.05 possible", 3, "0001-far-possibly-below-2-05.mcap"),
+    ],
+)
+def test_a_trigger_fires_after_an_unknown_sample(tmp_path: Path, when: str, at: int, name: str) -> None:
+    spec = sr.parse_specification("spec far = G (cube dist wall >= 1)")
+    wall = sr.Footprint.box(-1, 0, 0, 1)
+    with sr.Recorder(
+        tmp_path, specifications=[spec], trigger=Trigger(when, before_s=1, after_s=0)
+    ) as recorder:
+        for tick in range(40):
+            cube = {} if tick == 3 else {"cube": sr.Footprint.box(5 - tick / 10, 0, 5.1 - tick / 10, 1)}
+            recorder.write(Sample(tick * 10**8, {**cube, "wall": wall}))
+    [clip] = recorder.clips
+    assert (clip.path.name, clip.time_ns) == (name, at * 10**8)
+
+
 def test_a_ring_stays_within_its_bytes_and_says_what_it_cannot_hold(tmp_path: Path) -> None:
     recorder = kept_by(
         tmp_path, Trigger("violated", before_s=3, after_s=0, most_bytes=2**21), size=2**18, pause_ms=10
