@@ -292,7 +292,8 @@ class _Open:
 class ClipLog(RecorderLog):
     """The ring of a recorder with a trigger, and the clips that it leaves; see `RecorderLog`.
 
-    A trigger that fires while a clip is open makes it longer.
+    A trigger that fires while a clip is open makes it longer, or begins another clip if the ring has already
+    evicted some of the time between.
 
     Attributes:
         held_bytes: memory of the ring.
@@ -329,7 +330,7 @@ class ClipLog(RecorderLog):
         }
         self._channels: Mapping[int, Channel] = {}
         self.held_bytes = 0
-        self._newest_ns = -1
+        self._newest_ns = self._evicted_ns = -1
         self._progress: dict[type, tuple[int, float]] = {}
         self._open: _Open | None = None
         self._fired: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -451,7 +452,9 @@ class ClipLog(RecorderLog):
             clip.put(item)
 
     def _begin(self, reason: str, at_ns: int) -> None:
-        """Open a clip around a time, or make the open one longer."""
+        """Open a clip around a time, or make the open one longer where that leaves no hole in it."""
+        if self._open is not None and self._evicted_ns > self._open.until_ns:
+            self._finish(is_interrupted=False)
         if self._open is not None:
             clip = self._open
             clip.reasons.append(reason)
@@ -493,6 +496,7 @@ class ClipLog(RecorderLog):
             if ring[0].time_ns >= oldest_ns and not is_over:
                 return
             dropped = ring.popleft()
+            self._evicted_ns = max(self._evicted_ns, dropped.time_ns)
             self.held_bytes -= dropped.size
             if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
                 self._has_overflowed = True

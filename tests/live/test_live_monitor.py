@@ -512,6 +512,21 @@ def test_a_trigger_fires_after_an_unknown_sample(tmp_path: Path, when: str, at: 
     assert (clip.path.name, clip.time_ns) == (name, at * 10**8)
 
 
+def test_clips_of_triggers_far_apart_have_no_holes(tmp_path: Path) -> None:
+    spec = sr.parse_specification("spec low = G (load <= 1)\nspec lower = G (load <= 2)")
+    trigger = Trigger(["low violated", "lower violated"], before_s=0.5, after_s=0.5)
+    samples = [
+        Sample(tick * 10**8, signals={"load": 2.0 * (tick >= 20) + (tick >= 80)}) for tick in range(120)
+    ]
+    with sr.Recorder(tmp_path, specifications=[spec], trigger=trigger) as recorder:
+        # a loop that is faster than its clock
+        for sample in samples:
+            recorder.write(sample)
+    first, second = (sr.read_trace(clip.path).times_ns.tolist() for clip in recorder.clips)
+    assert first == [tick * 10**8 for tick in range(15, 26)]
+    assert second == [tick * 10**8 for tick in range(75, 86)]
+
+
 def test_a_ring_stays_within_its_bytes_and_says_what_it_cannot_hold(tmp_path: Path) -> None:
     recorder = kept_by(
         tmp_path, Trigger("violated", before_s=3, after_s=0, most_bytes=2**21), size=2**18, pause_ms=10
