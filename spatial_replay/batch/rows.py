@@ -202,7 +202,7 @@ def parsed_specifications(
         SpecificationError: one has errors.
         UsageError: a value of a constant that none has.
     """
-    return tuple(load_specifications(specs, profile=conditions.profile, constants=dict(conditions.constants)))
+    return tuple(load_specifications(specs, constants=dict(conditions.constants)))
 
 
 def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:

@@ -52,7 +52,6 @@ class Conditions:
         semantics: "ltlf" or "paper".
         strict_names: names that a log never has are errors.
         constants: values in place of those that the specifications give their constants.
-        profile: relation profile of specifications without a `use` line.
         requires: what a log must have to be judged, as JSON; "" for nothing.
     """
 
@@ -65,7 +64,6 @@ class Conditions:
     semantics: Semantics = "ltlf"
     strict_names: bool = False
     constants: Pairs[float | str] = ()
-    profile: str | None = None
     requires: str = ""
 
     @classmethod

@@ -88,6 +88,11 @@ FAMILIES = {
 }
 """Commands that share the module of another one."""
 
+FORMER_OPTIONS = {
+    "--profile": "write `use spatial_spec` in the first line of the specification",
+}
+"""Options of earlier versions, with the new form."""
+
 
 class LazyCommands(click.Group):
     """A group of the commands in `COMMANDS`."""
@@ -280,6 +285,8 @@ def message_from_error(error: BaseException) -> str:
             return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
             path, what = context.command_path, error.format_message()
+            if isinstance(error, click.NoSuchOption) and error.option_name in FORMER_OPTIONS:
+                what = f"no option {error.option_name}; {FORMER_OPTIONS[error.option_name]}"
             if "unexpected extra" in what and any("--spec" in each.opts for each in context.command.params):
                 what += f"; specifications come after --spec: {path} LOG --spec FILE; batch takes many logs"
             if "'--spec'" in what and any(each.name == "specification" for each in context.command.params):

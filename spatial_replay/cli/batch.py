@@ -324,7 +324,7 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     """
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
-    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names", "profile")}
+    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
     each = objects_by_parameter(given.choices)
     conditions = Conditions.given(given.reading, each, given.constants, semantics=semantics, **others)
     suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]

@@ -21,7 +21,7 @@ from spatial_replay.cli.options import (
     LogPath,
     constants_option,
     load_spec_options,
-    profile_option,
+    plugin_option,
     reading_options,
     refuse_given,
     require_choice,
@@ -137,7 +137,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.option("--log", type=LogPath(), help="Log to compare names, thresholds and windows with.")
 @constants_option
 @strict_names_option
-@profile_option
+@plugin_option
 @reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @finding_format_option
@@ -156,7 +156,6 @@ def check(
     log: LogFile | None,
     constants: Mapping[str, float | str],
     strict_names: bool,
-    profile: str | None,
     as_json: bool,
     form: Form,
     dfa: str | None,
@@ -191,7 +190,7 @@ def check(
         _refuse_log_options(reading, strict_names)
     shown = str(specification)
     with findings_of(shown, form):
-        (parsed,) = load_spec_options([specification], profile, constants)
+        (parsed,) = load_spec_options([specification], constants)
     inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
@@ -461,7 +460,7 @@ _UNSAFE: Final = re.compile(r"[^\w-]+")
 @click.command(cls=JsonCommand)
 @click.argument("specification", metavar="SPEC", type=LogPath())
 @constants_option
-@profile_option
+@plugin_option
 @click.option(
     "-o",
     "--output",
@@ -474,7 +473,6 @@ _UNSAFE: Final = re.compile(r"[^\w-]+")
 def doctor(
     specification: LogFile,
     constants: Mapping[str, float | str],
-    profile: str | None,
     output: Path | None,
     as_json: bool,
     form: Form,
@@ -499,7 +497,7 @@ def doctor(
         raise UsageError(f"--format {form} writes to standard output; remove --json")
     shown = str(specification)
     with findings_of(shown, form):
-        (parsed,) = load_spec_options([specification], profile, constants)
+        (parsed,) = load_spec_options([specification], constants)
     found = examine(parsed, examples=form == "text" or output is not None)
     files = {} if output is None else _write(found, output, local_files([specification]))
     show_findings(form, shown, [each.diagnostic for each in found.findings])

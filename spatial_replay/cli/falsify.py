@@ -12,7 +12,7 @@ from spatial_replay.cli.options import (
     JsonCommand,
     constants_option,
     load_spec_options,
-    profile_option,
+    plugin_option,
     specs_option,
 )
 from spatial_replay.cli.record import SCENARIOS
@@ -59,7 +59,7 @@ from spatial_replay.logs.remote import LogFile
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @constants_option
-@profile_option
+@plugin_option
 def falsify(
     scenario: str,
     specs: tuple[LogFile, ...],
@@ -71,7 +71,6 @@ def falsify(
     jobs: int,
     as_json: bool,
     constants: Mapping[str, float | str],
-    profile: str | None,
 ) -> ExitCode:
     """Search for runs of a simulated world that violate a specification.
 
@@ -94,10 +93,9 @@ def falsify(
     from spatial_replay.falsification.simulations import scenario_simulation
     from spatial_replay.simulation.tabletop import default_specification
 
-    files = load_spec_options(specs, profile, constants, lambda: default_specification(scenario))
+    files = load_spec_options(specs, constants, lambda: default_specification(scenario))
     options = [word for spec in specs for word in ("--spec", str(spec))]
     options += [word for name, value in constants.items() for word in ("--const", f"{name}={value}")]
-    options += [] if profile is None else ["--profile", profile]
     simulation, parameters = scenario_simulation(scenario, files, vary, options, is_planned=planned)
     found = search_failures(
         simulation, parameters, folder, workers_of(jobs), budget=budget, seed=seed, progress=progress

@@ -21,7 +21,7 @@ from spatial_replay.cli.options import (
     naming_option,
     output_option,
     overwrite_option,
-    profile_option,
+    plugin_option,
     refuse_given,
     serving_options,
     specs_option,
@@ -73,7 +73,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     help="Mapping file (YAML), as for a log of the same topics.  [default: samples on /spatial/objects]",
 )
 @constants_option
-@profile_option
+@plugin_option
 @output_option("Log of the whole run to write (MCAP), with the robot's own messages.")
 @overwrite_option
 @click.option(
@@ -149,7 +149,6 @@ def monitor(
     specs: tuple[Path, ...],
     mapping_file: Path | None,
     constants: Mapping[str, float | str],
-    profile: str | None,
     output: Path | None,
     overwrite: bool,
     topics: tuple[str, ...],
@@ -208,7 +207,7 @@ def monitor(
     ):
         if given is not None and given <= 0:
             raise UsageError(f"{option} is 0; give it a length, as in {option} 2s")
-    files = load_spec_options(specs, profile, constants)
+    files = load_spec_options(specs, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     mapping = None if mapping_file is None else load_mapping(mapping_file)
     if layout:

@@ -255,16 +255,6 @@ plugin_option = click.option(
 )
 
 
-def profile_option(command: _Command) -> _Command:
-    """Add the options for how specifications are read: `--profile` and `--plugin`."""
-    profile = click.option(
-        "--profile",
-        type=click.Choice(["paper", "spatial_spec"]),
-        help="Definitions of the relations, for files without a `use` line.  [default: paper]",
-    )
-    return profile(plugin_option(command))
-
-
 def gather(name: str, values: Callable[..., Any], command: Callable[..., Any]) -> Callable[..., Any]:
     """Return a command that gets several options together, as one argument.
 
@@ -368,7 +358,6 @@ class ConditionArguments:
     choices: tuple[str, ...]
     constants: Mapping[str, float | str]
     strict_names: bool
-    profile: str | None
     reading: Reading
 
 
@@ -417,7 +406,7 @@ _CONDITIONS = (
     choices_option,
     constants_option,
     strict_names_option,
-    profile_option,
+    plugin_option,
 )
 
 
@@ -475,7 +464,7 @@ def open_inputs(
     is_bare = can_do_without and not (request.specs or request.constants or recorded_texts(source))
     if not files and not is_bare:
         specs = [local_copy(each) for each in request.specs]
-        files = load_files(specs, source, profile=request.profile, constants=request.constants)
+        files = load_files(specs, source, constants=request.constants)
         show_diagnostics(warning for file in files for warning in file.warnings)
     window, each = _window(source, request), objects_by_parameter(request.choices)
     return EvaluationInputs(source, files, window, each, request.strict_names)
@@ -520,7 +509,6 @@ def _window(source: Source, request: EvaluationArguments) -> Window:
 
 def load_spec_options(
     specs: Sequence[LogFile],
-    profile: str | None,
     constants: Mapping[str, float | str],
     default: Callable[[], Specification] | None = None,
 ) -> list[Specification]:
@@ -540,7 +528,7 @@ def load_spec_options(
     if constants and not sources and default is not None:
         own = default()
         sources = [SpecificationText(own.source, own.filename)]
-    return load_specifications(sources, profile=profile, constants=constants)
+    return load_specifications(sources, constants=constants)
 
 
 def refuse_given(options: Mapping[str, object], why: str) -> None:

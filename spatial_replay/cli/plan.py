@@ -18,7 +18,7 @@ from spatial_replay.cli.options import (
     durability_option,
     load_spec_options,
     log_output_option,
-    profile_option,
+    plugin_option,
     require_choice,
 )
 from spatial_replay.cli.record import (
@@ -89,7 +89,6 @@ def _redo(
     spec: LogFile | None,
     of: str | None,
     constants: Mapping[str, float | str],
-    profile: str | None,
     changes: Mapping[str, Any],
     as_json: bool,
 ) -> int:
@@ -102,7 +101,7 @@ def _redo(
 
     source = open_source(log)
     named = [] if spec is None else [spec]
-    files = load_spec_options(named, profile, constants, lambda: planner_of(source).specification)
+    files = load_spec_options(named, constants, lambda: planner_of(source).specification)
     file = next(iter(files), None)
     if file is not None:
         require_choice(file, of)
@@ -136,7 +135,7 @@ def _redo(
 @click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")
 @click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")
 @constants_option
-@profile_option
+@plugin_option
 @setting_options
 @click.pass_context
 def plan(
@@ -204,7 +203,7 @@ def planning_command(scenario: str) -> click.Command:
         help="Specification to evaluate, of which the planner knows nothing; repeat for several.",
     )
     @constants_option
-    @profile_option
+    @plugin_option
     @simulation_options
     @click.option(
         "--timings",
@@ -219,7 +218,6 @@ def planning_command(scenario: str) -> click.Command:
         of: str | None,
         also: tuple[LogFile, ...],
         constants: Mapping[str, float | str],
-        profile: str | None,
         simulation: SimulationArguments,
         timings: bool,
         changes: Mapping[str, Any],
@@ -229,7 +227,7 @@ def planning_command(scenario: str) -> click.Command:
         from spatial_replay.simulation.tabletop import default_specification
 
         named = [*([] if spec is None else [spec]), *also]
-        files = load_spec_options(named, profile, constants, lambda: default_specification(scenario))
+        files = load_spec_options(named, constants, lambda: default_specification(scenario))
         # constants alone are values of the scenario's own specification
         file = files.pop(0) if files and (spec is not None or not also) else None
         if file is not None:

@@ -22,7 +22,7 @@ from spatial_replay.cli.options import (
     log_output_option,
     naming_option,
     overwrite_option,
-    profile_option,
+    plugin_option,
     reading_options,
     refuse_given,
     specs_option,
@@ -83,7 +83,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
 @durability_option
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
-@profile_option
+@plugin_option
 @click.option(
     "--keep-video",
     "keep",
@@ -119,7 +119,6 @@ def video(
     durability: Durability,
     specs: tuple[LogFile, ...],
     constants: Mapping[str, float | str],
-    profile: str | None,
     keep: KeepVideo | None,
     hold_ns: int | None,
     rate: float | None,
@@ -154,7 +153,7 @@ def video(
         raise UsageError("--for ends a run with --camera; leave it out")
     if camera is not None and not overwrite:
         refuse_existing(output)
-    files = load_spec_options(specs, profile, constants)
+    files = load_spec_options(specs, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     tags = load_tags(tags_file)
     names = [each.name for each in tags.objects]
@@ -360,7 +359,7 @@ def recording_command(scenario: str) -> click.Command:
         "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
     )
     @constants_option
-    @profile_option
+    @plugin_option
     @click.option(
         "--duration",
         "length_ns",
@@ -374,7 +373,6 @@ def recording_command(scenario: str) -> click.Command:
         durability: Durability,
         specs: tuple[LogFile, ...],
         constants: Mapping[str, float | str],
-        profile: str | None,
         length_ns: int | None,
         simulation: SimulationArguments,
     ) -> int:
@@ -382,7 +380,7 @@ def recording_command(scenario: str) -> click.Command:
         from spatial_replay.runs.scripted import record_script
         from spatial_replay.simulation.tabletop import default_specification
 
-        files = load_spec_options(specs, profile, constants, lambda: default_specification(scenario))
+        files = load_spec_options(specs, constants, lambda: default_specification(scenario))
         with progress("samples") as advance:
             recorded = record_script(
                 scenario,
@@ -430,7 +428,7 @@ record.add_command(video)
 @durability_option
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
-@profile_option
+@plugin_option
 @reading_options
 @click.option(
     "--unit",
@@ -444,7 +442,6 @@ def tracks(
     durability: Durability,
     specs: tuple[LogFile, ...],
     constants: Mapping[str, float | str],
-    profile: str | None,
     reading: Reading,
     unit: str,
 ) -> int:
@@ -464,7 +461,7 @@ def tracks(
 
     inputs = input_files(file, *specs, reading=reading)
     source = open_source(file, **reading)
-    files = load_spec_options(specs, profile, constants)
+    files = load_spec_options(specs, constants)
     with progress("samples") as advance:
         recorded = record_source(
             source, output, files, inputs=inputs, unit=unit, advance=advance, durability=durability

@@ -95,7 +95,7 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     from spatial_replay.replay.specification_files import SpecificationFiles
 
     specs = [local_copy(each) for each in request.specs]
-    files = SpecificationFiles(specs, profile=request.profile, constants=request.constants)
+    files = SpecificationFiles(specs, constants=request.constants)
     try:
         files.load()
     except (SpecificationError, MissingFileError) as error:
@@ -551,7 +551,7 @@ def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> in
 
 def _is_evaluated(request: EvaluationArguments) -> bool:
     """Return whether a log is evaluated first; an annotated one has its numbers already."""
-    options = (request.specs, request.constants, request.choices, request.start, request.end, request.profile)
+    options = (request.specs, request.constants, request.choices, request.start, request.end)
     return any(options) or request.every > 1 or request.reading.get("mapping") is not None
 
 

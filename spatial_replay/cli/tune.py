@@ -18,7 +18,7 @@ from spatial_replay.cli.options import (
     load_spec_options,
     objects_by_parameter,
     output_option,
-    profile_option,
+    plugin_option,
     reading_options,
 )
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_file, show_json
@@ -104,7 +104,7 @@ def _read_ranges(
 )
 @choices_option
 @constants_option
-@profile_option
+@plugin_option
 @reading_options
 def tune(
     spec: LogFile,
@@ -117,7 +117,6 @@ def tune(
     seed: int,
     choices: tuple[str, ...],
     constants: Mapping[str, float | str],
-    profile: str | None,
     reading: Reading,
 ) -> ExitCode:
     """Find the constants with which good runs satisfy a specification and bad runs violate it.
@@ -148,7 +147,7 @@ def tune(
         raise UsageError(
             f"--write changes {spec}, which is an address; copy it to this machine, and give that"
         )
-    (file,) = load_spec_options([spec], profile, constants)
+    (file,) = load_spec_options([spec], constants)
     show_diagnostics(file.warnings)
     if output is not None:
         if output.suffix.lower() not in _PICTURES:
@@ -159,7 +158,7 @@ def tune(
         tuning = tune_runs(file, runs, ranges, each=objects_by_parameter(choices), seed=seed, advance=advance)
     changed: tuple[str, ...] = ()
     if write and tuning.is_found:
-        changed = write_constants(local_copy(spec), plain_values(tuning.specification), profile=profile)
+        changed = write_constants(local_copy(spec), plain_values(tuning.specification))
     if output is not None:
         from spatial_replay.notebook.study_view import write_surface
 
@@ -225,7 +224,7 @@ def _row(constant: TunedConstant) -> tuple[str, str, str, str]:
 @output_option("Specification to write.  [default: printed]")
 @click.option("--lines", type=click.IntRange(min=1), help="Write at most so many specs.  [default: 20]")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
-@profile_option
+@plugin_option
 @reading_options
 def learn(
     good: tuple[LogFile, ...],
@@ -233,7 +232,6 @@ def learn(
     output: Path | None,
     lines: int | None,
     as_json: bool,
-    profile: str | None,
     reading: Reading,
 ) -> ExitCode:
     """Find a short specification that all GOOD runs satisfy and that bad ones violate.
@@ -253,7 +251,6 @@ def learn(
     from spatial_replay.learning.learned import DEFAULT_LINES, learn_runs
     from spatial_replay.logs.output_file import refuse_inputs, replacing
     from spatial_replay.sources.open_log import read_trace
-    from spatial_replay.spec.relations import DEFAULT_PROFILE
     from spatial_replay.tuning.margins import load_runs
 
     inputs = input_files(*good, *bad, reading=reading)
@@ -261,9 +258,7 @@ def learn(
         refuse_inputs(output, inputs)
     with progress("logs", 2 * len(good + bad)) as advance:
         runs = load_runs(good, bad, lambda path: read_trace(path, **reading), advance)
-        learned = learn_runs(
-            runs, lines=lines or DEFAULT_LINES, profile=profile or DEFAULT_PROFILE, advance=advance
-        )
+        learned = learn_runs(runs, lines=lines or DEFAULT_LINES, advance=advance)
     if output is not None and learned.text:
         with replacing(output, inputs) as stream:
             stream.write(learned.text.encode())

@@ -225,7 +225,7 @@ def scenario_simulation(
 
     Args:
         vary: as on the command line.
-        options: those of `record` that give the specifications: files, constants, a profile.
+        options: those of `record` that give the specifications: files, constants.
 
     Raises:
         UsageError: there is no such scenario, no simulator, or what cannot be varied.
@@ -322,7 +322,7 @@ class ScenarioRuns:
     """The runs of a simulated world.
 
     Attributes:
-        spec_options: those options of `record` that give the specifications: files, constants, a profile.
+        spec_options: those options of `record` that give the specifications: files, constants.
         is_planned: whether a planner decides, for the scenario's own specification, in place of the script.
     """
 

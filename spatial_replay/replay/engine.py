@@ -484,7 +484,6 @@ def load_files(
     paths: Sequence[Path],
     source: Source,
     *,
-    profile: str | None = None,
     constants: Mapping[str, float | str] | None = None,
 ) -> list[Specification]:
     """Load the named specifications or, without any, those that the log was written with.
@@ -501,7 +500,7 @@ def load_files(
     named: Sequence[Path | SpecificationText] = tuple(dict.fromkeys(paths)) or recorded_texts(source)
     if not named:
         raise UsageError(f"{source.name} holds no specification of its own; give one with --spec FILE")
-    return load_specifications(named, profile=profile, constants=constants)
+    return load_specifications(named, constants=constants)
 
 
 def recorded_texts(source: Source) -> list[SpecificationText]:

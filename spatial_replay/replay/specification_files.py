@@ -43,13 +43,11 @@ class SpecificationFiles:
         self,
         paths: Sequence[Path],
         *,
-        profile: str | None = None,
         constants: Mapping[str, float | str] | None = None,
     ) -> None:
         """Name the files; nothing is read yet.
 
         Args:
-            profile: relation profile of files without a `use` line.
             constants: values in place of those that the files give their constants.
 
         Raises:
@@ -58,7 +56,7 @@ class SpecificationFiles:
         if not paths:
             raise UsageError("watching needs a specification file to watch; give --spec FILE")
         self.paths = tuple(dict.fromkeys(paths))
-        self._profile, self._constants = profile, dict(constants or {})
+        self._constants = dict(constants or {})
         self._read: list[_State | None] = []
         self._sources: list[str] = []
         self._written: dict[tuple[int, str], Constant] = {}
@@ -73,7 +71,7 @@ class SpecificationFiles:
         with self._turn:
             # before the files are read: what is saved while they are is a change
             self._read, self._sources = self._state(), []
-            files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
+            files = load_specifications(self.paths, constants=self._constants)
             self._sources = [file.source for file in files]
             self._written = {
                 (index, name): value
@@ -123,8 +121,8 @@ class SpecificationFiles:
             MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
         """
         with self._turn:
-            files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
-            plain = load_specifications(self.paths, profile=self._profile)
+            files = load_specifications(self.paths, constants=self._constants)
+            plain = load_specifications(self.paths)
             changed: dict[str, float | str] = {}
             for index, (path, own, with_given, written) in enumerate(
                 zip(self.paths, values or [{}] * len(self.paths), files, plain, strict=True)
@@ -135,9 +133,9 @@ class SpecificationFiles:
                     if with_given.constants[name] != written.constants[name]
                 }
                 new = {**given, **own}
-                names = write_constants(path, new, profile=self._profile)
+                names = write_constants(path, new)
                 changed |= {name: new[name] for name in names}
-                after = load_specification(path, profile=self._profile) if names else written
+                after = load_specification(path) if names else written
                 self._written |= {(index, name): after.constants[name] for name in names}
             self._constants = {}
             return changed
@@ -176,9 +174,7 @@ class SpecificationFiles:
         return states
 
 
-def write_constants(
-    path: Path, values: Mapping[str, float | str], *, profile: str | None = None
-) -> tuple[str, ...]:
+def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str, ...]:
     """Write values of constants into a specification file, and change nothing but these numbers.
 
     Args:
@@ -199,8 +195,8 @@ def write_constants(
         text = content.removeprefix(_MARK).decode("utf-8")
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from error
-    before = parse_specification(text, filename=path.name, profile=profile)
-    after = parse_specification(text, filename=path.name, profile=profile, constants=values)
+    before = parse_specification(text, filename=path.name)
+    after = parse_specification(text, filename=path.name, constants=values)
     changed = {
         name: value for name, value in values.items() if before.constants[name] != after.constants[name]
     }
@@ -212,7 +208,7 @@ def write_constants(
             f"{path.name} computes {', '.join(computed)} from other constants; "
             "change those, or write a number there"
         )
-    written = parse_specification(text, filename=path.name, profile=profile, constants=changed)
+    written = parse_specification(text, filename=path.name, constants=changed)
     mark = _MARK if content.startswith(_MARK) else b""
     with replacing(path) as stream:
         stream.write(mark + written.source.encode("utf-8"))

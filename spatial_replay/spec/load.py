@@ -1003,7 +1003,6 @@ class SpecificationText:
 def load_specifications(
     sources: Sequence[Path | SpecificationText],
     *,
-    profile: str | None = None,
     constants: Mapping[str, float | str] | None = None,
 ) -> list[Specification]:
     """Parse several files or texts, with values in place of those of their constants.
@@ -1017,13 +1016,13 @@ def load_specifications(
         SpecificationError: a specification with errors.
         UsageError: a constant that no file has, or a value of another kind.
     """
-    files = [_parsed(source, profile, {}) for source in sources]
+    files = [_parsed(source, {}) for source in sources]
     if not constants:
         return files
     _check_names(files, constants)
     own = [_own_constants(file, constants) for file in files]
     return [
-        _parsed(source, profile, values) if values else file
+        _parsed(source, values) if values else file
         for source, file, values in zip(sources, files, own, strict=True)
     ]
 
@@ -1034,16 +1033,12 @@ def is_formula(source: Path) -> bool:
     return bool(_FORMULA.search(written)) and not written.endswith(".spatial") and not source.exists()
 
 
-def _parsed(
-    source: Path | SpecificationText, profile: str | None, constants: Mapping[str, float | str]
-) -> Specification:
+def _parsed(source: Path | SpecificationText, constants: Mapping[str, float | str]) -> Specification:
     if isinstance(source, SpecificationText):
-        return parse_specification(
-            source.text, filename=source.filename, profile=profile, constants=constants
-        )
+        return parse_specification(source.text, filename=source.filename, constants=constants)
     if is_formula(source):
-        return parse_specification(str(source), filename="<formula>", profile=profile, constants=constants)
-    return load_specification(source, profile=profile, constants=constants)
+        return parse_specification(str(source), filename="<formula>", constants=constants)
+    return load_specification(source, constants=constants)
 
 
 def _qualified(file: Specification, constant: str) -> str:

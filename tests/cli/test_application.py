@@ -146,7 +146,7 @@ def test_a_shell_completes_commands_and_options(tmp_path: Path) -> None:
     assert "complete -o nosort -F _spatial_replay_completion spatial-replay" in script.stdout
     for words, expected in (
         ("spatial-replay ch", "plain,check"),
-        ("spatial-replay check --pro", "plain,--profile"),
+        ("spatial-replay check --str", "plain,--strict-names"),
     ):
         completed = run_process(
             cwd=tmp_path,

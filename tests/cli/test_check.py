@@ -101,11 +101,18 @@ def test_names_are_compared_with_those_in_a_log(
     assert capsys.readouterr().out.endswith("all names, thresholds and windows fit\n")
 
 
-def test_the_profile_of_a_file_without_a_use_line_can_be_chosen(tmp_path: Path) -> None:
+def test_a_use_line_chooses_the_profile_instead_of_an_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     published = tmp_path / "published.spatial"
     published.write_text("F (a closeto b)")
     assert run(["check", str(published)]) == 2
-    assert run(["check", str(published), "--profile", "spatial_spec"]) == 0
+    capsys.readouterr()
+    assert run(["check", str(published), "--profile", "spatial_spec"]) == 2
+    said = capsys.readouterr().err
+    assert "no option --profile; write `use spatial_spec` in the first line of the specification" in said
+    published.write_text("use spatial_spec\nF (a closeto b)")
+    assert run(["check", str(published)]) == 0
 
 
 SLOW = "".join(
