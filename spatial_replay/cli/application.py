@@ -89,6 +89,7 @@ FAMILIES = {
 """Commands that share the module of another one."""
 
 FORMER_OPTIONS = {
+    "--plugin": "allow the module in pyproject.toml: [tool.spatial-replay] plugins = [MODULE]",
     "--profile": "write `use spatial_spec` in the first line of the specification",
 }
 """Options of earlier versions, with the new form."""

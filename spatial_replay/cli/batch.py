@@ -25,6 +25,7 @@ from spatial_replay.cli.options import (
     gather,
     naming_option,
     objects_by_parameter,
+    plugin_option,
     refuse_given,
     semantics_option,
 )
@@ -220,6 +221,7 @@ _OUTPUTS = (
 @click.command()
 @click.argument("logs", metavar="SUITE.yaml|LOG...", nargs=-1, required=True)
 @condition_options
+@plugin_option
 @semantics_option
 @lambda command: add_options(_OUTPUTS, gather("outputs", BatchOutputs, command))
 @click.option(

@@ -460,7 +460,6 @@ _UNSAFE: Final = re.compile(r"[^\w-]+")
 @click.command(cls=JsonCommand)
 @click.argument("specification", metavar="SPEC", type=LogPath())
 @constants_option
-@plugin_option
 @click.option(
     "-o",
     "--output",

@@ -16,7 +16,6 @@ from spatial_replay.cli.options import (
     log_output_option,
     naming_option,
     open_inputs,
-    plugin_option,
     reading_options,
     warn_of_input,
 )
@@ -211,7 +210,6 @@ def _gap(gap: SampleGap, first_ns: int) -> str:
     type=click.Path(path_type=Path),
     help="The signature to write or check.  [default: LOG.sig]",
 )
-@plugin_option
 @reading_options
 def verify(
     log: LogFile,

@@ -12,7 +12,6 @@ from spatial_replay.cli.options import (
     JsonCommand,
     constants_option,
     load_spec_options,
-    plugin_option,
     specs_option,
 )
 from spatial_replay.cli.record import SCENARIOS
@@ -59,7 +58,6 @@ from spatial_replay.logs.remote import LogFile
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @constants_option
-@plugin_option
 def falsify(
     scenario: str,
     specs: tuple[LogFile, ...],

@@ -21,7 +21,6 @@ from spatial_replay.cli.options import (
     naming_option,
     output_option,
     overwrite_option,
-    plugin_option,
     refuse_given,
     serving_options,
     specs_option,
@@ -73,7 +72,6 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     help="Mapping file (YAML), as for a log of the same topics.  [default: samples on /spatial/objects]",
 )
 @constants_option
-@plugin_option
 @output_option("Log of the whole run to write (MCAP), with the robot's own messages.")
 @overwrite_option
 @click.option(

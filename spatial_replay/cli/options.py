@@ -406,7 +406,6 @@ _CONDITIONS = (
     choices_option,
     constants_option,
     strict_names_option,
-    plugin_option,
 )
 
 

@@ -18,7 +18,6 @@ from spatial_replay.cli.options import (
     durability_option,
     load_spec_options,
     log_output_option,
-    plugin_option,
     require_choice,
 )
 from spatial_replay.cli.record import (
@@ -135,7 +134,6 @@ def _redo(
 @click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")
 @click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")
 @constants_option
-@plugin_option
 @setting_options
 @click.pass_context
 def plan(
@@ -203,7 +201,6 @@ def planning_command(scenario: str) -> click.Command:
         help="Specification to evaluate, of which the planner knows nothing; repeat for several.",
     )
     @constants_option
-    @plugin_option
     @simulation_options
     @click.option(
         "--timings",

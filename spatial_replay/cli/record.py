@@ -22,7 +22,6 @@ from spatial_replay.cli.options import (
     log_output_option,
     naming_option,
     overwrite_option,
-    plugin_option,
     reading_options,
     refuse_given,
     specs_option,
@@ -83,7 +82,6 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
 @durability_option
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
-@plugin_option
 @click.option(
     "--keep-video",
     "keep",
@@ -359,7 +357,6 @@ def recording_command(scenario: str) -> click.Command:
         "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
     )
     @constants_option
-    @plugin_option
     @click.option(
         "--duration",
         "length_ns",
@@ -428,7 +425,6 @@ record.add_command(video)
 @durability_option
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
-@plugin_option
 @reading_options
 @click.option(
     "--unit",

@@ -30,6 +30,7 @@ from spatial_replay.cli.options import (
     naming_option,
     open_inputs,
     output_option,
+    plugin_option,
     refuse_given,
     semantics_option,
     serving_options,
@@ -317,6 +318,7 @@ def _serve(
 
 @click.command()
 @evaluation_options
+@plugin_option
 @log_output_option("Annotated log to write (MCAP).", required=False)
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
 @keep_option("Messages of the log to copy with -o", "all; none of a ROS 2 bag")

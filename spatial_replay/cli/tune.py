@@ -18,7 +18,6 @@ from spatial_replay.cli.options import (
     load_spec_options,
     objects_by_parameter,
     output_option,
-    plugin_option,
     reading_options,
 )
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_file, show_json
@@ -104,7 +103,6 @@ def _read_ranges(
 )
 @choices_option
 @constants_option
-@plugin_option
 @reading_options
 def tune(
     spec: LogFile,
@@ -224,7 +222,6 @@ def _row(constant: TunedConstant) -> tuple[str, str, str, str]:
 @output_option("Specification to write.  [default: printed]")
 @click.option("--lines", type=click.IntRange(min=1), help="Write at most so many specs.  [default: 20]")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
-@plugin_option
 @reading_options
 def learn(
     good: tuple[LogFile, ...],

@@ -776,7 +776,10 @@ def parse_specification(
     for name, place in used_modules(text).items():
         if name not in plugins and not nearest_hint(name, PROFILES):
             message = f"{name!r} is neither a profile ({', '.join(PROFILES)}) nor an allowed plug-in"
-            hint = f'if you trust the module: --plugin {name}, or plugins = ["{name}"] in pyproject.toml'
+            hint = (
+                f'if you trust the module: plugins = ["{name}"] in pyproject.toml, under'
+                f" [tool.spatial-replay]; or --plugin {name} of check, replay and batch"
+            )
             faults.add(Span(*place), message, hint)
     faults.raise_if_any()
     tokens = _tokens(text, names, faults)

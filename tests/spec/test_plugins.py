@@ -64,7 +64,8 @@ def test_a_specification_loads_no_module_by_itself(capsys: pytest.CaptureFixture
         assert run([*command]) == 2
         said = capsys.readouterr().err
         assert "'cell' is neither a profile (paper, spatial_spec) nor an allowed plug-in" in said
-        assert "if you trust the module: --plugin cell, or plugins = " in said
+        assert 'if you trust the module: plugins = ["cell"] in pyproject.toml' in said
+        assert "or --plugin cell of check, replay and batch" in said
     assert not Path("ran").exists()
 
 
@@ -103,11 +104,16 @@ def test_a_log_names_the_plugin_and_runs_it_only_if_it_is_allowed(
         assert run([command, "annotated.mcap"]) == 2
         assert "'cell' is neither a profile" in capsys.readouterr().err
     assert not Path("ran").exists()
-    assert run(["verify", "annotated.mcap", "--plugin", "cell"]) == 0
-    Path("other").mkdir()
-    Path("other/cell.py").write_text(MODULE + "\n# changed\n")
-    assert run(["verify", "annotated.mcap", "--plugin", "other/cell.py"]) == 1
-    assert "another specification" in capsys.readouterr().out
+    assert run(["verify", "annotated.mcap", "--plugin", "cell"]) == 2
+    assert "no option --plugin; allow the module in pyproject.toml" in capsys.readouterr().err
+    Path("pyproject.toml").write_text('[tool.spatial-replay]\nplugins = ["cell"]\n')
+    assert run(["verify", "annotated.mcap"]) == 0
+    Path("cell.py").write_text(MODULE + "\n# changed\n")
+    # another process, as commands are: one process reads a file once
+    program = [sys.executable, "-m", "spatial_replay", "verify", "annotated.mcap"]
+    verified = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert verified.returncode == 1
+    assert "another specification" in verified.stdout
 
 
 def test_a_batch_evaluates_logs_again_with_a_plugin_that_was_changed(
