@@ -249,11 +249,16 @@ class BagDirectory:
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """A record in the file: the fields of its head, and where its data are."""
+    """A record in the file: the fields of its head, and where its data are.
+
+    Attributes:
+        missing: bytes that an uncompressed chunk lacks, because the file breaks off in it.
+    """
 
     fields: dict[str, bytes]
     data: int
     length: int
+    missing: int = 0
 
     @property
     def opcode(self) -> int:
@@ -342,9 +347,13 @@ def _record(stream: BinaryIO, position: int, size: int) -> _Record:
     fields = fields_of(stream.read(head_length))
     length = _word(stream)
     data = stream.tell()
-    if data + length > size:
+    missing = max(0, data + length - size)
+    record = _Record(fields, data, length - missing, missing)
+    if missing and not (
+        record.opcode == CHUNK and fields.get("compression") == b"none" and number(fields, "size") == length
+    ):
         raise DamageError("the file breaks off in a record")
-    return _Record(fields, data, length)
+    return record
 
 
 def _word(stream: BinaryIO) -> int:
@@ -363,7 +372,13 @@ def _data(stream: BinaryIO, record: _Record) -> bytes:
 
 def _content(stream: BinaryIO, record: _Record) -> bytes:
     compression = record.fields.get("compression", b"")
-    return decompressed(compression, _data(stream, record), number(record.fields, "size"))
+    size = number(record.fields, "size") - record.missing
+    content = decompressed(compression, _data(stream, record), size)
+    if record.missing:
+        # the fault of the file names the loss
+        table, _ = record_table(content)
+        content = content[: int(table.end.max(initial=0))]
+    return content
 
 
 class _Scan:
@@ -386,12 +401,14 @@ class _Scan:
             except DamageError as damage:
                 gaps += 1
                 following = self._next_chunk(position + 1) if gaps < _MOST_GAPS else None
-                lost = (following or self._size) - position
-                self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost} bytes cannot be read")
+                self._lose(position, damage, (following or self._size) - position)
                 if following is None:
                     break
                 position = following
         return self._directory
+
+    def _lose(self, position: int, damage: DamageError | str, lost: int) -> None:
+        self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost} bytes cannot be read")
 
     def _take_in(self, position: int) -> int:
         """Take in the record at a position; return where the next one begins."""
@@ -410,6 +427,10 @@ class _Scan:
         table, _ = record_table(content)
         for connection in connections_in(content, table):
             self._directory.connections.setdefault(connection.number, connection)
+        if record.missing:
+            self._lose(
+                position, "the file breaks off in a chunk", record.missing + record.length - len(content)
+            )
         is_message = table.opcode == MESSAGE
         if is_message.any():
             times = table.time_ns[is_message]

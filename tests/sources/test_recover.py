@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 import spatial_replay as sr
 from bags.bag_files import drive, write_json_mcap, write_ros1, write_ros2
@@ -184,14 +184,63 @@ def test_bags_and_external_logs_become_an_indexed_log_with_the_same_messages(
     assert messages_of(tmp_path / "saved.mcap") == messages_of(path)
 
 
-def test_a_bag_that_breaks_off_is_saved_up_to_there(tmp_path: Path) -> None:
-    path = write_ros1(tmp_path / "drive.bag", drive(60))
-    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
-    code, _ = call("recover", path, "-o", tmp_path / "saved.mcap")
+def test_a_bag_that_breaks_off_is_saved_up_to_its_last_whole_message(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "drive.bag", drive(60), chunk_bytes=4_000)
+    data, whole = path.read_bytes(), messages_of(path)
+    ends = dict[int, int]()
+    for number, message in enumerate(whole):
+        ends[number] = data.index(message.payload, ends.get(number - 1, 0)) + len(message.payload)
+    for size in range(len(data) * 6 // 10, len(data) * 6 // 10 + 600, 9):
+        path.write_bytes(data[:size])
+        reader = open_messages(path)
+        messages = list(reader.iter_messages({topic.name for topic in reader.topics()}))
+        assert messages == [whole[number] for number, end in ends.items() if end <= size], size
+        assert len(reader.take_faults()) == 2, size
+    code, said = call("recover", path, "-o", tmp_path / "saved.mcap")
     assert code == 3
-    saved = messages_of(tmp_path / "saved.mcap")
-    assert saved == messages_of(path)
-    assert len(saved) > 60
+    assert "the file breaks off in a chunk" in said
+    assert messages_of(tmp_path / "saved.mcap") == messages_of(path)
+
+
+@pytest.fixture
+def uncompressed(tmp_path: Path) -> Path:
+    """A log of 60 messages of different lengths in several uncompressed chunks."""
+    with (tmp_path / "drive.mcap").open("wb") as stream:
+        writer = Writer(stream, chunk_size=1_000, compression=CompressionType.NONE)
+        writer.start("", "test")
+        channels = [writer.register_channel(f"/{name}", "json", 0) for name in "ab"]
+        for n in range(60):
+            payload = json.dumps({"n": n, "rest": "x" * (n * 7 % 40)}).encode()
+            writer.add_message(channels[n % 2], (n + 1) * 10**8, payload, (n + 1) * 10**8, n)
+        writer.finish()
+    return tmp_path / "drive.mcap"
+
+
+def test_whole_messages_of_an_uncompressed_chunk_that_breaks_off_are_saved(
+    uncompressed: Path, tmp_path: Path
+) -> None:
+    data, whole = uncompressed.read_bytes(), messages_of(uncompressed)
+    ends = [data.index(each.payload) + len(each.payload) for each in whole]
+    cut = tmp_path / "cut.mcap"
+    for size in range(ends[0], len(data), 7):
+        cut.write_bytes(data[:size])
+        reader = open_messages(cut)
+        messages = list(reader.iter_messages({topic.name for topic in reader.topics()}))
+        assert messages == [each for each, end in zip(whole, ends, strict=True) if end <= size], size
+        assert len(reader.take_faults()) == 1, size
+
+
+@pytest.mark.parametrize(("behind", "lost"), [(0, "a record"), (5, "a head"), (40, "a payload")])
+def test_a_chunk_that_breaks_off_is_reported_once(
+    uncompressed: Path, tmp_path: Path, behind: int, lost: str
+) -> None:
+    data, last = uncompressed.read_bytes(), messages_of(uncompressed)[49].payload
+    (tmp_path / "cut.mcap").write_bytes(data[: data.index(last) + len(last) + behind])
+    code, said = call("recover", tmp_path / "cut.mcap", "-o", tmp_path / "saved.mcap")
+    assert code == 3
+    assert len(messages_of(tmp_path / "saved.mcap")) == 50
+    assert said.count("the file breaks off") == 1, lost
+    assert "after 4.900 s cannot be read" in said
 
 
 def test_what_a_damaged_page_of_a_database_takes_is_listed_by_time(tmp_path: Path) -> None:

@@ -105,6 +105,19 @@ def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
     return ChunkPlace(offset, length, start, end, size=size)
 
 
+def _uncompressed_content(offset: int, record: bytes, following: int) -> int | None:
+    """Return where the records in an uncompressed chunk begin; None if this is no such chunk."""
+    if record[0] != Opcode.CHUNK:
+        return None
+    with suppress(DamageError):
+        size = chunk_place(offset, record, following - offset).size
+        if following - offset == _UNCOMPRESSED_HEAD_BYTES + size:
+            return offset + _UNCOMPRESSED_HEAD_BYTES
+    return None
+
+
+_UNCOMPRESSED_HEAD_BYTES = RECORD_HEAD.size + CHUNK_HEAD.size + 8
+"""Up to the records of a chunk whose compression has no name."""
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
 _CHUNK_INDEX = struct.Struct("<QQQQI")
@@ -286,11 +299,16 @@ def _check_complete(directory: Directory, end: int) -> None:
 
 
 class _Scan:
-    """One pass over the records of a file, skipping their contents."""
+    """One pass over the records of a file, skipping their contents.
+
+    The records of an uncompressed chunk that breaks off are read as records outside chunks.
+    """
 
     def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
         self._stream = stream
         self._size = size
+        # beyond the size inside a chunk that breaks off
+        self._end = size
         self._faults = faults
         self._name = name
         self._directory = Directory()
@@ -300,13 +318,14 @@ class _Scan:
     def directory(self) -> Directory:
         position = sound = len(MAGIC)
         gaps = 0
-        while position < self._size and not self._ended:
+        while position < self._end and not self._ended:
             try:
                 position = self._record(position)
             except DamageError as damage:
                 gaps += 1
                 following = self._next_chunk(sound) if gaps < _MOST_GAPS else None
                 self._lose(position, following, damage)
+                self._end = self._size
                 if following is None:
                     break
                 position = following.offset
@@ -317,7 +336,7 @@ class _Scan:
 
     def _lose(self, position: int, following: ChunkPlace | None, damage: DamageError) -> None:
         """Report the bytes from a position to the next chunk as lost, with the times around them."""
-        lost = max(0, (following.offset if following else self._size) - position)
+        lost = max(0, (following.offset if following else self._end) - position)
         known = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
         after = [Instant(max(known), 0)] if known else []
         before = [Instant(following.start_ns, 0)] if following else []
@@ -342,7 +361,12 @@ class _Scan:
         if opcode == 0:
             raise DamageError(f"there is no record (opcode {opcode})")
         if following > self._size:
-            raise DamageError("the file breaks off in a record")
+            content = _uncompressed_content(position, beginning, following)
+            if content is None or self._end > self._size:
+                raise DamageError("the file breaks off in a " + ("chunk" if content else "record"))
+            self._end_loose()
+            self._end = following
+            return content
         if max(Opcode) < opcode < 0x80:
             self._skip(opcode, beginning, following)
         if opcode == Opcode.CHUNK:
@@ -364,6 +388,8 @@ class _Scan:
         elif opcode == Opcode.METADATA:
             self._directory.metadata.append((position, following - position))
         elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            if self._end > self._size:
+                raise DamageError("the data end within a chunk")
             if self._next_chunk(following) is not None:
                 raise DamageError("the data end before the last chunk")
             # what follows repeats what was read already
