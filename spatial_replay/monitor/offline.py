@@ -409,11 +409,13 @@ class _OpenFormulas:
 def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
     """Return (T,), at which samples the end of a log cuts the window of an operator short.
 
-    An operator without an upper bound ends with the log; WX says itself what holds at the last sample.
+    An operator without an upper bound ends with the log; WX says itself what holds at the last sample. A log
+    of one sample shows nothing of what lasts: it cuts every G.
     """
     bound = formula.bound
     is_bounded = formula.operator == "X" or (bound is not None and bound.upper is not None)
-    return _is_open(formula, times_ns) & is_bounded
+    is_moment = formula.operator == "G" and len(times_ns) == 1
+    return _is_open(formula, times_ns) & (is_bounded or is_moment)
 
 
 def _is_open(formula: Temporal, times_ns: Integers) -> Booleans:

@@ -18,6 +18,7 @@ from spatial_replay.monitor.offline import (
     windows_of,
 )
 from spatial_replay.monitor.online.codes import in_channels, joined_channels, low_and_high
+from spatial_replay.monitor.stream import Instance
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import End, PathNode, deciding_path
@@ -74,10 +75,11 @@ class UntestedPart:
     Attributes:
         node: its id; None for a template without instances.
         text: its canonical text.
-        reason: "empty window": no sample ever lies in the window of an operator. "antecedent never held": of
-            an implication. "no members": an open group is empty. "past the end": the result is infinite,
-            because its deciding part looks past an end of the log. "no instances": no object fits a template.
-            "cut window": it decides at a sample whose window ends after the log.
+        reason: "empty window": no sample lies in the window of an operator, wherever it counts. "antecedent
+            never held": of an implication, in any of its spellings. "no members": an open group is empty.
+            "past the end": the result is infinite, because its deciding part looks past an end of the log.
+            "no instances": no object fits a template. "cut window": it decides at a sample whose window ends
+            after the log.
         message: a sentence.
         time_ns: the sample at which it decides; None where it decides at none.
     """
@@ -130,9 +132,12 @@ def find_vacuous(
     instance = evidence.instance
     nodes = nodes_of(instance.formula)
     scopes = _scopes(instance.formula, times_ns)
+    implications = _implications_of(instance.formula)
+    held = _Holding(instance, leaves, times_ns)
+    active = _scopes(implications.formula, times_ns, held)
     found = [
-        *_empty_windows(nodes, scopes, times_ns, evidence),
-        *_idle_implications(leaves, times_ns, evidence),
+        *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), times_ns, evidence),
+        *_idle_implications(implications, active, held, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
@@ -159,6 +164,106 @@ class _Idle(NamedTuple):
 def _part(idle: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
     text = format_formula(evidence.bound(node))
     return UntestedPart(idle.node, text, idle.reason, Sentence(f"`{text}` ", *idle.what), idle.time_ns)
+
+
+# ------------------------------------------------------------------------------------------ implications
+
+
+class _Implications(NamedTuple):
+    """A formula in which each implication is written with `->`; its numbers are the same.
+
+    Attributes:
+        nodes: for each of its nodes, the id of the node as written that it stands for.
+    """
+
+    formula: Formula
+    nodes: tuple[int, ...]
+
+    def by_node(self, scopes: Sequence[_Samples], count: int) -> list[_Samples]:
+        """Return for each of `count` nodes as written the samples (T,) of the nodes that stand for it."""
+        joined = [np.zeros(len(scopes[0]), np.bool_) for _ in range(count)]
+        for node, scope in zip(self.nodes, scopes, strict=True):
+            joined[node] |= scope
+        return joined
+
+
+def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
+    """Write `->` for each implication of a formula.
+
+    `not a or b` and `not (a and not b)` are `a -> b`. In `not (a and b)` each part is a condition for the
+    other: it is `(a or b) -> not (a and b)`.
+
+    Args:
+        node: its id as written.
+        sign: 1 if it has to hold, -1 if it must not, 0 if both count. Only in the first is it an implication.
+    """
+    operands = list(_operands_with_ids(formula, node))
+    operator = operator_of(formula)
+    is_negated = operator == "not" and operator_of(operands[0][0]) == "and"
+    if sign > 0 and (operator == "or" or is_negated):
+        parts = list(_operands_with_ids(*operands[0])) if is_negated else operands
+        # `not` marks the conditions of a disjunction, and the response in a negated conjunction
+        are_conditions = [(operator_of(part) == "not") is not is_negated for part, _ in parts]
+        sides = [
+            [
+                _implications_of(*_without_negation(*part), -1 if is_condition else 1)
+                for part, is_condition in zip(parts, are_conditions, strict=True)
+                if is_condition is wanted
+            ]
+            for wanted in (True, False)
+        ]
+        if all(sides):
+            return _joined("->", (_joined("and", sides[0], node), _joined("or", sides[1], node)), node)
+        if sides[0]:
+            both = _joined("and", sides[0], node)
+            response = _Implications(Boolean("not", (both.formula,)), (node, *both.nodes))
+            return _joined("->", (_joined("or", sides[0], node), response), node)
+    if not isinstance(formula, Boolean | Temporal):
+        return _Implications(formula, (node,))
+    signs = [_sign_below(operator, place, sign) for place in range(len(operands))]
+    below = [_implications_of(*part, own) for part, own in zip(operands, signs, strict=True)]
+    whole = replace(formula, operands=tuple(part.formula for part in below))
+    return _Implications(whole, (node, *(identifier for part in below for identifier in part.nodes)))
+
+
+def _operands_with_ids(formula: Formula, node: int) -> Iterator[tuple[Formula, int]]:
+    node += 1
+    for operand in operands_of(formula):
+        yield operand, node
+        node += sum(1 for _ in iter_nodes(operand))
+
+
+def _without_negation(formula: Formula, node: int) -> tuple[Formula, int]:
+    is_negation = operator_of(formula) == "not"
+    return (operands_of(formula)[0], node + 1) if is_negation else (formula, node)
+
+
+def _sign_below(operator: str, place: int, sign: int) -> int:
+    if operator in ("xor", "<->"):
+        return 0
+    return -sign if operator == "not" or (operator == "->" and place == 0) else sign
+
+
+def _joined(operator: Literal["and", "or", "->"], parts: Sequence[_Implications], node: int) -> _Implications:
+    if len(parts) == 1:
+        return parts[0]
+    formula = Boolean(operator, tuple(part.formula for part in parts))
+    return _Implications(formula, (node, *(identifier for part in parts for identifier in part.nodes)))
+
+
+class _Holding:
+    """In which samples (T,) each condition holds or may hold, computed once."""
+
+    def __init__(self, instance: Instance, leaves: Floats, times_ns: Integers) -> None:
+        self._order = instance.program.leaves
+        self._leaves, self._times_ns = leaves, times_ns
+        self._samples: dict[Formula, _Samples] = {}
+
+    def __call__(self, condition: Formula) -> _Samples:
+        if condition not in self._samples:
+            nodes = evaluate_offline(condition, self._order, self._leaves, self._times_ns)
+            self._samples[condition] = nodes.ends(0)[1] >= 0.0
+        return self._samples[condition]
 
 
 # ---------------------------------------------------------------------------------------------- scopes
@@ -209,33 +314,43 @@ def _below(formula: Temporal, place: int, scope: _Samples, times_ns: Integers) -
 
 
 def _empty_windows(
-    nodes: Sequence[Formula], scopes: Sequence[_Samples], times_ns: Integers, evidence: Evidence
+    nodes: Sequence[Formula],
+    scopes: Sequence[_Samples],
+    active: Sequence[_Samples],
+    times_ns: Integers,
+    evidence: Evidence,
 ) -> Iterator[_Idle]:
-    for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
+    """Find the operators whose windows are empty in all samples at which they count.
+
+    Args:
+        scopes: the samples at which the number depends on a node.
+        active: the samples at which the verdict does, where conditions hold.
+    """
+    for identifier, (node, scope, own) in enumerate(zip(nodes, scopes, active, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
             continue
         begin, end = windows_of(node, times_ns)
-        if not (begin < end)[scope].any():
-            what: tuple[str | Instant, ...] = ("no sample of the log lies in its window",)
-            after = int(begin[scope][0])
+        counts = own if own.any() else scope
+        if not (begin < end)[counts].any():
+            where = " where it counts" if (begin < end)[scope].any() else ""
+            what: tuple[str | Instant, ...] = (f"no sample of the log lies in its window{where}",)
+            after = int(begin[counts][0])
             if node.operator in _NEXT:
-                what = (f"the log has no {_NEXT[node.operator]}",)
+                what = (f"the log has no {_NEXT[node.operator]}{where}",)
             elif 0 < after < len(times_ns):
                 between = (
-                    Instant(int(each), evidence.first_ns()) for each in times_ns[after - 1 : after + 1]
+                    Instant(int(time), evidence.first_ns()) for time in times_ns[after - 1 : after + 1]
                 )
-                what += (", between those at ", next(between), " and ", next(between))
+                first = "first " if counts.sum() > 1 else ""
+                what += (f", {first}between those at ", next(between), " and ", next(between))
             yield _Idle(identifier, "empty window", ("was never tested: ", *what, "."))
 
 
-def _idle_implications(leaves: Floats, times_ns: Integers, evidence: Evidence) -> Iterator[_Idle]:
-    formula, order = evidence.instance.formula, evidence.instance.program.leaves
-
-    def held(antecedent: Formula) -> _Samples:
-        return evaluate_offline(antecedent, order, leaves, times_ns).ends(0)[1] >= 0.0
-
-    scopes = _scopes(formula, times_ns, held)
-    for (identifier, _, node), scope in zip(iter_nodes(formula), scopes, strict=True):
+def _idle_implications(
+    implications: _Implications, active: Sequence[_Samples], held: _Holding, evidence: Evidence
+) -> Iterator[_Idle]:
+    nodes = nodes_of(implications.formula)
+    for identifier, node, scope in zip(implications.nodes, nodes, active, strict=True):
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
             is_held = held(node.operands[0])
             if not is_held[scope].any():
@@ -268,7 +383,7 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
 
     Within the consequent of another one, which is said as well, both antecedents have to hold.
     """
-    stack: list[tuple[Formula, tuple[Formula, ...]]] = [(node.body, ())]
+    stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_implications_of(node.body).formula, ())]
     while stack:
         current, given = stack.pop()
         if isinstance(current, Quantified):
@@ -384,7 +499,8 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
         return formula
 
     both = joined_channels([unknown, known], axis=1)
-    done = evaluate_offline(tested(instance.formula), (*order, *stand_ins.values()), both, times_ns)
+    formula = tested(_implications_of(instance.formula).formula)
+    done = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
     return final_verdict(*done.interval(0)) is verdict
 
 
@@ -397,7 +513,8 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
         bound = evidence.bound(leaf)
         groups = list(dict.fromkeys(_open_groups(bound)))
         if isinstance(bound, Quantified):
-            column = evidence.columns([replace(bound, body=_without_tests(bound.body))])
+            body = _without_tests(_implications_of(bound.body).formula)
+            column = evidence.columns([replace(bound, body=body)])
             result[:, place] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)

@@ -212,6 +212,13 @@ def test_the_semantics_of_the_paper_reports_no_violation_online() -> None:
 # ------------------------------------------------------------------------------------------- vacuous
 
 
+@pytest.mark.parametrize(("formula", "tested"), [("G (p >= 0)", "cut"), ("F (p >= 0)", "full")])
+def test_one_sample_shows_nothing_that_lasts(formula: str, tested: str) -> None:
+    trace = sr.Trace.from_samples([sr.Sample(SECOND, {}, {"p": 1.0})])
+    result = sr.evaluate(sr.parse_specification(f"spec s = {formula}"), trace).result()
+    assert (result.verdict, result.tested) == (sr.Verdict.SATISFIED, tested)
+
+
 @pytest.mark.parametrize(
     ("formula", "reason", "message"),
     [
@@ -231,6 +238,46 @@ def test_the_semantics_of_the_paper_reports_no_violation_online() -> None:
             "`(p >= 3) -> (q >= 0)` was never tested: `p >= 3` never held where it counts.",
         ),
         (
+            "G ((p >= 3) -> (G[1s, 2s] (q >= 0)))",
+            "empty window",
+            "`G[1s, 2s] (q >= 0)` was never tested: no sample of the log lies in its window where it counts.",
+        ),
+        (
+            "G ((p <= 1) -> (H[1s, 2s] (q >= 0)))",
+            "empty window",
+            "`H[1s, 2s] (q >= 0)` was never tested: no sample of the log lies in its window where it counts.",
+        ),
+        (
+            "G ((p <= 1) -> not (Y (q >= 0)))",
+            "empty window",
+            "`Y (q >= 0)` was never tested: the log has no sample before where it counts.",
+        ),
+        (
+            "G ((p >= 3) -> (WX (q >= 0)))",
+            "empty window",
+            "`WX (q >= 0)` was never tested: the log has no next sample where it counts.",
+        ),
+        (
+            "G ((p >= 2) -> (G[2, 3] (q >= 0)))",
+            "empty window",
+            "`G[2, 3] (q >= 0)` was never tested: no sample of the log lies in its window where it counts.",
+        ),
+        (
+            "G (not (p >= 9) or q >= 0)",
+            "antecedent never held",
+            "`(not (p >= 9)) or (q >= 0)` was never tested: `p >= 9` never held.",
+        ),
+        (
+            "G (not (p >= 9 and not (q >= 0)))",
+            "antecedent never held",
+            "`not ((p >= 9) and (not (q >= 0)))` was never tested: `p >= 9` never held.",
+        ),
+        (
+            "G (not (p >= 9 and q >= 0))",
+            "antecedent never held",
+            "`not ((p >= 9) and (q >= 0))` was never tested: `(p >= 9) or (q >= 0)` never held.",
+        ),
+        (
             "G (forall x in people: x dist y >= 1)",
             "no members",
             "`forall x in people: (x dist y >= 1)` decided nothing: no object was ever in `people`.",
@@ -247,15 +294,28 @@ def test_a_pass_that_tested_nothing_is_marked(formula: str, reason: str, message
     samples = [sr.Sample(k * SECOND, {}, {"p": 1.0 + k, "q": -1.0}) for k in range(3)]
     evaluation = sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(samples))
     result = evaluation.result()
-    assert result.verdict is sr.Verdict.SATISFIED
-    assert [(each.reason, each.message) for each in result.vacuous] == [(reason, message)]
+    assert (result.verdict, result.tested) == (sr.Verdict.SATISFIED, "nothing")
+    assert [(part.reason, part.message) for part in result.vacuous] == [(reason, message)]
     assert message in evaluation.explain()
 
 
-def test_a_pass_that_tested_something_is_not_marked() -> None:
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "G ((p >= 3) -> F[0s, 2s] (q >= 0))",
+        # one of two conditions meets a sample in its window
+        "G ((p <= 2) -> (H[1s, 2s] (q >= 0)))",
+        # one part was measured while the other held
+        "G (not (p >= 9 and q >= 0))",
+        "G (not (q >= 9))",
+        "F (p >= 3 or q >= 9)",
+    ],
+)
+def test_a_pass_that_tested_something_is_not_marked(formula: str) -> None:
     samples = [sr.Sample(k * SECOND, {}, {"p": 1.0 + k, "q": 1.0}) for k in range(3)]
-    spec = sr.parse_specification("spec s = G ((p >= 3) -> F[0s, 2s] (q >= 0))")
-    assert sr.evaluate(spec, sr.Trace.from_samples(samples)).result().vacuous == ()
+    evaluation = sr.evaluate(sr.parse_specification(f"spec s = {formula}"), sr.Trace.from_samples(samples))
+    result = evaluation.result()
+    assert (result.verdict, result.tested, result.vacuous) == (sr.Verdict.SATISFIED, "full", ())
 
 
 def test_a_template_that_no_object_fits_is_marked() -> None:
