@@ -286,8 +286,9 @@ def message_from_error(error: BaseException) -> str:
             return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
             path, what = context.command_path, error.format_message()
-            if isinstance(error, click.NoSuchOption) and error.option_name in FORMER_OPTIONS:
-                what = f"no option {error.option_name}; {FORMER_OPTIONS[error.option_name]}"
+            if isinstance(error, click.NoSuchOption):
+                remedy = new_form(error.option_name, context.command)
+                what = f"no option {error.option_name}; {remedy}" if remedy else what
             if "unexpected extra" in what and any("--spec" in each.opts for each in context.command.params):
                 what += f"; specifications come after --spec: {path} LOG --spec FILE; batch takes many logs"
             if "'--spec'" in what and any(each.name == "specification" for each in context.command.params):
@@ -308,6 +309,17 @@ def message_from_error(error: BaseException) -> str:
                 f"internal error: {type(error).__name__}: {error}\n"
                 f"  please report it, with the output of the same command under {DEBUG_VARIABLE}=1"
             )
+
+
+def new_form(option: str, command: click.Command) -> str | None:
+    """Return what to write instead of an option of an earlier version; None for any other option."""
+    from spatial_replay.mapping.yaml_document import schema_of
+
+    key = option.removeprefix("--").replace("-", "_")
+    is_planner = any("--set" in parameter.opts for parameter in command.params)
+    if is_planner and key in schema_of("planning", "settings")["properties"]:
+        return f"write --set {key}=VALUE"
+    return FORMER_OPTIONS.get(option)
 
 
 def report_error(error: BaseException) -> None:

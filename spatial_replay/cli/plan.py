@@ -36,38 +36,41 @@ if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
 
 
+_SETTINGS = (
+    click.option(
+        "--settings",
+        metavar="FILE",
+        type=LogPath(),
+        help="Settings of the planner (YAML); --set has precedence.",
+    ),
+    click.option(
+        "--set",
+        "texts",
+        metavar="KEY=VALUE",
+        multiple=True,
+        help="Setting of the planner, such as room=0.05 or yaws=0,90deg; repeat for several. Keys: "
+        f"{', '.join(schema_of('planning', 'settings')['properties'])}.",
+    ),
+)
+
+
 def setting_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that change a planner's settings; the command takes what they change as `changes`."""
 
     @wraps(command)
-    def changing(**arguments: Any) -> Any:
-        file: LogFile | None = arguments.pop("settings")
-        texts = {key: arguments.pop(key) for key in schema_of("planning", "settings")["properties"]}
-        return command(changes=_changes(file, texts), **arguments)
+    def changing(*, settings: LogFile | None, texts: tuple[str, ...], **arguments: Any) -> Any:
+        return command(changes=_setting_changes(settings, texts), **arguments)
 
-    options = [
-        click.option(
-            "--settings",
-            metavar="FILE",
-            type=LogPath(),
-            help="Settings of the planner (YAML); the options below have precedence.",
-        )
-    ]
-    for key, kind in schema_of("planning", "settings")["properties"].items():
-        what = kind["description"]
-        text = f"{what[0].upper()}{what[1:]}."
-        options.append(click.option(f"--{key.replace('_', '-')}", key, metavar="VALUE", help=text))
-    return add_options(options, changing)
+    return add_options(_SETTINGS, changing)
 
 
-def _changes(file: LogFile | None, texts: Mapping[str, str | None]) -> Mapping[str, Any]:
+def _setting_changes(file: LogFile | None, texts: tuple[str, ...]) -> dict[str, Any]:
     """Return what a settings file and options change.
 
     Raises:
         MissingFileError: there is no such file. UsageError: invalid values.
     """
-    given = {key: text for key, text in texts.items() if text is not None}
-    if file is None and not given:
+    if file is None and not texts:
         return {}
     # imported here so that --help stays fast
     from spatial_replay.logs.remote import log_file
@@ -77,8 +80,8 @@ def _changes(file: LogFile | None, texts: Mapping[str, str | None]) -> Mapping[s
     changes: dict[str, Any] = {}
     if file is not None:
         changes |= parse_settings(read_yaml_text(file), log_file(file).name)
-    for key, text in given.items():
-        changes |= parse_setting(key, text)
+    for text in texts:
+        changes |= parse_setting(text)
     return changes
 
 
@@ -148,9 +151,9 @@ def plan(
     \b
     Examples:
       spatial-replay plan push -o push.mcap --seed 3
-      spatial-replay plan push -o push.mcap --settings careful.yaml --attempts 5
+      spatial-replay plan push -o push.mcap --settings careful.yaml --set attempts=5
       spatial-replay plan --redo push.mcap
-      spatial-replay plan --redo table.mcap --room 0.02
+      spatial-replay plan --redo table.mcap --set room=0.02
       spatial-replay plan --redo push.mcap --spec edited.spatial -o both.mcap
     """
     if log is not None and context.invoked_subcommand is None:
@@ -179,7 +182,7 @@ def planning_command(scenario: str) -> click.Command:
     Examples:
       spatial-replay plan {scenario} -o run.mcap --seed 3
       spatial-replay plan {scenario} -o run.mcap --spec edited.spatial
-      spatial-replay plan {scenario} -o run.mcap --settings careful.yaml --attempts 5
+      spatial-replay plan {scenario} -o run.mcap --settings careful.yaml --set attempts=5
       spatial-replay info run.mcap --decisions
     """
 

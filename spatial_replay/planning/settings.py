@@ -21,7 +21,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import ConvexPart, Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text, schema_of
-from spatial_replay.text import cut, named_arguments
+from spatial_replay.text import cut, named_arguments, nearest_hint
 from spatial_replay.trace.trace import Sample
 
 # ---------------------------------------------------------------------------------------------- the workspace
@@ -429,20 +429,24 @@ def parse_settings(text: str, name: str = "settings") -> Mapping[str, Any]:
     return dict(value)
 
 
-def parse_setting(key: str, text: str) -> Mapping[str, Any]:
-    """Parse one setting as YAML, as an option gives it; a list needs no brackets.
+def parse_setting(text: str) -> Mapping[str, Any]:
+    """Parse one setting, KEY=VALUE with a value as in a settings file; a list needs no brackets.
 
     Raises:
-        UsageError: the value is not valid.
+        UsageError: there is no such setting, or the value is not valid.
     """
-    kind = schema_of("planning", "settings")["properties"][key]
-    options = [kind, *kind.get("anyOf", ())]
-    is_list = kind.get("type") == "array" or any("names" in each.get("$ref", "") for each in options)
-    if is_list and text.strip() != "null" and not text.strip().startswith("["):
-        text = f"[{text}]"
-    option = f"--{key.replace('_', '-')}"
+    key, equals, value = text.partition("=")
+    kinds = schema_of("planning", "settings")["properties"]
+    if not equals or key not in kinds:
+        hint = nearest_hint(key, kinds) or f"the keys are {', '.join(kinds)}"
+        raise UsageError(f"--set {text!r:.100}: give KEY=VALUE; {hint}")
+    options = [kinds[key], *kinds[key].get("anyOf", ())]
+    is_list = kinds[key].get("type") == "array" or any("names" in kind.get("$ref", "") for kind in options)
+    if is_list and value.strip() != "null" and not value.strip().startswith("["):
+        value = f"[{value}]"
+    option = f"--set {key}"
     try:
-        return parse_settings(f"{key}: {text}", option)
+        return parse_settings(f"{key}: {value}", option)
     except UsageError as error:
         # there is one line, and the option names the key
         message = str(error).replace(f"{option}:1: {key}", option, 1).replace(f"{option}:1", option)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import fields
 from importlib.resources import files
@@ -100,18 +101,18 @@ def test_the_command_line_shows_both_decisions_and_both_maps(tidied, tmp_path):
     assert same.exit_code == 0
     assert "all decisions are the same, byte for byte" in same.output
     both = tmp_path / "both.mcap"
-    other = run("plan", "--redo", tidied, "--room", "0", "-o", both)
+    other = run("plan", "--redo", tidied, "--set", "room=0", "-o", both)
     assert other.exit_code == 1
     assert "redone with room 0.4 -> 0.0" in other.output
     assert "decision 0 at 0.000 s differs" in other.output
     assert other.output.count("robustness 0.") >= 2
-    document = json.loads(run("plan", "--redo", tidied, "--room", "0", "--json").output)
+    document = json.loads(run("plan", "--redo", tidied, "--set", "room=0", "--json").output)
     assert document["recorded"]["target"]["robustness"] < document["redone"]["target"]["robustness"]
 
 
 def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     both, page = tmp_path / "both.mcap", tmp_path / "both.html"
-    ran = run("plan", "--redo", tidied, "--room", "0", "-o", both)
+    ran = run("plan", "--redo", tidied, "--set", "room=0", "-o", both)
     assert ran.exit_code == 1, ran.output
     source = open_source(both)
     topics = {
@@ -140,17 +141,20 @@ def test_a_copy_with_both_decisions_keeps_the_units_of_lengths_and_signals(tmp_p
 
 def test_settings_come_from_a_file_and_options_have_precedence(tidied, tmp_path):
     (tmp_path / "careful.yaml").write_text("room: 0.2\nattempts: 1\nyaws: [0, 45deg]\n")
-    found = run("plan", "--redo", tidied, "--settings", tmp_path / "careful.yaml", "--room", "0.1")
+    found = run("plan", "--redo", tidied, "--settings", tmp_path / "careful.yaml", "--set", "room=0.1")
     assert "redone with room 0.4 -> 0.1, attempts 6 -> 1:" in found.output.replace("\n", ":")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--room", "-1"), "--room: expected a number of 0 or more; got -1"),
-        (("--attempts", "0"), "--attempts: expected a whole number of at least 1; got 0"),
-        (("--yaws", "0,3x"), "3x"),
-        (("--skill", "throw"), "--skill: expected push (the path matters)"),
+        (("--room", "0.1"), "no option --room; write --set room=VALUE"),
+        (("--set", "rom=0.1"), "--set 'rom=0.1': give KEY=VALUE; did you mean 'room'?"),
+        (("--set", "room"), "--set 'room': give KEY=VALUE"),
+        (("--set", "room=-1"), "--set room: expected a number of 0 or more; got -1"),
+        (("--set", "attempts=0"), "--set attempts: expected a whole number of at least 1; got 0"),
+        (("--set", "yaws=0,3x"), "3x"),
+        (("--set", "skill=throw"), "--set skill: expected push (the path matters)"),
         (("push",), "--redo takes no scenario"),
     ],
 )
@@ -161,7 +165,7 @@ def test_a_mistake_on_the_command_line_is_named(tidied, arguments, message):
 
 
 def test_options_of_a_run_come_after_its_scenario():
-    found = run("plan", "--room", "0.1", "push", "-o", "run.mcap")
+    found = run("plan", "--set", "room=0.1", "push", "-o", "run.mcap")
     assert found.exit_code == 2
     assert "after its scenario" in found.output
 
@@ -174,10 +178,10 @@ def test_every_setting_is_in_the_schema_in_the_help_and_on_the_page():
     # it follows from the skill
     own -= {"keeps_yaw"}
     assert schema["properties"].keys() == own | {"area", "cell_size"}
-    helped = run("plan", "push", "--help").output
+    helped = re.findall(r"\w+", run("plan", "push", "--help").output)
     page = (ROOT / "docs/planning.md").read_text()
     for key in schema["properties"]:
-        assert f"--{key.replace('_', '-')} " in helped
+        assert key in helped
         assert f"`{key}`" in page
 
 
