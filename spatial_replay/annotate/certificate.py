@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay import __version__
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.logs.messages import Messages
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.format import format_specification
@@ -30,6 +30,8 @@ class SampleHash:
         self._times = hashlib.sha256()
         self._objects: dict[str, list[hashlib._Hash]] = {}
         self._signals: dict[str, hashlib._Hash] = {}
+        self._reports: dict[str, hashlib._Hash] = {}
+        self._lasting: set[str] = set()
 
     def add(self, trace: Trace) -> None:
         """Take in the next samples."""
@@ -53,6 +55,12 @@ class SampleHash:
                 _floats(trace.uncertainty[observations]),
                 classes[trace.class_code[observations]],
             )
+            if name in trace.lasting and (rows >= 0).any():
+                self._lasting.add(name)
+            if trace.reported_ns is not None:
+                self._add_reports(
+                    name, trace.times_ns, trace.reported_ns[:, trace.names.index(name)], rows >= 0
+                )
             hashes = self._objects.setdefault(name, [hashlib.sha256() for _ in columns])
             for hashed, column in zip(hashes, columns, strict=True):
                 _take_in(hashed, column)
@@ -62,6 +70,18 @@ class SampleHash:
                 hashed = self._signals.setdefault(name, hashlib.sha256())
                 pairs = np.rec.fromarrays([trace.times_ns[known], values[known]])
                 _take_in(hashed, pairs.tobytes())
+        for name, reported_ns in trace.signals_reported_ns.items():
+            is_known = ~np.isnan(trace.signals[name])
+            self._add_reports(f"signal {name}", trace.times_ns, reported_ns, is_known)
+
+    def _add_reports(self, what: str, times_ns: Integers, reported_ns: Integers, is_known: Booleans) -> None:
+        """Take in the times of reports that are not those of samples: of many logs, none."""
+        earlier = np.flatnonzero(is_known & (reported_ns != times_ns))
+        if len(earlier):
+            hashed = self._reports.setdefault(what, hashlib.sha256())
+            _take_in(
+                hashed, np.column_stack([times_ns[earlier], reported_ns[earlier]]).astype("<i8").tobytes()
+            )
 
     def hexdigest(self) -> str:
         total = hashlib.sha256(self._times.digest())
@@ -71,6 +91,10 @@ class SampleHash:
                 total.update(hashed.digest())
         for name in sorted(self._signals):
             total.update(_text(name) + self._signals[name].digest())
+        for what in sorted(self._reports):
+            total.update(_text(what) + self._reports[what].digest())
+        for name in sorted(self._lasting):
+            total.update(_text(f"lasting {name}"))
         return total.hexdigest()
 
 

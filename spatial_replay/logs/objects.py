@@ -49,17 +49,19 @@ class SlotLayout:
     Attributes:
         time: slot of the sample's time.
         names, classes: of the J objects.
+        lasting: those among them that stand where they are until they are reported again.
         part_counts: (J,) parts of each object.
         vertex_counts: (P,) vertices of each part.
         coordinates: (2 V,) slots of x, y, x, y …
         radius: (P,) slots.
-        yaw, bottom, top, uncertainty: (J,) slots.
-        signals: slot of each signal's value.
+        yaw, bottom, top, uncertainty, reported: (J,) slots.
+        signals, signals_reported: slots of each signal's value, and of the time of its report.
     """
 
     time: int
     names: tuple[str, ...]
     classes: tuple[str | None, ...]
+    lasting: frozenset[str]
     part_counts: Integers
     vertex_counts: Integers
     coordinates: Integers
@@ -68,7 +70,9 @@ class SlotLayout:
     bottom: Integers
     top: Integers
     uncertainty: Integers
+    reported: Integers
     signals: dict[str, int]
+    signals_reported: dict[str, int]
 
 
 def parsed(payload: bytes) -> ObjectStates:
@@ -102,7 +106,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
         return next(slots) if present else otherwise
 
     time = slot(message.HasField("time_ns"), UNKNOWN)
-    names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty")
+    names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty", "reported")
     columns: dict[str, list[int]] = {name: [] for name in names}
     for state in message.objects:
         # in the order of the fields
@@ -114,7 +118,12 @@ def layout_of(message: ObjectStates) -> SlotLayout:
         columns["bottom"].append(slot(state.height.HasField("bottom"), absent))
         columns["top"].append(slot(state.height.HasField("top"), absent))
         columns["uncertainty"].append(slot(state.HasField("uncertainty"), ZERO))
-    signals = {signal.name: slot(signal.HasField("value"), ZERO) for signal in message.signals}
+        columns["reported"].append(slot(state.HasField("reported_ns"), UNKNOWN))
+    signals: dict[str, int] = {}
+    signals_reported: dict[str, int] = {}
+    for signal in message.signals:
+        signals[signal.name] = slot(signal.HasField("value"), ZERO)
+        signals_reported[signal.name] = slot(signal.HasField("reported_ns"), UNKNOWN)
     if "" in signals or len(signals) < len(message.signals):
         raise WrongMessageError("a signal has no name, or one that another signal has")
     counts = (len(part.coordinates) // 2 for state in message.objects for part in state.parts)
@@ -122,9 +131,11 @@ def layout_of(message: ObjectStates) -> SlotLayout:
         time=time,
         names=tuple(state.name for state in message.objects),
         classes=tuple(s.class_name if s.HasField("class_name") else None for s in message.objects),
+        lasting=frozenset(state.name for state in message.objects if state.lasting),
         part_counts=np.array([len(state.parts) for state in message.objects], np.int64),
         vertex_counts=np.fromiter(counts, np.int64),
         signals=signals,
+        signals_reported=signals_reported,
         **{name: np.array(slots_of, np.int64) for name, slots_of in columns.items()},
     )
 
@@ -168,7 +179,8 @@ def decode_objects(
     """
     faults: dict[int, str] = {}
     groups = _groups(payloads, faults)
-    faults = _wrong_times(groups, times_ns) | _signals_given_twice(groups) | faults
+    faults = _late_reports(groups, times_ns) | _signals_given_twice(groups) | faults
+    faults = _wrong_times(groups, times_ns) | faults
     trace, wrong = trace_from_observations(_observations(groups, times_ns), concave=concave)
     faults = wrong | faults
     if faults.keys() - wrong.keys():
@@ -280,11 +292,29 @@ def _wrong_times(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str]
     has_time = np.zeros(len(times_ns), np.bool_)
     for group in groups:
         if group.layout.time != UNKNOWN:
-            stated[group.samples] = np.ascontiguousarray(group.numbers[:, group.layout.time]).view(np.int64)
+            stated[group.samples] = _whole(group, group.layout.time)
             has_time[group.samples] = True
     wrong = np.flatnonzero(has_time & (stated != times_ns)).tolist()
     faults = {index: f"time_ns is {stated[index]}, not the log time of the message" for index in wrong}
     return faults | dict.fromkeys(np.flatnonzero(~has_time).tolist(), "the message has no time_ns")
+
+
+def _late_reports(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str]:
+    faults: dict[int, str] = {}
+    for group in groups:
+        slots = [*zip(group.layout.names, group.layout.reported.tolist(), strict=True)]
+        for name, slot in (*slots, *group.layout.signals_reported.items()):
+            if slot != UNKNOWN:
+                reported_ns = _whole(group, slot)
+                is_wrong = (reported_ns < 0) | (reported_ns > times_ns[group.samples])
+                what = f"reported_ns of {name!r} is not a time up to that of the sample"
+                faults |= dict.fromkeys(group.samples[is_wrong].tolist(), what)
+    return faults
+
+
+def _whole(group: _Group, slot: int) -> Integers:
+    """Return (K,) what is in a slot of whole numbers."""
+    return np.ascontiguousarray(group.numbers[:, slot]).view(np.int64)
 
 
 def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
@@ -339,7 +369,31 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
         ),
         invalid=np.concatenate([np.empty(0, np.bool_), *map(_invalid, groups)]),
         signals={name: _signal(name, groups, len(times_ns)) for name in signals},
+        reported_ns=_reported(groups, times_ns),
+        signals_reported_ns=_signals_reported(groups, times_ns),
+        lasting=frozenset().union(*(group.layout.lasting for group in groups)),
     )
+
+
+def _reported(groups: Sequence[_Group], times_ns: Integers) -> Integers | None:
+    """Return when each observation was reported, (R,); None where all have the times of their samples."""
+    if all((group.layout.reported == UNKNOWN).all() for group in groups):
+        return None
+    columns = [np.empty(0, np.int64)]
+    for group in groups:
+        slots = group.layout.reported
+        stated = np.ascontiguousarray(group.numbers[:, slots]).view(np.int64)
+        columns.append(np.where(slots == UNKNOWN, times_ns[group.samples, None], stated).ravel())
+    return np.concatenate(columns)
+
+
+def _signals_reported(groups: Sequence[_Group], times_ns: Integers) -> dict[str, Integers]:
+    reported: dict[str, Integers] = {}
+    for group in groups:
+        for name, slot in group.layout.signals_reported.items():
+            if slot != UNKNOWN:
+                reported.setdefault(name, times_ns.copy())[group.samples] = _whole(group, slot)
+    return reported
 
 
 def _invalid(group: _Group) -> NDArray[np.bool_]:
@@ -373,7 +427,7 @@ def encode_objects(trace: Trace) -> list[bytes]:
     times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
     objects = _object_pieces(trace)
     begins = starts_from_counts(np.count_nonzero(trace.rows != ABSENT, axis=1)).tolist()
-    columns = [_signal_pieces(name, values) for name, values in trace.signals.items()]
+    columns = [_signal_pieces(trace, name) for name in trace.signals]
     signals = list(zip(*columns, strict=True))
     return [
         b"".join((time, *objects[begins[index] : begins[index + 1]], *(signals[index] if signals else ())))
@@ -388,20 +442,36 @@ def _object_pieces(trace: Trace) -> list[bytes]:
     rows = np.where(marked < 0, -2 - marked, marked)
     name = np.nonzero(present)[1]
     pieces = [b""] * len(rows)
-    for places in equal_places(combined([name, marked < 0, _row_layout(trace)[rows]], len(rows))):
+    reported_ns = np.zeros(0, np.int64) if trace.reported_ns is None else trace.reported_ns[present]
+    is_earlier = np.zeros(len(rows), np.bool_)
+    if trace.reported_ns is not None:
+        is_earlier = reported_ns != trace.times_ns[np.nonzero(present)[0]]
+    layouts = combined([name, marked < 0, is_earlier, _row_layout(trace)[rows]], len(rows))
+    for places in equal_places(layouts):
         first = int(places[0])
         message = _message(trace, int(name[first]), int(rows[first]), unreadable=bool(marked[first] < 0))
-        encoded = _pieces(message, _numbers(trace, message, rows[places]))
+        numbers = _numbers(trace, message, rows[places])
+        if is_earlier[first]:
+            message.objects[0].reported_ns = 0
+            numbers = np.column_stack([numbers, reported_ns[places].view(np.float64)])
+        encoded = _pieces(message, numbers)
         for place, piece in zip(places.tolist(), encoded, strict=True):
             pieces[place] = piece
     return pieces
 
 
-def _signal_pieces(name: str, values: Floats) -> list[bytes]:
+def _signal_pieces(trace: Trace, name: str) -> list[bytes]:
     """Encode a signal in every sample: nothing where its value is not known."""
-    message = ObjectStates()
-    message.signals.add(name=name, value=0.0)
+    message, values = ObjectStates(), trace.signals[name]
+    signal = message.signals.add(name=name, value=0.0)
     pieces = _pieces(message, values[:, None])
+    reported_ns = trace.signals_reported_ns.get(name, trace.times_ns)
+    earlier = np.flatnonzero(reported_ns != trace.times_ns)
+    if len(earlier):
+        signal.reported_ns = 0
+        numbers = np.column_stack([values[earlier], reported_ns[earlier].view(np.float64)])
+        for place, piece in zip(earlier.tolist(), _pieces(message, numbers), strict=True):
+            pieces[place] = piece
     for place in np.flatnonzero(np.isnan(values)).tolist():
         pieces[place] = b""
     return pieces
@@ -434,6 +504,7 @@ def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectSt
     shapes = trace.footprints
     message = ObjectStates()
     state = message.objects.add(name=trace.names[name], uncertainty=0.0)
+    state.lasting = not unreadable and state.name in trace.lasting
     class_name = trace.classes[trace.class_code[row]]
     if class_name is not None:
         state.class_name = class_name

@@ -65,40 +65,60 @@ class Events:
         joined = concatenated([before, self])
         return select(joined, np.argsort(joined.name, kind="stable"))
 
-    def state(self, times_ns: Integers, max_age_ns: int) -> tuple[Integers, Integers, Integers]:
-        """Return the state of all N objects at T times.
-
-        Returns:
-            distinct names (N,); rows (T, N), each a row, `ABSENT` or `STALE`; class codes (T, N).
-        """
+    def state(self, times_ns: Integers, max_age_ns: int) -> States:
+        """Return the state of all N objects at T times."""
         starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
         if len(times_ns) == 1 and len(starts):
             # all objects at once, as there are more of them than times
             at = starts + np.add.reduceat(self.time_ns <= times_ns, starts, dtype=np.int64) - 1
-            row, code = self._standing(at, starts, times_ns, max_age_ns)
-            return self.name[starts], row[None], code[None]
+            columns = self._standing(at, starts, times_ns, max_age_ns)
+            return States(self.name[starts], *(column[None] for column in columns))
         ends = np.append(starts[1:], len(self.name))[: len(starts)]
-        rows = np.full((len(times_ns), len(starts)), ABSENT, np.int64)
-        classes = np.zeros((len(times_ns), len(starts)), np.int64)
+        states = np.zeros((3, len(times_ns), len(starts)), np.int64)
         for column, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
             at = np.searchsorted(self.time_ns[start:end], times_ns, "right") - 1 + start
-            rows[:, column], classes[:, column] = self._standing(at, start, times_ns, max_age_ns)
-        return self.name[starts], rows, classes
+            states[:, :, column] = self._standing(at, start, times_ns, max_age_ns)
+        return States(self.name[starts], *states)
 
     def _standing(
         self, at: Integers, starts: Integers | int, times_ns: Integers, max_age_ns: int
-    ) -> tuple[Integers, Integers]:
-        """Return rows and class codes by the events `at` some times; those before `starts` are of others."""
+    ) -> tuple[Integers, Integers, Integers]:
+        """Return rows, class codes and times of reports by the events `at` some times.
+
+        Those before `starts` are of others.
+        """
         has_appeared = at >= starts
         at = np.maximum(at, starts)
         row = self.row[at]
         is_old = times_ns - self.time_ns[at] > max_age_ns
         is_absent = ~has_appeared | (row == LEFT) | (times_ns >= self.expires_ns[at])
-        return np.where(is_absent, ABSENT, np.where(is_old, STALE, row)), self.class_code[at]
+        rows = np.where(is_absent, ABSENT, np.where(is_old, STALE, row))
+        return rows, self.class_code[at], self.time_ns[at]
+
+
+class States(NamedTuple):
+    """The states of N objects at T times.
+
+    Attributes:
+        names: (N,), distinct.
+        rows: (T, N), each a row, `ABSENT` or `STALE`.
+        classes: (T, N), codes.
+        reported_ns: (T, N), of the report that counts then.
+    """
+
+    names: Integers
+    rows: Integers
+    classes: Integers
+    reported_ns: Integers
 
 
 def events_from_messages(
-    detections: Detections, times_ns: Integers, rows: Integers, *, alive: Events, is_complete: bool
+    detections: Detections,
+    times_ns: Integers,
+    rows: Integers,
+    *,
+    alive: Events,
+    is_complete: bool,
 ) -> Events:
     """Return the events of messages in order: detections, deletions, and objects that lists leave out.
 
@@ -349,12 +369,12 @@ class Tracker:
         """
         if not len(times_ns):
             return Trace.empty()
-        codes, rows, classes = self._states(times_ns, newest_ns)
+        codes, rows, classes, reported_ns = self._states(times_ns, newest_ns)
         self._store_added()
         names = [self.names.by_code[code] for code in codes.tolist()]
         appears = (rows != ABSENT).any(axis=0).tolist()
         order = sorted((i for i in range(len(names)) if appears[i]), key=names.__getitem__)
-        rows, classes = rows[:, order], classes[:, order]
+        rows, classes, reported_ns = rows[:, order], classes[:, order], reported_ns[:, order]
         stored, is_stale = self._rows, rows == STALE
         # unknown rows are numbered downwards from -2
         is_valid = np.append(stored.is_valid, False)[np.where(rows >= 0, rows, -1)]
@@ -371,6 +391,7 @@ class Tracker:
         rank = np.array([places[name] for name in by_code], np.int64)
         used, numbered = renumbered(numbered)
         stored = select(stored, used)
+        signals, signals_reported_ns = self._signal_columns(times_ns, newest_ns)
         return Trace(
             times_ns=times_ns,
             names=tuple(names[i] for i in order),
@@ -380,8 +401,17 @@ class Tracker:
             uncertainty=stored.uncertainty,
             class_code=rank[stored.class_code] if len(rank) else stored.class_code,
             classes=classes_of,
-            signals=self._signal_columns(times_ns, newest_ns),
+            signals=signals,
+            reported_ns=None if (reported_ns == times_ns[:, None])[rows >= 0].all() else reported_ns,
+            signals_reported_ns=signals_reported_ns,
+            lasting=frozenset(names[i] for i in order if self._is_lasting(int(codes[i]))),
         )
+
+    def _is_lasting(self, name: int) -> bool:
+        """Return whether an object stands where it is until it is reported again."""
+        planned = self.readers[self._topic_of_name[name]].planned
+        # frames are placed anew in every sample
+        return planned.is_lasting and not planned.is_static
 
     def forget(self, upto_ns: int) -> None:
         """Drop what no later sample needs: all but the last observation of each object and signal."""
@@ -448,18 +478,26 @@ class Tracker:
             number[again] = self._add(ObservationRows.blank(detections.class_code[again]))
         before = self._events[reader.name]
         alive = before.last()
-        events = events_from_messages(detections, times_ns, number, alive=alive, is_complete=is_complete)
+        events = events_from_messages(
+            detections,
+            times_ns,
+            number,
+            alive=alive,
+            is_complete=is_complete,
+        )
         self._events[reader.name] = events.after(before)
 
-    def _place_following(self, topic: str, times_ns: Integers, rows: Integers) -> None:
+    def _place_following(self, topic: str, times_ns: Integers, states: States) -> None:
         """Replace the rows (T, N) of objects that stay in moving frames by those of each time."""
         if not self._following:
             return
-        for column in rows.T:
-            for row in np.unique(column).tolist():
+        for rows, reported_ns in zip(states.rows.T, states.reported_ns.T, strict=True):
+            for row in np.unique(rows).tolist():
                 if row in self._following:
-                    where = np.flatnonzero(column == row)
-                    column[where] = self._placed(topic, self._following[row], times_ns[where])
+                    where = np.flatnonzero(rows == row)
+                    rows[where] = self._placed(topic, self._following[row], times_ns[where])
+                    # a transform places it anew, as a report does
+                    reported_ns[where] = times_ns[where]
 
     def _placed(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
         """Return the rows of an object that stays in a frame, where that is at some times."""
@@ -568,23 +606,27 @@ class Tracker:
         next_ns = np.append(known, following)[after]
         return np.asarray((after > 0) & (next_ns - before_ns > most_ns) & (times_ns > before_ns))
 
-    def _states(self, times_ns: Integers, newest_ns: int) -> tuple[Integers, Integers, Integers]:
+    def _states(self, times_ns: Integers, newest_ns: int) -> States:
         """Return the states of the objects of all topics, as `Events.state` does."""
         states = []
         for topic, events in self._events.items():
             state = events.state(times_ns, self.readers[topic].planned.max_age_ns)
-            rows, in_gap = state[1], self._in_gap(topic, times_ns, newest_ns)
+            rows, in_gap = state.rows, self._in_gap(topic, times_ns, newest_ns)
             rows[in_gap[:, None] & (rows >= 0)] = STALE
             for column in np.flatnonzero((rows == STALE).any(axis=0)).tolist():
-                name = self.names.by_code[int(state[0][column])]
+                name = self.names.by_code[int(state.names[column])]
                 self.remarks.count_stale(topic, name, times_ns, rows[:, column] == STALE, in_gap)
-            self._place_following(topic, times_ns, state[1])
+            self._place_following(topic, times_ns, state)
             states.append(state)
-        codes, states_of, classes = zip(*states, strict=True)
-        return np.concatenate(codes), np.concatenate(states_of, axis=1), np.concatenate(classes, axis=1)
+        names, *columns = zip(*states, strict=True)
+        return States(np.concatenate(names), *(np.concatenate(column, axis=1) for column in columns))
 
-    def _signal_columns(self, times_ns: Integers, newest_ns: int) -> dict[str, Floats]:
+    def _signal_columns(
+        self, times_ns: Integers, newest_ns: int
+    ) -> tuple[dict[str, Floats], dict[str, Integers]]:
+        """Return the signals, and when they were reported where that is not the sample's time."""
         columns: dict[str, Floats] = {}
+        reported: dict[str, Integers] = {}
         unknown: list[tuple[str, str, Booleans, Booleans]] = []
         for (topic, index), (reported_ns, values) in self._signals.items():
             planned = self.readers[topic].planned
@@ -597,11 +639,17 @@ class Tracker:
             name = planned.mapping.signals[index].name
             unknown.append((topic, name, (at >= 0) & (is_old | in_gap), in_gap))
             # several topics may report one signal: the first that has a value counts
-            first = columns.get(name, column)
+            first = columns.get(name, np.full(len(times_ns), np.nan))
+            reported[name] = np.where(np.isnan(first), reported_ns[at], reported.get(name, times_ns))
             columns[name] = np.where(np.isnan(first), column, first)
         for topic, name, is_stale, in_gap in unknown:
             self.remarks.count_stale(topic, name, times_ns, is_stale & np.isnan(columns[name]), in_gap)
-        return columns
+        earlier = {
+            name: times
+            for name, times in reported.items()
+            if (times != times_ns)[~np.isnan(columns[name])].any()
+        }
+        return columns, earlier
 
 
 class _Counts(dict[Any, tuple[int, int]]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,9 @@ class Observations:
         shapes: the R footprints, bottom and top NaN where there is no height.
         invalid: (R,) bool, where the report itself marks a number as unknown.
         signals: numeric signals by name, each (T,) float64, NaN where unknown.
+        reported_ns: (R,) int64, when each was reported; None where all have the times of their samples.
+        signals_reported_ns: the same of signals, as in a `Trace`.
+        lasting: the objects that stand where they are until they are reported again.
     """
 
     times_ns: Integers
@@ -50,6 +53,9 @@ class Observations:
     shapes: FootprintBatch
     invalid: Booleans
     signals: Mapping[str, Floats]
+    reported_ns: Integers | None = None
+    signals_reported_ns: Mapping[str, Integers] = field(default_factory=dict)
+    lasting: frozenset[str] = frozenset()
 
 
 def trace_from_observations(observed: Observations, *, concave: Concave) -> tuple[Trace, dict[int, str]]:
@@ -71,6 +77,10 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     rows = np.full((len(observed.times_ns), len(observed.names)), ABSENT, np.int64)
     number = np.arange(len(observed.name), dtype=np.int64)
     rows[observed.sample, observed.name] = np.where(readable, number, -2 - number)
+    reported_ns = None
+    if observed.reported_ns is not None:
+        reported_ns = np.repeat(observed.times_ns[:, None], len(observed.names), axis=1)
+        reported_ns[observed.sample, observed.name] = observed.reported_ns
     trace = Trace(
         times_ns=observed.times_ns,
         names=tuple(observed.names),
@@ -81,6 +91,9 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
         class_code=observed.class_code,
         classes=observed.classes,
         signals=observed.signals,
+        reported_ns=reported_ns,
+        signals_reported_ns=observed.signals_reported_ns,
+        lasting=observed.lasting,
     )
     if faults:
         is_sound = np.ones(len(trace), np.bool_)
@@ -125,6 +138,7 @@ def _ordered(observed: Observations) -> Observations:
         uncertainty=observed.uncertainty[by_key],
         shapes=observed.shapes.select(by_key),
         invalid=observed.invalid[by_key],
+        reported_ns=None if observed.reported_ns is None else observed.reported_ns[by_key],
     )
 
 

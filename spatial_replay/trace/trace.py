@@ -68,6 +68,7 @@ _EXAMPLES = MappingProxyType(
         "objects": "{'cup': Footprint.disc(0, 0, 0.1)}",
         "signals": "{'battery': 0.8}",
         "unknown": "{'cup': None}",
+        "reported_ns": "{'cup': 5_000_000_000}",
     }
 )
 
@@ -97,6 +98,9 @@ class Sample:
         unknown: the objects that are there, but not known where: their classes by name, None without one.
             Unlike an object that is left out, they stay members of open groups, and make atoms over these
             unknown.
+        reported_ns: when objects and signals were reported, by name, at most `time_ns`; the sample's own time
+            for others. An object and a signal of the same name share a time.
+        lasting: the objects that stand where they are until they are reported again, such as a latched map.
 
     Raises:
         TraceError: an invalid time, name or value.
@@ -106,6 +110,8 @@ class Sample:
     objects: Mapping[str, TrackedObject] = field(default_factory=dict)
     signals: Mapping[str, float] = field(default_factory=dict)
     unknown: Mapping[str, str | None] = field(default_factory=dict)
+    reported_ns: Mapping[str, int] = field(default_factory=dict)
+    lasting: frozenset[str] = frozenset()
 
     if TYPE_CHECKING:
         # what is given may be less than what is there then
@@ -115,12 +121,15 @@ class Sample:
             objects: Mapping[str, TrackedObject | Footprint] = ...,
             signals: Mapping[str, float | str] = ...,
             unknown: Mapping[str, str | None] = ...,
+            reported_ns: Mapping[str, int] = ...,
+            lasting: Collection[str] = ...,
         ) -> None: ...
 
     def __post_init__(self) -> None:
         if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, (int, np.integer)):
             raise TraceError(f"time_ns is {self.time_ns!r}; give integer nanoseconds")
-        for what, named in (("objects", self.objects), ("signals", self.signals), ("unknown", self.unknown)):
+        for what in _EXAMPLES:
+            named = getattr(self, what)
             if not isinstance(named, Mapping):
                 raise TraceError(
                     f"{what} is {shortened(named)}; give a dict by name, as in {_EXAMPLES[what]}"
@@ -150,10 +159,29 @@ class Sample:
             # a class may be empty, as that of a tracked object
             if class_name not in (None, ""):
                 _require_name(class_name, "a class")
+        for name, reported_ns in self.reported_ns.items():
+            if name not in objects and name not in signals and name not in self.unknown:
+                raise TraceError(f"reported_ns has {name!r}, which the sample does not have; leave it out")
+            self._check_reported(name, reported_ns)
         object.__setattr__(self, "time_ns", int(self.time_ns))
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
+        # equal samples are equal however their own time is written
+        others = {
+            name: reported_ns
+            for name, reported_ns in self.reported_ns.items()
+            if reported_ns != self.time_ns and name not in self.unknown
+        }
+        object.__setattr__(self, "reported_ns", MappingProxyType(others))
+        object.__setattr__(self, "lasting", frozenset(self.lasting) & objects.keys())
+
+    def _check_reported(self, name: str, reported_ns: object) -> None:
+        if isinstance(reported_ns, bool) or not isinstance(reported_ns, (int, np.integer)):
+            raise TraceError(f"reported_ns of {name!r} is {shortened(reported_ns)}; give integer nanoseconds")
+        if not 0 <= reported_ns <= self.time_ns:
+            what = f"reported_ns of {name!r} is {reported_ns}"
+            raise TraceError(f"{what}; give a time from 0 to that of the sample, {self.time_ns} ns")
 
 
 def require_sample(value: object) -> None:
@@ -314,6 +342,11 @@ class Trace(Displayed):
         class_code: (R,) int64, index into `classes`.
         classes: class names; None for objects without one.
         signals: numeric signals by name, each (T,) float64, NaN where unknown.
+        reported_ns: (T, N) int64, when the observation that each sample shows was reported; None where every
+            report has the time of its sample.
+        signals_reported_ns: the same of signals by name, each (T,) int64; without those whose reports all
+            have the times of samples.
+        lasting: the objects that stand where they are until they are reported again.
         faults: messages about samples lost or left out while reading, each with its place.
         remarks: other messages about the log, where nothing was lost.
         units: those that are declared, of signals by their names, of lengths by "".
@@ -332,6 +365,9 @@ class Trace(Displayed):
     class_code: Integers
     classes: tuple[str | None, ...]
     signals: Mapping[str, Floats] = field(default_factory=dict)
+    reported_ns: Integers | None = None
+    signals_reported_ns: Mapping[str, Integers] = field(default_factory=dict)
+    lasting: frozenset[str] = frozenset()
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
@@ -344,6 +380,10 @@ class Trace(Displayed):
             object.__setattr__(self, name, read_only_floats(getattr(self, name)))
         signals = {name: read_only_floats(self.signals[name]) for name in sorted(self.signals)}
         object.__setattr__(self, "signals", MappingProxyType(signals))
+        if self.reported_ns is not None:
+            object.__setattr__(self, "reported_ns", read_only_integers(self.reported_ns))
+        reported = {name: read_only_integers(times) for name, times in self.signals_reported_ns.items()}
+        object.__setattr__(self, "signals_reported_ns", MappingProxyType(reported))
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         _check_shapes(self)
         _check_times(self.times_ns)
@@ -368,8 +408,10 @@ class Trace(Displayed):
     @property
     def nbytes(self) -> int:
         """The size of its arrays in bytes, without the cache."""
-        columns = (self.times_ns, self.rows, self.yaw, self.uncertainty, self.class_code)
-        return self.footprints.nbytes + sum(each.nbytes for each in (*columns, *self.signals.values()))
+        columns = [self.times_ns, self.rows, self.yaw, self.uncertainty, self.class_code]
+        columns += [*self.signals.values(), *self.signals_reported_ns.values()]
+        columns += [] if self.reported_ns is None else [self.reported_ns]
+        return self.footprints.nbytes + sum(column.nbytes for column in columns)
 
     @property
     def unreadable_count(self) -> int:
@@ -447,6 +489,8 @@ class Trace(Displayed):
             class_code=np.array([classes.index(name) for name in named], np.int64),
             classes=classes,
             signals={name: np.array(values, np.float64) for name, values in columns.items()},
+            **_reported_of_samples(listed, names, signals),
+            lasting=frozenset().union(*(sample.lasting for sample in listed)),
             units=checked_units(units),
         )
 
@@ -463,7 +507,17 @@ class Trace(Displayed):
             }
             values = ((name, float(column[index])) for name, column in self.signals.items())
             known = {name: value for name, value in values if value == value}
-            yield Sample(time_ns, objects, known, unknown)
+            reported_ns = self._reported_in(index, objects, known)
+            yield Sample(time_ns, objects, known, unknown, reported_ns, self.lasting)
+
+    def _reported_in(self, index: int, objects: Collection[str], signals: Collection[str]) -> dict[str, int]:
+        reported_ns = {
+            name: int(times[index]) for name, times in self.signals_reported_ns.items() if name in signals
+        }
+        if self.reported_ns is not None:
+            times = zip(self.names, self.reported_ns[index].tolist(), strict=True)
+            reported_ns |= {name: time_ns for name, time_ns in times if name in objects}
+        return reported_ns
 
     def observation(self, row: int) -> TrackedObject:
         """Return the object that row `row` (at least 0) reports."""
@@ -497,6 +551,8 @@ class Trace(Displayed):
             uncertainty=self.uncertainty[used],
             class_code=self.class_code[used],
             signals={name: values[samples] for name, values in self.signals.items()},
+            reported_ns=None if self.reported_ns is None else self.reported_ns[samples],
+            signals_reported_ns={name: times[samples] for name, times in self.signals_reported_ns.items()},
         )
 
     def compact(self) -> Trace:
@@ -511,11 +567,31 @@ class Trace(Displayed):
             names=tuple(name for name, used in zip(self.names, observed.tolist(), strict=True) if used),
             rows=self.rows[:, observed],
             signals={name: values for name, values in self.signals.items() if not np.isnan(values).all()},
+            **self._own_reported(observed),
         ).take(np.arange(len(self), dtype=np.int64))
         codes, inverse = np.unique(whole.class_code, return_inverse=True)
         classes = class_order(self.classes[code] for code in codes.tolist())
         order = np.array([classes.index(self.classes[code]) for code in codes.tolist()], np.int64)
         return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
+
+    def _own_reported(self, observed: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the columns of the observed objects and of signals, the sample's time where nothing is."""
+        own_ns = self.times_ns[:, None]
+        reported_ns = None
+        if self.reported_ns is not None:
+            reported_ns = np.where(self.rows >= 0, self.reported_ns, own_ns)[:, observed]
+        signals = {
+            name: np.where(np.isnan(self.signals[name]), self.times_ns, times)
+            for name, times in self.signals_reported_ns.items()
+        }
+        return {
+            "reported_ns": None if reported_ns is None or (reported_ns == own_ns).all() else reported_ns,
+            "signals_reported_ns": {
+                name: times for name, times in signals.items() if (times != self.times_ns).any()
+            },
+            "lasting": self.lasting
+            & {name for name, rows in zip(self.names, self.rows.T, strict=True) if (rows >= 0).any()},
+        }
 
     @classmethod
     def concatenate(cls, traces: Sequence[Trace]) -> Trace:
@@ -530,12 +606,18 @@ class Trace(Displayed):
         code = {name: index for index, name in enumerate(classes)}
         signals = sorted({name for trace in traces for name in trace.signals})
         rows = np.full((sum(map(len, traces)), len(names)), ABSENT, np.int64)
+        reported_ns = None
+        if any(trace.reported_ns is not None for trace in traces):
+            reported_ns = np.zeros(rows.shape, np.int64)
         sample = row = 0
         for trace in traces:
             # an unreadable row is stored as -2 - row, so its shift is negative
             shift = np.where(trace.rows >= 0, row, np.where(trace.rows == ABSENT, 0, -row))
             columns = [number[name] for name in trace.names]
             rows[sample : sample + len(trace), columns] = trace.rows + shift
+            if reported_ns is not None:
+                own_ns = trace.times_ns[:, None] if trace.reported_ns is None else trace.reported_ns
+                reported_ns[sample : sample + len(trace), columns] = own_ns
             sample += len(trace)
             row += len(trace.footprints)
         unknown = {len(trace): np.full(len(trace), np.nan) for trace in traces}
@@ -553,10 +635,34 @@ class Trace(Displayed):
                 name: np.concatenate([trace.signals.get(name, unknown[len(trace)]) for trace in traces])
                 for name in signals
             },
+            reported_ns=reported_ns,
+            signals_reported_ns={
+                name: np.concatenate([t.signals_reported_ns.get(name, t.times_ns) for t in traces])
+                for name in sorted({name for trace in traces for name in trace.signals_reported_ns})
+            },
+            lasting=frozenset().union(*(trace.lasting for trace in traces)),
             faults=tuple(fault for trace in traces for fault in trace.faults),
             remarks=tuple(remark for trace in traces for remark in trace.remarks),
             units={name: unit for trace in traces for name, unit in trace.units.items()},
         )
+
+
+def _reported_of_samples(
+    samples: Sequence[Sample], names: Sequence[str], signals: Sequence[str]
+) -> dict[str, Any]:
+    """Return the columns `reported_ns` and `signals_reported_ns` of some samples."""
+    if not any(sample.reported_ns for sample in samples):
+        return {}
+    times_ns = np.array([sample.time_ns for sample in samples], np.int64)
+    columns = {name: times_ns.copy() for sample in samples for name in sample.reported_ns}
+    for index, sample in enumerate(samples):
+        for name, reported_ns in sample.reported_ns.items():
+            columns[name][index] = reported_ns
+    objects = np.stack([columns.get(name, times_ns) for name in names] or [times_ns], axis=1)
+    return {
+        "reported_ns": objects[:, : len(names)] if columns.keys() & set(names) else None,
+        "signals_reported_ns": {name: columns[name] for name in signals if name in columns},
+    }
 
 
 def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]:
@@ -606,6 +712,11 @@ def _check_shapes(trace: Trace) -> None:
     for name, values in trace.signals.items():
         if values.shape != (samples,):
             raise TraceError(f"signal {name!r} has the shape {values.shape}; the times need ({samples},)")
+    if trace.reported_ns is not None and trace.reported_ns.shape != trace.rows.shape:
+        raise TraceError(f"reported_ns has the shape {trace.reported_ns.shape}; rows have {trace.rows.shape}")
+    for name, times in trace.signals_reported_ns.items():
+        if name not in trace.signals or times.shape != (samples,):
+            raise TraceError(f"signals_reported_ns of {name!r} needs a signal and the shape ({samples},)")
 
 
 def _check_times(times_ns: Integers) -> None:
@@ -628,6 +739,16 @@ def _same_samples(a: Trace, b: Trace) -> bool:
     pairs = [(getattr(a, name), getattr(b, name)) for name in columns]
     pairs += [(getattr(a.footprints, name), getattr(b.footprints, name)) for name in shapes]
     pairs += [(a.signals[name], b.signals[name]) for name in a.signals]
+    reported, others = a.signals_reported_ns, b.signals_reported_ns
+    if (a.reported_ns is None, reported.keys(), a.lasting) != (
+        b.reported_ns is None,
+        others.keys(),
+        b.lasting,
+    ):
+        return False
+    pairs += [(reported[name], others[name]) for name in reported]
+    if a.reported_ns is not None and b.reported_ns is not None:
+        pairs.append((a.reported_ns, b.reported_ns))
     # only numbers with a point can be NaN
     return all(np.array_equal(one, other, equal_nan=one.dtype.kind == "f") for one, other in pairs)
 

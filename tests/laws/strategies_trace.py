@@ -38,9 +38,18 @@ def certain_traces(draw, max_samples=6):
     """Traces in which every number is known."""
     count = draw(st.integers(0, max_samples))
     objects = st.dictionaries(names, tracked_objects, max_size=4)
+    lasting = draw(st.sets(names, max_size=2))
     return Trace.from_samples(
-        Sample(time_ns, draw(objects), draw(signals)) for time_ns in draw(increasing_times(count))
+        _reported(draw, Sample(time_ns, draw(objects), draw(signals), lasting=lasting))
+        for time_ns in draw(increasing_times(count))
     )
+
+
+def _reported(draw, sample):
+    """The sample, with other times for some of its reports."""
+    reported = sorted({*sample.objects, *sample.signals})
+    few = draw(st.sets(st.sampled_from(reported))) if reported else ()
+    return replace(sample, reported_ns={name: draw(st.integers(0, sample.time_ns)) for name in sorted(few)})
 
 
 @st.composite

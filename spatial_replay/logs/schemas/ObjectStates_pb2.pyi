@@ -58,6 +58,8 @@ class ObjectState(google.protobuf.message.Message):
     YAW_FIELD_NUMBER: builtins.int
     HEIGHT_FIELD_NUMBER: builtins.int
     UNCERTAINTY_FIELD_NUMBER: builtins.int
+    REPORTED_NS_FIELD_NUMBER: builtins.int
+    LASTING_FIELD_NUMBER: builtins.int
     name: builtins.str
     class_name: builtins.str
     """What the object is; absent if unknown."""
@@ -65,6 +67,10 @@ class ObjectState(google.protobuf.message.Message):
     """Orientation in radians, counter-clockwise from the x axis; absent for an object without one."""
     uncertainty: builtins.float
     """Radius in footprint units within which the true outline may differ, at least 0."""
+    reported_ns: builtins.int
+    """Time of the report in nanoseconds, at most that of the sample; absent where it is the sample's own."""
+    lasting: builtins.bool
+    """The object stands where it is until it is reported again, such as a latched map."""
     @property
     def parts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___ConvexPart]:
         """The footprint: the union of these parts."""
@@ -82,13 +88,17 @@ class ObjectState(google.protobuf.message.Message):
         yaw: builtins.float | None = ...,
         height: global___HeightInterval | None = ...,
         uncertainty: builtins.float | None = ...,
+        reported_ns: builtins.int | None = ...,
+        lasting: builtins.bool = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_class_name", b"_class_name", "_height", b"_height", "_uncertainty", b"_uncertainty", "_yaw", b"_yaw", "class_name", b"class_name", "height", b"height", "uncertainty", b"uncertainty", "yaw", b"yaw"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_class_name", b"_class_name", "_height", b"_height", "_uncertainty", b"_uncertainty", "_yaw", b"_yaw", "class_name", b"class_name", "height", b"height", "name", b"name", "parts", b"parts", "uncertainty", b"uncertainty", "yaw", b"yaw"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_class_name", b"_class_name", "_height", b"_height", "_reported_ns", b"_reported_ns", "_uncertainty", b"_uncertainty", "_yaw", b"_yaw", "class_name", b"class_name", "height", b"height", "reported_ns", b"reported_ns", "uncertainty", b"uncertainty", "yaw", b"yaw"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_class_name", b"_class_name", "_height", b"_height", "_reported_ns", b"_reported_ns", "_uncertainty", b"_uncertainty", "_yaw", b"_yaw", "class_name", b"class_name", "height", b"height", "lasting", b"lasting", "name", b"name", "parts", b"parts", "reported_ns", b"reported_ns", "uncertainty", b"uncertainty", "yaw", b"yaw"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_class_name", b"_class_name"]) -> typing.Literal["class_name"] | None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_height", b"_height"]) -> typing.Literal["height"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_reported_ns", b"_reported_ns"]) -> typing.Literal["reported_ns"] | None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_uncertainty", b"_uncertainty"]) -> typing.Literal["uncertainty"] | None: ...
     @typing.overload
@@ -158,20 +168,27 @@ class Signal(google.protobuf.message.Message):
     NAME_FIELD_NUMBER: builtins.int
     VALUE_FIELD_NUMBER: builtins.int
     UNIT_FIELD_NUMBER: builtins.int
+    REPORTED_NS_FIELD_NUMBER: builtins.int
     name: builtins.str
     value: builtins.float
     """In the unit given."""
     unit: builtins.str
     """Empty where the source of the log names none."""
+    reported_ns: builtins.int
+    """Time of the report in nanoseconds, at most that of the sample; absent where it is the sample's own."""
     def __init__(
         self,
         *,
         name: builtins.str = ...,
         value: builtins.float | None = ...,
         unit: builtins.str = ...,
+        reported_ns: builtins.int | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_value", b"_value", "value", b"value"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_value", b"_value", "name", b"name", "unit", b"unit", "value", b"value"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_reported_ns", b"_reported_ns", "_value", b"_value", "reported_ns", b"reported_ns", "value", b"value"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_reported_ns", b"_reported_ns", "_value", b"_value", "name", b"name", "reported_ns", b"reported_ns", "unit", b"unit", "value", b"value"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_reported_ns", b"_reported_ns"]) -> typing.Literal["reported_ns"] | None: ...
+    @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_value", b"_value"]) -> typing.Literal["value"] | None: ...
 
 global___Signal = Signal
