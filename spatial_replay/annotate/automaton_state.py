@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -23,7 +23,16 @@ from spatial_replay.logs.wire import WireTemplate, placed
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Semantics
-from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    NamedSpec,
+    Quantified,
+    Specification,
+    iter_nodes,
+)
+from spatial_replay.spec.walks import nodes_of, rates_of
 from spatial_replay.text import listed
 
 _NOW = 1
@@ -45,7 +54,8 @@ class AutomatonRun:
     Cutting the samples into blocks changes no message.
 
     Attributes:
-        propositions: the nodes that are the automaton's propositions.
+        propositions: the nodes that are the automaton's propositions; of one that is about rates, the node that
+            it judges.
     """
 
     def __init__(
@@ -71,7 +81,8 @@ class AutomatonRun:
         self._order = order
         self._table = TransitionTable.of(automaton)
         numbers = {id(node): number for number, _, node in iter_nodes(formula)}
-        self.propositions = tuple(numbers[id(each.formula)] for each in automaton.propositions)
+        self.propositions = tuple(_node_of(each.formula, formula, numbers) for each in automaton.propositions)
+        self._is_node = [id(each.formula) in numbers for each in automaton.propositions]
         self._possible = np.zeros(len(automaton.states), np.bool_)
         self._possible[automaton.initial] = True
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
@@ -149,7 +160,7 @@ class AutomatonRun:
         """Return (P, T): whether each proposition is true in each sample, or unknown."""
         now = block.series[list(self.propositions), _NOW]
         values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)
-        unclear = np.isnan(now)
+        unclear = np.isnan(now) | ~np.array(self._is_node)[:, None]
         for number in np.flatnonzero(unclear.any(axis=1)).tolist():
             # a number that is not determined can still have a determined sign
             formula = self._automaton.propositions[number].formula
@@ -193,6 +204,17 @@ class AutomatonRun:
             message.guard = "" if taken is None else _shortened(self._guard(taken))
         message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
         return WireTemplate.of(message)
+
+
+def _node_of(proposition: Formula, formula: Formula, numbers: Mapping[int, int]) -> int:
+    """Return the node that a proposition is, or that it is about where it leaves samples without a rate out."""
+    if id(proposition) in numbers:
+        return numbers[id(proposition)]
+    if isinstance(proposition, Boolean):
+        return numbers[id(proposition.operands[-1])]
+    (rate,) = rates_of(proposition)
+    atoms = (node for node in nodes_of(formula) if isinstance(node, Atom | Quantified))
+    return next(numbers[id(atom)] for atom in atoms if rate in rates_of(atom))
 
 
 _LONGEST_GUARD = 500

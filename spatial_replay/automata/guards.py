@@ -20,7 +20,9 @@ from spatial_replay.spec.formula import (
     Temporal,
     Truth,
     expand,
+    judged,
     operands_of,
+    operator_of,
 )
 from spatial_replay.spec.walks import is_spatial, without_variables
 
@@ -173,8 +175,10 @@ class Proposition:
 
 
 def _bracketed(formula: Formula) -> str:
-    text = format_formula(formula)
-    return f"({text})" if isinstance(formula, (Boolean, Quantified)) else text
+    text, written = format_formula(formula), formula
+    if operator_of(formula) in ("given", "with"):
+        written = operands_of(formula)[-1]
+    return f"({text})" if isinstance(written, (Boolean, Quantified)) else text
 
 
 class Propositions:
@@ -210,8 +214,17 @@ class Propositions:
             return
         if shape not in self._numbers:
             self._numbers[shape] = len(self.all)
-            self.all.append(Proposition(formula, format_formula(formula), formula.name))
+            self.all.append(Proposition(formula, self._text(formula), formula.name))
         self._literals[id(formula)] = self._numbers[shape], True
+
+
+    def _text(self, formula: Formula) -> str:
+        """Return the text of a proposition, which says how it treats a rate without a value if it has to."""
+        text = format_formula(formula)
+        if all(each.text != text for each in self.all):
+            return text
+        ends = {"given": " or there is no rate", "with": " and there is a rate"}
+        return f"({text}){ends.get(operator_of(formula), '')}"
 
 
 def _maximal(formula: Formula) -> Iterator[Formula]:
@@ -221,7 +234,7 @@ def _maximal(formula: Formula) -> Iterator[Formula]:
     if is_spatial(formula):
         yield formula
         return
-    for operand in operands_of(formula):
+    for operand in operands_of(judged(formula) if isinstance(formula, Temporal) else formula):
         yield from _maximal(operand)
 
 

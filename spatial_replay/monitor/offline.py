@@ -11,8 +11,8 @@ at begin + i, or at end - 1 - i for a future operator.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
 from types import MappingProxyType
@@ -37,7 +37,7 @@ from spatial_replay.spec.formula import (
     Signal,
     Temporal,
     expand,
-    iter_nodes,
+    judged,
     operator_of,
 )
 from spatial_replay.spec.walks import nodes_with_operands
@@ -245,12 +245,15 @@ class OfflineNodes:
     Attributes:
         times_ns: (T,).
         columns: (C, N, T), the ends of each node's interval (see `channels`).
+        conditions: (C, T) of each operand, by id, that its operator leaves out of samples without a rate (see
+            `judged_operands`): where it has one.
         goes_on: whether samples may follow.
     """
 
     formula: Formula
     times_ns: Integers
     columns: Floats
+    conditions: Mapping[int, Floats] = field(default_factory=dict)
     goes_on: bool = False
 
     @cached_property
@@ -262,6 +265,25 @@ class OfflineNodes:
         """Return the ends (T,) of a node's robustness at each sample, with uncertainty if `wide`."""
         low, high = low_and_high(len(self.columns), wide=wide)
         return self.columns[low, node], self.columns[high, node]
+
+    def judged_ends(self, operand: int) -> tuple[Floats, Floats]:
+        """Return the ends (T,) of an operand as its temporal operator reads it, with uncertainty."""
+        low, high = self.ends(operand)
+        condition = self.conditions.get(operand)
+        if condition is None:
+            return low, high
+        has_low, has_high = condition[[*low_and_high(len(condition), wide=True)]]
+        if self._judged[operand].operator == "with":
+            return np.minimum(has_low, low), np.minimum(has_high, high)
+        return np.maximum(-has_high, low), np.maximum(-has_low, high)
+
+    def is_left_out(self, operand: int, sample: int) -> bool:
+        """Return whether the temporal operator above leaves a sample out."""
+        return operand in self.conditions and bool((self.conditions[operand][:, sample] == -np.inf).all())
+
+    @cached_property
+    def _judged(self) -> dict[int, Boolean]:
+        return _judged_operands(self.tree)
 
     def interval(self, node: int, sample: int = 0, *, wide: bool = True) -> tuple[float, float]:
         """Return the ends of a node's robustness at one sample."""
@@ -277,12 +299,14 @@ class OfflineFormula:
     Attributes:
         table: (R, OFFLINE_WIDTH), its rows.
         nodes, width: how many nodes it has, and columns with those of other rows.
+        conditions: the column of each operand's condition (see `OfflineNodes`).
     """
 
     formula: Formula
     table: Integers
     nodes: int
     width: int
+    conditions: Mapping[int, int]
 
     @classmethod
     def of(
@@ -292,12 +316,15 @@ class OfflineFormula:
 
         Args:
             order: which leaf is which.
-            stand_ins: what is computed in place of each node, by id, if that is something else.
+            stand_ins: what is computed in place of each of `computed_formulas`, if that is something else.
         """
-        table = OfflineTable(order)
-        nodes = [table.add(node) for node in stand_ins or (node for _, _, node in iter_nodes(formula))]
-        instructions = table.instructions(nodes)
-        return cls(formula, instructions, len(nodes), int(instructions[:, OFFLINE_TARGET].max()) + 1)
+        table, tree = OfflineTable(order), nodes_with_operands(formula)
+        rows = [table.add(each) for each in stand_ins or computed_formulas(formula)]
+        instructions = table.instructions(rows)
+        conditions = dict(zip(_judged_operands(tree), range(len(tree), len(rows)), strict=True))
+        return cls(
+            formula, instructions, len(tree), int(instructions[:, OFFLINE_TARGET].max()) + 1, conditions
+        )
 
     def evaluate(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
         """Evaluate every node over all samples; see `evaluate_offline`."""
@@ -305,7 +332,25 @@ class OfflineFormula:
         extrema = np.empty(len(times_ns))
         stamps = writable(times_ns)
         run_offline(self.table, writable(leaves), stamps, 0, len(stamps), columns, extrema)
-        return OfflineNodes(self.formula, times_ns, columns[:, : self.nodes])
+        conditions = {operand: columns[:, column] for operand, column in self.conditions.items()}
+        return OfflineNodes(self.formula, times_ns, columns[:, : self.nodes], conditions)
+
+
+def computed_formulas(formula: Formula) -> list[Formula]:
+    """Return the nodes of a formula, by id, and the conditions of operands that leave samples out."""
+    tree = nodes_with_operands(formula)
+    return [*(node for node, _ in tree), *(each.operands[0] for each in _judged_operands(tree).values())]
+
+
+def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boolean]:
+    """Return the operands, by id, that their operators read with samples left out, as they read them."""
+    return {
+        identifier: operand
+        for node, operands in tree
+        if isinstance(node, Temporal)
+        for identifier, operand in zip(operands, judged(node).operands, strict=True)
+        if isinstance(operand, Boolean) and operand.operator in ("given", "with")
+    }
 
 
 def evaluate_offline(
@@ -350,7 +395,7 @@ def _evaluated(
     beyond: Callable[[Temporal, Integers], Booleans],
 ) -> OfflineNodes:
     opened = _OpenFormulas(times_ns, beyond)
-    stand_ins = [opened.of(node) for _, _, node in iter_nodes(formula)]
+    stand_ins = [opened.of(each) for each in computed_formulas(formula)]
     is_open = np.array(opened.columns, np.bool_).reshape(-1, len(times_ns))
     columns = np.stack([np.full(is_open.shape, -np.inf), np.where(is_open, np.inf, -np.inf)])
     compiled = OfflineFormula.of(formula, (*order, *opened.leaves), stand_ins)

@@ -32,8 +32,9 @@ from spatial_replay.spec.formula import (
     Temporal,
     Truth,
     iter_nodes,
+    rate_conditions,
 )
-from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key, nodes_with_operands
+from spatial_replay.spec.walks import is_spatial, leaf_key, nodes_with_operands
 
 
 class PaperMemory(NamedTuple):
@@ -616,6 +617,8 @@ def left_out(
 ) -> Floats:
     """Return leaves with NaN where one, or the body of a quantifier, looks back (`a[-3]`) to before the log.
 
+    So are those of rates that have no value yet, below an operator that leaves such samples out.
+
     Args:
         values: (C, A, T) of these leaves.
         positions: (T,), how many samples of the log come before each.
@@ -623,11 +626,15 @@ def left_out(
         first_ns: the time of the log's first sample.
     """
     is_before = np.zeros(values.shape[1:], np.bool_)
+    numbers = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
     for row, leaf in zip(is_before, leaves, strict=True):
         for samples, duration_ns in set(iter_delays([leaf])):
             row |= positions < (samples or 0)
             if duration_ns is not None:
                 row |= times_ns - duration_ns < first_ns
+        for condition in rate_conditions(leaf):
+            if (number := numbers.get(leaf_key(condition))) is not None:
+                row |= (values[:, number] == -np.inf).all(axis=0)
     return np.where(is_before, np.nan, values) if is_before.any() else values
 
 
@@ -669,8 +676,6 @@ def check_operators(specification: Specification) -> None:
                 source = SourceText.of(specification.source, specification.filename)
                 fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
                 remedy = "write it with X, F, G and U"
-                if node is spec.formula and has_rate(node):
-                    remedy = "a rate of change is read from the second sample on: write X in front"
                 raise UsageError(
                     f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, as {spec.name} has; "
                     f"{remedy}, or evaluate with the semantics 'ltlf'"

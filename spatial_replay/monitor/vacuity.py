@@ -37,10 +37,13 @@ from spatial_replay.spec.formula import (
     Temporal,
     TrackedName,
     iter_nodes,
+    judged,
+    judged_operands,
     operands_of,
     operator_of,
 )
 from spatial_replay.spec.walks import (
+    is_about_having_rates,
     is_spatial,
     iter_parts,
     iter_terms,
@@ -475,7 +478,8 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     """Return whether a verdict stays the same whatever the leaves are.
 
     Leaves in antecedents keep their numbers where it is satisfied: if no antecedent held, nothing was tested.
-    Leaves over an open group keep them where the group is empty.
+    Leaves over an open group keep them where the group is empty. Whether a rate has a value is always known:
+    samples that are left out test nothing.
 
     Args:
         leaves: (C, A, T), the leaves of the instance's formula.
@@ -491,8 +495,11 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
             case Boolean(operator="->", operands=(antecedent, consequent)):
                 known_one = tested(antecedent, in_antecedent=True)
                 return replace(formula, operands=(known_one, tested(consequent, in_antecedent=in_antecedent)))
+            case Boolean(operator="given" | "with", operands=(condition, body)):
+                return replace(formula, operands=(condition, tested(body, in_antecedent=in_antecedent)))
             case Boolean() | Temporal():
-                operands = [tested(each, in_antecedent=in_antecedent) for each in formula.operands]
+                read = judged(formula).operands if isinstance(formula, Temporal) else formula.operands
+                operands = [tested(each, in_antecedent=in_antecedent) for each in read]
                 return replace(formula, operands=tuple(operands))
             case Atom() | Quantified() if in_antecedent:
                 return stand_ins[leaf_key(formula)]
@@ -505,16 +512,19 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 
 
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
-    """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers and empty groups."""
+    """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers, empty groups and rates."""
     low, high = low_and_high(len(leaves), wide=True)
     result = roomy((2, *leaves.shape[1:]), np.float64)
     result[0], result[1] = -np.inf, np.inf
     for place, leaf in enumerate(order):
         bound = evidence.bound(leaf)
         groups = list(dict.fromkeys(_open_groups(bound)))
-        if isinstance(bound, Quantified):
-            body = _without_tests(_implications_of(bound.body).formula)
-            column = evidence.columns([replace(bound, body=body)])
+        if is_about_having_rates(bound):
+            result[:, place] = leaves[[low, high], place]
+        elif isinstance(bound, Quantified):
+            body = _implications_of(bound.body).formula
+            (body,) = judged_operands(bound.quantifier, (body,))
+            column = evidence.columns([replace(bound, body=_without_tests(body))])
             result[:, place] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)
@@ -528,8 +538,8 @@ def _without_tests(formula: Formula) -> Formula:
         case Atom():
             return _UNKNOWN
         case Quantified():
-            return replace(formula, body=_without_tests(formula.body))
-        case Boolean(operator="->", operands=(antecedent, consequent)):
+            return replace(formula, body=_without_tests(formula.judged))
+        case Boolean(operator="->" | "given" | "with", operands=(antecedent, consequent)):
             return replace(formula, operands=(antecedent, _without_tests(consequent)))
         case Boolean():
             return replace(formula, operands=tuple(_without_tests(each) for each in formula.operands))

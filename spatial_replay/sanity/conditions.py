@@ -54,6 +54,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.relations import compare
 from spatial_replay.spec.walks import (
     base_of,
+    is_about_having_rates,
     iter_expressions,
     iter_formulas,
     measured_terms,
@@ -393,6 +394,9 @@ class FactDiagrams:
             case Truth():
                 return YES if formula.value else NO
             case Atom():
+                if is_about_having_rates(formula):
+                    # the rules are about logs in which rates have values
+                    return YES
                 tree = self._tree_of(formula.expression)
                 return self._opaque(formula) if tree is None else self._condition(tree, formula)
             case Boolean(operator="not"):

@@ -145,6 +145,8 @@ def format_formula(
             if references and that.name is not None:
                 return written_name(that.name, relations)
             return format_formula(that, references=references, relations=relations)
+        case Boolean(operator="given" | "with"):
+            return format_formula(formula.operands[-1], references=references, relations=relations)
         case Boolean(operator="not"):
             return f"not {operand(formula.operands[0])}"
         case Boolean():

@@ -12,8 +12,9 @@ Three layers, each built of the one before:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self, TypeAlias
 
 from spatial_replay.lazy import Displayed
@@ -252,8 +253,15 @@ STEP: Final = Rate("", ())
 
 
 @dataclass(frozen=True, slots=True)
+class HasRate(Signal):
+    """Whether a rate has a value: 1 or 0; unknown where an object or the signal of it is missing."""
+
+    rate: Rate
+
+
+@dataclass(frozen=True, slots=True)
 class Equality(_Arithmetic):
-    """+inf where a signal is equal to a number, -inf where it is not.
+    """+inf where a signal is equal to a number, -inf where it is not; unknown where the signal is.
 
     A text is its `text_number`; whether a number is equal to a text is unknown.
     """
@@ -384,8 +392,12 @@ class Atom:
     parameters: tuple[float | str, ...] = ()
 
 
-BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "spec"]
-"""`spec` has one operand and is that operand: a spec that only repeats another under its own name."""
+BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "spec", "given", "with"]
+"""`spec` has one operand and is that operand: a spec that only repeats another under its own name.
+
+`given` and `with` are in expansions alone: an operand of an operator that leaves samples without a rate out
+(see `judged`). Their first operand is that there is a rate, their last one what was written.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,7 +426,8 @@ PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
 class Temporal:
     """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
 
-    Its `expansion` is the formula that defines R, W and WX; None for the others (see `expand`).
+    Its `expansion` is the formula that defines R, W and WX, and any operator over a rate (see `judged`); None
+    for the others (see `expand`).
     """
 
     operator: TemporalOperator
@@ -425,7 +438,13 @@ class Temporal:
     expansion: Formula | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "expansion", _expansion(self.operator, self.operands, self.bound))
+        operands = judged_operands(self.operator, self.operands)
+        expansion: Formula | None = None
+        if operands is self.operands:
+            expansion = _expansion(self.operator, operands, self.bound)
+        else:
+            expansion = Temporal(self.operator, operands, self.bound)
+        object.__setattr__(self, "expansion", expansion)
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,6 +456,7 @@ class Quantified:
 
     Attributes:
         group: an open `Group`, or one `Earlier` (its members are those of then).
+        judged: the body that is evaluated: it leaves members without a rate out (see `judged`).
     """
 
     quantifier: Literal["forall", "exists"]
@@ -445,6 +465,10 @@ class Quantified:
     body: Formula
     name: str | None = None
     span: Span = field(default=_NO_SPAN, compare=False)
+    judged: Formula = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "judged", judged_operands(self.quantifier, (self.body,))[0])
 
 
 Formula: TypeAlias = Truth | Atom | Boolean | Temporal | Quantified
@@ -466,8 +490,10 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
     match operator:
         case "spec":
             return first
-        case "->":
+        case "->" | "given":
             return Boolean("or", (_not(first), last))
+        case "with":
+            return Boolean("and", operands)
         case "xor":
             one, other = Boolean("and", (first, _not(last))), Boolean("and", (_not(first), last))
             return Boolean("or", (one, other))
@@ -488,6 +514,78 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
 
 def _not(operand: Formula) -> Boolean:
     return Boolean("not", (operand,))
+
+
+_LEFT_OUT_AS: Final[Mapping[str, tuple[BooleanOperator, ...]]] = MappingProxyType(
+    {
+        **dict.fromkeys(("G", "H", "forall"), ("given",)),
+        **dict.fromkeys(("F", "O", "exists"), ("with",)),
+        **dict.fromkeys(("U", "S", "W"), ("given", "with")),
+        "R": ("with", "given"),
+    }
+)
+"""How each operator that ranges over samples or members leaves one out, by operand."""
+
+
+def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formula, ...]:
+    """Return operands with the samples or members left out in which a rate has no value yet.
+
+    They are the same tuple where no rate stands in them without such an operator in between.
+    """
+    conditions = [rate_conditions(each) for each in operands] if operator in _LEFT_OUT_AS else []
+    if not any(conditions):
+        return operands
+    return tuple(
+        Boolean(how, (_all(own), each), name=each.name) if own else each
+        for how, own, each in zip(_LEFT_OUT_AS[operator], conditions, operands, strict=True)
+    )
+
+
+def judged(formula: Temporal) -> Temporal:
+    """Return a temporal operator with the operands that it reads (see `judged_operands`)."""
+    expansion = formula.expansion
+    is_judged = isinstance(expansion, Temporal) and expansion.operator == formula.operator
+    return expansion if is_judged else formula  # type: ignore[return-value]
+
+
+def rate_conditions(formula: Formula) -> list[Formula]:
+    """Return that each rate in a formula has a value, in the samples in which the formula reads them.
+
+    Rates within an operator that leaves samples out itself do not count. Before the first sample and after
+    the last one there is nothing to leave out, and so the conditions hold there.
+    """
+    match formula:
+        case Atom():
+            return [_has_value(rate) for rate in dict.fromkeys(_rates_of(formula.expression))]
+        case Boolean() if formula.operator not in ("given", "with"):
+            return list(dict.fromkeys(each for part in formula.operands for each in rate_conditions(part)))
+        case Temporal(operator="X" | "WX"):
+            return [Temporal("WX", (each,)) for each in rate_conditions(formula.operands[0])]
+        case Temporal(operator="Y"):
+            return [_not(Temporal("Y", (_not(each),))) for each in rate_conditions(formula.operands[0])]
+    return []
+
+
+def _has_value(rate: Rate) -> Atom:
+    return Atom(f"{rate.name} has a value", "signal", Equality(HasRate(rate.name, rate), 1.0))
+
+
+def _rates_of(expression: Expression) -> Iterator[Rate]:
+    match expression:
+        case Rate():
+            yield expression
+        case Sum(first, second):
+            yield from _rates_of(first)
+            yield from _rates_of(second)
+        case Negative(operand) | Scaled(operand):
+            yield from _rates_of(operand)
+        case Minimum(operands) | Maximum(operands):
+            for operand in operands:
+                yield from _rates_of(operand)
+
+
+def _all(formulas: list[Formula]) -> Formula:
+    return formulas[0] if len(formulas) == 1 else Boolean("and", tuple(formulas))
 
 
 def operands_of(formula: Formula) -> tuple[Formula, ...]:

@@ -97,7 +97,6 @@ from spatial_replay.spec.syntax import (
 from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, tokenize
 from spatial_replay.spec.walks import (
     base_of,
-    has_rate,
     is_centre,
     iter_expressions,
     iter_formulas,
@@ -318,18 +317,6 @@ class AtomBuilder:
             self.resolver.fault(written.operator, scope, message, "compare single objects of the log")
 
 
-def _from_second(spec: NamedSpec) -> NamedSpec:
-    """Return a spec as written or, with a rate in it, from the second sample on: the first has no rates."""
-    formula = spec.formula
-    if (isinstance(formula, Temporal) and formula.operator in ("X", "WX")) or not has_rate(formula):
-        return spec
-    if isinstance(formula, Boolean) and formula.operator == "spec":
-        inner = formula.operands[0]
-    else:
-        inner = replace(formula, name=None)
-    return replace(spec, formula=Temporal("WX", (inner,), name=spec.name, span=formula.span))
-
-
 @dataclass(frozen=True, slots=True)
 class QuantifierBuilder:
     """Builds the formulas of the quantifiers of one text.
@@ -516,10 +503,7 @@ class Elaborator:
         total = sum(known.size for name, known in self.known.items() if name not in self.referred)
         if total > MAX_SIZE:
             self._too_large(statements[-1].name.span)
-        return tuple(
-            replace(spec, is_result=False) if spec.name in self.referred else _from_second(spec)
-            for spec in done
-        )
+        return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in done)
 
     def _spec(self, statement: SpecStatement, order: int) -> None:
         name = statement.name.text

@@ -22,6 +22,7 @@ from spatial_replay.spec.formula import (
     Expression,
     Formula,
     Group,
+    HasRate,
     Maximum,
     Measurement,
     Minimum,
@@ -90,6 +91,8 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
                 stack.append(current.operand)
             case Equality():
                 stack.append(current.signal)
+            case HasRate():
+                stack.append(current.rate)
             case Minimum() | Maximum():
                 stack += reversed(current.operands)
 
@@ -124,9 +127,19 @@ def rate_of(signal: Signal) -> Rate:
     return Rate(f"rate({written_name(signal.name, RELATION_NAMES)})", (), signal)
 
 
+def rates_of(formula: Formula) -> list[Rate]:
+    """Return the rates of change that a formula is about."""
+    return [part for part in iter_parts(formula) if isinstance(part, Rate)]
+
+
 def has_rate(formula: Formula) -> bool:
     """Return whether a formula is about rates of change."""
-    return any(isinstance(part, Rate) for part in iter_parts(formula))
+    return bool(rates_of(formula))
+
+
+def is_about_having_rates(leaf: Formula) -> bool:
+    """Return whether a leaf is that a rate has a value (see `judged_operands`)."""
+    return isinstance(leaf, Atom) and any(isinstance(part, HasRate) for part in iter_parts(leaf))
 
 
 def change_of(rate: Rate) -> Sum | SignedDistance:
@@ -154,7 +167,7 @@ def logged_signals(expression: Expression) -> Iterator[str]:
     for part in iter_expressions(expression):
         signal = part.signal if isinstance(part, Rate) else part
         signal = signal.of if isinstance(signal, PreviousSignal) else signal
-        if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal):
+        if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal | HasRate):
             yield signal.name
 
 

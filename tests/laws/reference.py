@@ -28,6 +28,7 @@ from spatial_replay.spec.formula import (
     Expression,
     Formula,
     Group,
+    HasRate,
     Maximum,
     Minimum,
     Misalignment,
@@ -93,6 +94,31 @@ def combine(operator: str, operands: Sequence[Interval]) -> Interval:
     raise ValueError(operator)
 
 
+def leave_out(body: Interval, has_rates: Interval, is_implied: bool) -> Interval:
+    """A body where its rates have values: `has_rates -> body`, or `has_rates and body`."""
+    return greatest([-has_rates, body]) if is_implied else least([has_rates, body])
+
+
+def has_value_atoms(formula: Formula) -> list[Atom]:
+    """That each rate has a value, of those below no operator but Booleans, X, WX and Y."""
+    match formula:
+        case Atom():
+            parts = [formula.expression]
+            for part in parts:
+                match part:
+                    case Sum():
+                        parts += [part.first, part.second]
+                    case Negative():
+                        parts.append(part.operand)
+                    case Minimum() | Maximum():
+                        parts += part.operands
+            rates = [part for part in parts if isinstance(part, Rate)]
+            return [Atom("", "signal", Equality(HasRate("", each), 1.0)) for each in rates]
+        case Boolean() | Temporal(operator="X" | "WX" | "Y"):
+            return [atom for each in formula.operands for atom in has_value_atoms(each)]
+    return []
+
+
 # ------------------------------------------------------------------------------------ temporal operators
 
 Leaf = Callable[[Formula, int], Interval]
@@ -126,10 +152,10 @@ class Prefix:
 
     def _temporal(self, formula: Temporal, t: int) -> Interval:
         def left(at: int) -> Interval:
-            return self.rho(formula.operands[0], at)
+            return self._operand(formula, 0, at)
 
         def right(at: int) -> Interval:
-            return self.rho(formula.operands[-1], at)
+            return self._operand(formula, -1, at)
 
         match formula.operator:
             case "X":
@@ -159,6 +185,32 @@ class Prefix:
                 for u in self._behind(formula, t)
             ]
         )  # fmt: skip
+
+    def _operand(self, formula: Temporal, place: int, t: int) -> Interval:
+        """An operand as its operator reads it: without the samples in which a rate has no value."""
+        operand = formula.operands[place]
+        leaves_out = {"GHUSW": (True, False), "FO": (False, False), "R": (False, True)}
+        is_given = next((how for names, how in leaves_out.items() if formula.operator in names), None)
+        if is_given is None:
+            return self.rho(operand, t)
+        is_only = len(formula.operands) == 1
+        is_implied = is_given[0] if is_only or place == 0 else is_given[1]
+        return leave_out(self.rho(operand, t), self._has_rates(operand, t), is_implied)
+
+    def _has_rates(self, formula: Formula, t: int) -> Interval:
+        """Whether all rates of a body have values, those of next and earlier samples then."""
+        match formula:
+            case Atom():
+                return least([self.leaf(each, t) for each in has_value_atoms(formula)])
+            case Boolean():
+                return least([self._has_rates(each, t) for each in formula.operands])
+            case Temporal(operator="X" | "WX") if t + 1 < len(self.times_ns):
+                return self._has_rates(formula.operands[0], t + 1)
+            case Temporal(operator="X" | "WX") if self.goes_on and has_value_atoms(formula):
+                return ANYTHING
+            case Temporal(operator="Y") if t > 0:
+                return self._has_rates(formula.operands[0], t - 1)
+        return TRUE
 
     def _next(self, formula: Temporal, t: int, beyond_the_end: Interval) -> Interval:
         if t + 1 < len(self.times_ns):
@@ -287,7 +339,17 @@ class Observed:
                     {**bindings, **dict(zip(formula.variables, chosen, strict=True))}
                     for chosen in permutations(names, len(formula.variables))
                 ]
-                return join([self.interval(formula.body, t, each, uncertain) for each in bound])
+                conditions = has_value_atoms(formula.body)
+                return join(
+                    [
+                        leave_out(
+                            self.interval(formula.body, t, each, uncertain),
+                            least([self.interval(atom, t, each, uncertain) for atom in conditions]),
+                            formula.quantifier == "forall",
+                        )
+                        for each in bound
+                    ]
+                )
         raise ValueError(formula)
 
     def _expression(
@@ -306,6 +368,10 @@ class Observed:
             case Signal():
                 number = self.signals[t].get(expression.name, math.nan)
                 return None if math.isnan(number) else Interval(number, number)
+            case Equality(HasRate(rate=rate)):
+                if self._changing(rate, t, bindings, uncertain) is None:
+                    return None
+                return FALSE if self._rate(rate, t, bindings, uncertain) is None else TRUE
             case Equality():
                 number = self.signals[t].get(expression.signal.name, math.nan)
                 return None if math.isnan(number) else TRUE if number == expression.value else FALSE

@@ -38,9 +38,6 @@ def test_the_text_of_a_node_means_that_node(text: str) -> None:
         for operand in operands_of(spec.formula):
             alone = parse_specification("\n".join([*definitions, f"spec alone = {format_formula(operand)}"]))
             (read,) = (each.formula for each in alone.specs)
-            # a spec with a rate begins at the second sample, a node of one need not
-            if has_rate(read) and operator_of(operand) not in ("X", "WX"):
-                (read,) = operands_of(read)
             assert format_formula(read) == format_formula(operand)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
 from math import inf, nan
 from pathlib import Path
 
@@ -42,27 +44,106 @@ def drive(uncertainty: float = 0.0) -> list[Sample]:
 )
 def test_a_rate_compares_neighbouring_samples_by_their_times(formula: str, expected: list[float]) -> None:
     (result,) = evaluate(parse_specification(formula), Trace.from_samples(drive()))
-    assert result.nodes[1].text == formula
-    np.testing.assert_allclose(result.nodes[1].now, expected)
+    assert result.nodes[0].text == formula
+    np.testing.assert_allclose(result.nodes[0].now, expected)
 
 
 def test_what_is_uncertain_in_both_samples_adds_up() -> None:
-    (result,) = evaluate(parse_specification("speed(robot) >= 1.5"), Trace.from_samples(drive(0.2)[:2]))
+    (result,) = evaluate(parse_specification("X (speed(robot) >= 1.5)"), Trace.from_samples(drive(0.2)[:2]))
     # 2 m/s, give or take 0.4 m in half a second
     assert (result.lower, result.upper) == pytest.approx((-0.3, 1.3))
     assert result.verdict == "unknown"
 
 
-def test_a_result_with_a_rate_begins_at_the_second_sample() -> None:
-    specification = parse_specification("spec slow = G (speed(cart) <= 1)\nspec a = X (rate(battery) <= 1)")
-    written = format_specification(specification)
-    assert "spec slow = WX (G (speed(cart) <= 1))\n" in written
-    assert "spec a = X (rate(battery) <= 1)\n" in written
-    assert parse_specification(written) == specification
-    slow, _ = evaluate(specification, Trace.from_samples(drive()))
-    assert (slow.verdict, slow.robustness) == ("satisfied", 1.0)
-    slow, _ = evaluate(specification, Trace.from_samples(drive()[:1]))
-    assert (slow.verdict, slow.robustness) == ("satisfied", inf)
+@pytest.mark.parametrize(
+    ("formula", "expected"),
+    [
+        # the battery has no rate in the first sample, and is missing in the last
+        ("G[0, 3] (rate(battery) <= 0.25)", -0.25),
+        ("F[0, 3] (rate(battery) >= 0.25)", 0.25),
+        ("G[0, 0] (rate(battery) >= 9)", inf),
+        ("F[0, 0] (rate(battery) <= 9)", -inf),
+        ("(rate(battery) <= 0) U[0, 2] (rate(battery) >= 0.5)", 0.0),
+        ("(rate(battery) >= 0.5) R[0, 2] (rate(battery) <= 9)", 8.5),
+        ("(rate(battery) <= 0) W[0, 2] (rate(battery) >= 0.5)", 0.0),
+        ("F[3, 3] (H (rate(battery) <= 1))", 0.5),
+        ("F[3, 3] (O (rate(battery) >= 0.25))", 0.25),
+        ("F[3, 3] ((rate(battery) >= -1) S (rate(battery) >= 0.5))", 0.0),
+        # each sample has the rate of the next one, or of the one before
+        ("G[0, 2] (X (rate(battery) <= 1))", 0.5),
+        ("G[0, 2] (WX (rate(battery) <= 1))", 0.5),
+        ("G[1, 3] (Y (rate(battery) <= 1))", 0.5),
+        ("G[0, 3] (rate(battery) <= 1 and battery >= 11)", 0.0),
+        ("G[0, 3] (not (rate(battery) >= 1))", 0.5),
+        # nothing that ranges over samples is around the comparison
+        ("rate(battery) <= 9", nan),
+        ("X (rate(battery) <= 9)", 11.0),
+        ("G[0, 0] (battery >= 3) and X (rate(battery) <= 3)", 5.0),
+        # the battery is missing where the sample is asked for
+        ("F[4, 4] (rate(battery) >= 0)", nan),
+        ("G[4, 4] (rate(battery) >= 0)", nan),
+    ],
+)
+def test_the_nearest_operator_leaves_out_what_has_no_rate_yet(formula: str, expected: float) -> None:
+    (result,) = evaluate(parse_specification(formula), Trace.from_samples(drive()))
+    np.testing.assert_equal(result.robustness, expected)
+
+
+def test_a_deadline_beside_a_rate_has_the_verdict_that_it_has_alone() -> None:
+    specification = parse_specification(
+        "spec intime = F[0s, 1s] (battery >= 11.5)\n"
+        "spec calm = G (speed(cart) <= 1)\n"
+        "spec alone = F[0s, 1s] (battery >= 11.5)\n"
+        "spec task = intime and calm\n"
+    )
+    samples = [replace(each, signals={"battery": 11.0 + (n == 2)}) for n, each in enumerate(drive())]
+    alone, task = evaluate(specification, Trace.from_samples(samples))
+    assert (alone.verdict, alone.robustness) == ("violated", -0.5)
+    assert (task.verdict, task.robustness) == ("violated", -0.5)
+    assert format_specification(specification).endswith("spec task = intime and calm\n")
+
+
+def arrivals(order: str) -> list[Sample]:
+    """People who walk at 1 m/s from when they come; the names of those in the next sample, sample by sample."""
+    samples = []
+    for step, names in enumerate(order.split()):
+        people = {
+            name: TrackedObject(Footprint.disc(float(step), 9.0 * place, 0.3), class_name="person")
+            for place, name in enumerate("abc")
+            if name in names
+        }
+        samples.append(Sample(step * SECOND, people))
+    return samples
+
+
+@pytest.mark.parametrize("order", ["a ab abc abc", "abc bc bc abc", "c . a ab", "a b c a"])
+def test_members_that_come_and_go_are_left_out_where_they_are_new(order: str) -> None:
+    specification = parse_specification(
+        'group people = class "person"\n'
+        "spec calm = G (forall p in people: speed(p) <= 3)\n"
+        "spec runs = F (exists p in people: speed(p) >= 2)\n"
+    )
+    samples = arrivals(order)
+    moves = any(set(one) & set(other) - {"."} for one, other in pairwise(order.split()))
+    calm, runs = evaluate(specification, Trace.from_samples(samples))
+    assert (calm.verdict, calm.robustness) == ("satisfied", 2.0 if moves else inf)
+    assert (runs.verdict, runs.robustness) == ("violated", -1.0 if moves else -inf)
+    assert calm.tested == ("full" if moves else "nothing")
+
+
+def test_samples_without_rates_test_nothing_and_are_not_what_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Recorder("run.mcap") as recorder:
+        for sample in arrivals("a ab b"):
+            recorder.write(sample)
+    assert run(["explain", "run.mcap", "--spec", 'G (forall p in class "person": speed(p) <= 0.5)']) == 1
+    assert "speed(a) <= 0.5" in capsys.readouterr().out
+    assert run(["explain", "run.mcap", "--spec", "F[0, 0] (speed(a) <= 5)"]) == 1
+    assert "no sample in its window has a rate" in capsys.readouterr().out
+    for body in ("speed(a) <= 5", "(speed(a) <= 5) -> (a dist b >= 9)"):
+        assert run(["replay", "run.mcap", "--spec", f"G[0, 0] ({body})"]) == 4
 
 
 @pytest.mark.parametrize(
@@ -88,12 +169,12 @@ def test_what_is_no_rate_is_refused_with_what_to_write(
     assert hint in said
 
 
-def test_the_papers_semantics_says_how_a_rate_is_written_for_it(capsys: pytest.CaptureFixture[str]) -> None:
-    log = str(Path(__file__).resolve().parents[2] / "recordings/table.jsonl")
-    paper = ("--semantics", "paper")
-    assert run(["replay", log, "--spec", "G (speed(cup) <= 9)", *paper]) == 2
-    assert "read from the second sample on: write X in front, or" in capsys.readouterr().err
-    assert run(["replay", log, "--spec", "X G (speed(cup) <= 9)", *paper]) == 0
+def test_the_papers_semantics_leaves_out_what_has_no_rate_yet() -> None:
+    formula = parse_specification("G (speed(cart) <= 1)")
+    late = [Sample(0, {}), *(replace(each, time_ns=each.time_ns + 1) for each in drive())]
+    for samples in (drive(), late[1:]):
+        (result,) = evaluate(formula, Trace.from_samples(samples), semantics="paper")
+        assert (result.verdict, result.robustness) == ("satisfied", 1.0)
 
 
 def test_speed_and_rate_stay_names_without_a_bracket_and_of_macros() -> None:

@@ -33,11 +33,13 @@ from spatial_replay.spec.formula import (
     Expression,
     Formula,
     Group,
+    HasRate,
     Maximum,
     Measurement,
     Minimum,
     Negative,
     Number,
+    Projection,
     Quantified,
     Rate,
     Scaled,
@@ -145,6 +147,7 @@ DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
 EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where one of them is a text, or none
 QUOTIENT = 15  # a by b, which is positive and the same in every channel
+HAS_VALUE = 16  # +inf where a is a number, else -inf; not a number where b is not
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -241,6 +244,10 @@ def run_instructions(
                 elif op == QUOTIENT:
                     for k in range(count):
                         target[k] = first[k] / second[k]
+                elif op == HAS_VALUE:
+                    for k in range(count):
+                        has_value = np.inf if first[k] == first[k] else -np.inf
+                        target[k] = has_value if second[k] == second[k] else np.nan
                 elif op == OR:
                     for k in range(count):
                         target[k] = max(first[k], second[k])
@@ -355,6 +362,8 @@ class LeafCode:
                 return self._row(ADD, first, self._expression(expression.second, bindings))
             case Negative():
                 return self._row(NEGATE, self._expression(expression.operand, bindings))
+            case Equality(HasRate(rate=rate)):
+                return self._row(HAS_VALUE, self._expression(rate, bindings), self._current(rate, bindings))
             case Equality(signal, value):
                 constant = self.constants.setdefault(value, len(self.constants))
                 return self._row(EQUAL, self.signals.setdefault(signal, len(self.signals)), constant)
@@ -369,6 +378,15 @@ class LeafCode:
                 return row
         measurement = map_terms(expression, lambda term: substitute_term(term, bindings))
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
+
+    def _current(self, rate: Rate, bindings: Bindings) -> int:
+        """Return a row that is a number where all objects of a rate, or its signal, are in the sample."""
+        if rate.signal is not None:
+            return self._expression(rate.signal, bindings)
+        first, *others = [self._expression(Projection(each, "x", "min"), bindings) for each in rate.terms]
+        for other in others:
+            first = self._row(ADD, first, other)
+        return first
 
     def _joined(self, formula: Formula, rows: Mapping[int, int]) -> int:
         """Return the row of an expansion, given the rows of the operands that were written, by `id`.
@@ -404,7 +422,7 @@ class LeafCode:
         for chosen in permutations(range(len(names)), len(formula.variables)):
             members = [TrackedName(names[n]) for n in chosen]
             inner = {**bindings, **dict(zip(formula.variables, members, strict=True))}
-            body = self._add(formula.body, inner)
+            body = self._add(formula.judged, inner)
             result = self._row(op, result, body, self._member(group, chosen))
         return result
 

@@ -57,6 +57,7 @@ from spatial_replay.spec.formula import (
     Truth,
     operands_of,
     operator_of,
+    rate_conditions,
 )
 from spatial_replay.spec.walks import (
     base_of,
@@ -184,7 +185,7 @@ class DecidingPath(NamedTuple):
 
     Attributes:
         steps: at least one. The last is at a leaf, at `true` or `false`, or at an operator without a sample,
-            such as an empty window or a next sample beyond the log.
+            such as an empty window, a next sample beyond the log, or rates without a value in all of its window.
         end: which end of the last node's interval decides.
     """
 
@@ -221,7 +222,7 @@ class _Walk:
             case Temporal():
                 lasting = self._lasting(node, sample, end) if self._done.goes_on else None
                 taken = lasting or self._taken(formula, operands, sample, end)
-                if taken is None:
+                if taken is None or self._done.is_left_out(taken.node, taken.sample):
                     return DecidingPath((here,), end)
                 below = self.follow(taken.node, taken.sample, end)
             case _:
@@ -229,7 +230,7 @@ class _Walk:
         return DecidingPath((here, *below.steps), below.end)
 
     def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
-        low, high = (column[samples] for column in self._done.ends(operand.index))
+        low, high = (column[samples] for column in self._done.judged_ends(operand.index))
         return (-high, -low) if operand.negated else (low, high)
 
     def _taken(self, formula: Temporal, operands: Sequence[int], sample: int, end: End) -> PathNode | None:
@@ -548,7 +549,7 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
             formulas = list(leaf.operands)
             extremum = extremum_of(leaf.operator, range(len(formulas)))
         case Quantified():
-            formulas = list(_bodies(scene, leaf))
+            formulas = _judged_bodies(scene, leaf)
             extremum = Extremum(leaf.quantifier == "forall", tuple(map(SignedOperand, range(len(formulas)))))
         case _:
             return None
@@ -557,6 +558,15 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
     intervals = _intervals(scene, formulas)
     first, *_ = chosen(extremum, end, intervals.__getitem__)
     return formulas[first.index], end.turned if first.negated else end
+
+
+def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
+    """Return the body for each binding that the quantifier does not leave out."""
+    bodies = list(_bodies(scene, formula))
+    if not rate_conditions(formula.body):
+        return bodies
+    ends = _intervals(scene, [Boolean("and", tuple(rate_conditions(each))) for each in bodies])
+    return [body for body, (_, high) in zip(bodies, ends, strict=True) if high > -np.inf]
 
 
 def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:

@@ -24,7 +24,14 @@ from spatial_replay.monitor.witness.path import (
 )
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Atom, Formula, Quantified, operator_of
+from spatial_replay.spec.formula import (
+    Atom,
+    Formula,
+    Quantified,
+    judged_operands,
+    operands_of,
+    operator_of,
+)
 from spatial_replay.spec.walks import declared_unit
 
 
@@ -38,6 +45,7 @@ class WitnessStep:
         name: the name of the spec that it is the root of, or None.
         text: its canonical text.
         time_ns: of the sample.
+        has_rates: whether its operator leaves samples or members out in which a rate has no value.
     """
 
     node: int
@@ -45,6 +53,7 @@ class WitnessStep:
     name: str | None
     text: str
     time_ns: int
+    has_rates: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,4 +240,8 @@ def time_of_least(
 
 
 def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:
-    return WitnessStep(node, operator_of(formula), formula.name, format_formula(formula), time_ns)
+    operator, operands = operator_of(formula), operands_of(formula)
+    if isinstance(formula, Quantified):
+        operands = (formula.body,)
+    has_rates = judged_operands(operator, operands) is not operands
+    return WitnessStep(node, operator, formula.name, format_formula(formula), time_ns, has_rates)
