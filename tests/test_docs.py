@@ -42,13 +42,18 @@ def command_lines(text: str) -> Iterator[str]:
             yield re.split(r" (?:[|>]|\|\|) ", line)[0]
 
 
+def takes_argument(command: click.Command) -> bool:
+    """Whether a command, or a group by itself as `record SCENARIO`, takes an argument."""
+    return any(isinstance(parameter, click.Argument) for parameter in command.params)
+
+
 def leaves(name: str) -> Iterator[tuple[str, click.Command]]:
-    """The command of a name, or its subcommands, with their full names."""
+    """The command of a name, and its subcommands, with their full names."""
     command = application.get_command(click.Context(application), name)
     assert command is not None
     if isinstance(command, click.Group):
         yield from ((f"{name} {inner}", each) for inner, each in command.commands.items())
-    else:
+    if not isinstance(command, click.Group) or takes_argument(command):
         yield name, command
 
 
@@ -57,10 +62,12 @@ def parse(line: str) -> None:
     arguments = shlex.split(line, comments=True)[1:]
     command: click.Command | None = application
     while isinstance(command, click.Group) and arguments and not arguments[0].startswith("-"):
-        command = command.get_command(click.Context(command), arguments[0])
-        if command is None:
+        inner = command.get_command(click.Context(command), arguments[0])
+        if inner is None and takes_argument(command):
+            break
+        if inner is None:
             raise click.UsageError(f"{arguments[0]!r} is no command")
-        arguments = arguments[1:]
+        command, arguments = inner, arguments[1:]
     assert command is not None
     command.make_context(command.name, arguments).close()
 

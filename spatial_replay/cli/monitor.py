@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
-from click.core import ParameterSource
 
 from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
 from spatial_replay.cli.options import (
@@ -22,6 +21,7 @@ from spatial_replay.cli.options import (
     output_option,
     overwrite_option,
     refuse_given,
+    refuse_options,
     serving_options,
     specs_option,
 )
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from spatial_replay.spec.formula import Specification
 
 _STATUS_S: Final = 0.5
-_DEFAULT: Final = ParameterSource.DEFAULT
 _UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
 
 
@@ -197,7 +196,8 @@ def monitor(
         refuse_given({"--topics": topics}, "says which messages are written; add -o FILE or --clips DIR")
     if clips is None:
         refuse_given({"--trigger": triggers}, "writes clips; add --clips DIR")
-        _refuse_values("before_s", "after_s", "ring")
+        context = click.get_current_context()
+        refuse_options(context, ("before_s", "after_s", "ring"), "is about clips; add --clips DIR")
     for option, given in (
         ("--for", length_s),
         ("--topic-timeout", topic_timeout_s),
@@ -243,13 +243,6 @@ def monitor(
     if output is not None:
         show(f"wrote {output}")
     return run.exit_code
-
-
-def _refuse_values(*names: str) -> None:
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        if parameter.name in names and context.get_parameter_source(parameter.name) is not _DEFAULT:
-            raise UsageError(f"{parameter.opts[0]} is about clips; add --clips DIR")
 
 
 def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:

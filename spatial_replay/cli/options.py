@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
@@ -21,7 +22,7 @@ from spatial_replay.text import counted
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
@@ -543,6 +544,22 @@ def refuse_given(options: Mapping[str, object], why: str) -> None:
     for name, value in options.items():
         if value:
             raise UsageError(f"{name} {why}")
+
+
+def refuse_options(context: click.Context, names: Collection[str], why: str) -> None:
+    """Refuse options that do not apply, if they stand on the command line.
+
+    Args:
+        names: of the parameters.
+        why: follows the name of the option.
+
+    Raises:
+        UsageError: one is given.
+    """
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is not ParameterSource.DEFAULT:
+            raise UsageError(f"{parameter.opts[0]} {why}")
 
 
 def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Path]) -> None:

@@ -18,11 +18,14 @@ from spatial_replay.cli.options import (
     durability_option,
     load_spec_options,
     log_output_option,
+    refuse_given,
+    refuse_options,
     require_choice,
 )
 from spatial_replay.cli.record import (
     SCENARIOS,
     SimulationArguments,
+    scenario_argument,
     show_film,
     simulation_options,
 )
@@ -124,148 +127,138 @@ def _redo(
     return most_severe([code, ExitCode.DAMAGED]) if redone.faults else code
 
 
-@click.group(invoke_without_command=True)
+_OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations__)
+"""Parameters that say how a run is made."""
+
+
+@click.command()
+@scenario_argument(required=False)
 @click.option(
     "--redo",
     "log",
     metavar="LOG",
     type=LogPath(),
-    help="Decide again on the samples of a planned run, with the changes of the options below.",
+    help="Instead of a run: decide again on the samples of a planned one, with the changes given here.",
 )
-@log_output_option("Copy of the log to write, with old and redone decisions (MCAP).", required=False)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
-@click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")
+@click.option("--json", "as_json", is_flag=True, help="With --redo: print one JSON object instead of text.")
+@log_output_option(
+    "Log to write (MCAP); with --redo, a copy of LOG with old and redone decisions.", required=False
+)
+@durability_option
+@click.option(
+    "--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for.  [default: the scenario's own]"
+)
 @click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")
+@click.option(
+    "--also",
+    metavar="SPEC",
+    multiple=True,
+    type=LogPath(),
+    help="Specification to evaluate, of which the planner knows nothing; repeat for several.",
+)
 @constants_option
 @setting_options
+@simulation_options
+@click.option(
+    "--timings",
+    is_flag=True,
+    help="Log how long each decision took, on /spatial/log; logs of equal options then differ.",
+)
 @click.pass_context
 def plan(
-    context: click.Context, /, log: LogFile | None, changes: Mapping[str, Any], **options: Any
-) -> int | None:
+    context: click.Context,
+    /,
+    scenario: str | None,
+    log: LogFile | None,
+    as_json: bool,
+    output: Path | None,
+    spec: LogFile | None,
+    of: str | None,
+    constants: Mapping[str, float | str],
+    changes: Mapping[str, Any],
+    **options: Any,
+) -> int:
     """Plan a run in a simulated world, and record it with every decision.
 
-    With --redo, show the planner's decisions on recorded samples with another specification or other
-    settings: the number of equal decisions, and the first one that differs, with both maps. Exits with 0 if
-    every decision does the same, otherwise with 1.
+    The planner decides what the robot moves, step by step, until the specification is satisfied or no path to
+    acceptance is left. Equal options give an equal log, byte for byte. Needs the extra `sim`. Exits with 0 if
+    the planned specification is satisfied, 1 if it is violated, 4 if it is unknown or if the planner timed
+    out.
+
+    With --redo, show the decisions on recorded samples with another specification or other settings: how many
+    are equal, and the first one that differs. Exits with 0 if all are equal, otherwise with 1.
 
     \b
     Examples:
       spatial-replay plan push -o push.mcap --seed 3
-      spatial-replay plan push -o push.mcap --settings careful.yaml --set attempts=5
-      spatial-replay plan --redo push.mcap
-      spatial-replay plan --redo table.mcap --set room=0.02
-      spatial-replay plan --redo push.mcap --spec edited.spatial -o both.mcap
+      spatial-replay plan table-setting -o set.mcap --settings careful.yaml --set attempts=5
+      spatial-replay plan --redo push.mcap --set room=0.02
     """
-    if log is not None and context.invoked_subcommand is None:
-        return _redo(log, changes=changes, **options)
     if log is not None:
-        raise UsageError(f"--redo takes no scenario; leave out {context.invoked_subcommand}")
-    if changes or any(options.values()):
-        if context.invoked_subcommand is not None:
-            raise UsageError(f"options of a run come after its scenario: plan {context.invoked_subcommand} …")
-        raise UsageError("there is nothing to plan; give a scenario, or --redo LOG")
-    if context.invoked_subcommand is None:
+        if scenario is not None:
+            raise UsageError(f"--redo takes no scenario; leave out {scenario}")
+        refuse_options(context, _OF_RUNS, "is for a run; leave it out with --redo")
+        return _redo(log, output, spec, of, constants, changes, as_json)
+    if scenario is None:
         context.fail(f"Missing a scenario ({', '.join(SCENARIOS)}), or --redo LOG.")
-    return None
+    if output is None:
+        raise UsageError("there is no log to write; give -o FILE")
+    refuse_given({"--json": as_json}, "is for --redo LOG; a run has `info LOG --decisions --json`")
+    return _plan(scenario, output, spec, of, constants, changes, **options)
 
 
-def planning_command(scenario: str) -> click.Command:
-    """Return the command `plan SCENARIO`."""
-    help_text = f"""Plan in a simulated world: {SCENARIOS[scenario]}.
+def _plan(
+    scenario: str,
+    output: Path,
+    spec: LogFile | None,
+    of: str | None,
+    constants: Mapping[str, float | str],
+    changes: Mapping[str, Any],
+    *,
+    also: tuple[LogFile, ...],
+    durability: Durability,
+    timings: bool,
+    simulation: SimulationArguments,
+) -> int:
+    """Plan and record a run."""
+    # imported here so that --help stays fast
+    from spatial_replay.runs.planned import record_plan
+    from spatial_replay.simulation.tabletop import default_specification
 
-    The planner decides what the robot moves, step by step, until the specification is satisfied or no path to
-    acceptance is left. The log records every decision. Equal options give an equal log, byte for byte. Needs
-    the extra `sim`. Exits with 0 if the planned specification is satisfied, 1 if it is violated, 4 if it is
-    unknown or if the planner timed out.
-
-    \b
-    Examples:
-      spatial-replay plan {scenario} -o run.mcap --seed 3
-      spatial-replay plan {scenario} -o run.mcap --spec edited.spatial
-      spatial-replay plan {scenario} -o run.mcap --settings careful.yaml --set attempts=5
-      spatial-replay info run.mcap --decisions
-    """
-
-    @click.command(scenario, help=help_text)
-    @log_output_option("Log to write (MCAP).")
-    @durability_option
-    @click.option(
-        "--spec",
-        metavar="SPEC",
-        type=LogPath(),
-        help="Specification to plan for.  [default: the scenario's own]",
-    )
-    @click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")
-    @click.option(
-        "--also",
-        metavar="SPEC",
-        multiple=True,
-        type=LogPath(),
-        help="Specification to evaluate, of which the planner knows nothing; repeat for several.",
-    )
-    @constants_option
-    @simulation_options
-    @click.option(
-        "--timings",
-        is_flag=True,
-        help="Log how long each decision took, on /spatial/log; logs of equal options then differ.",
-    )
-    @setting_options
-    def command(
-        output: Path,
-        durability: Durability,
-        spec: LogFile | None,
-        of: str | None,
-        also: tuple[LogFile, ...],
-        constants: Mapping[str, float | str],
-        simulation: SimulationArguments,
-        timings: bool,
-        changes: Mapping[str, Any],
-    ) -> int:
-        # imported here so that --help stays fast
-        from spatial_replay.runs.planned import record_plan
-        from spatial_replay.simulation.tabletop import default_specification
-
-        named = [*([] if spec is None else [spec]), *also]
-        files = load_spec_options(named, constants, lambda: default_specification(scenario))
-        # constants alone are values of the scenario's own specification
-        file = files.pop(0) if files and (spec is not None or not also) else None
-        if file is not None:
-            require_choice(file, of)
-        with progress("samples") as advance:
-            planned = record_plan(
-                scenario,
-                output,
-                file,
-                name=of,
-                inputs=local_files(named),
-                advance=advance,
-                durability=durability,
-                changes=changes,
-                timings=timings,
-                also=files,
-                **simulation,
-            )
-        show(
-            f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
-            f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
+    inputs = [*([] if spec is None else [spec]), *also]
+    files = load_spec_options(inputs, constants, lambda: default_specification(scenario))
+    # constants alone are values of the scenario's own specification
+    file = files.pop(0) if files and (spec is not None or not also) else None
+    if file is not None:
+        require_choice(file, of)
+    with progress("samples") as advance:
+        planned = record_plan(
+            scenario,
+            output,
+            file,
+            name=of,
+            inputs=local_files(inputs),
+            advance=advance,
+            durability=durability,
+            changes=changes,
+            timings=timings,
+            also=files,
+            **simulation,
         )
-        for note in filter(None, (planned.bounds, planned.yaws)):
-            show(note)
-        show_film(simulation["cameras"])
-        show(f"planning took {planned.planning_s:.2f} s", err=True)
-        show(f"the planner: {planned.reason}")
-        if planned.ended == "no path":
-            command_line = shlex.join(["spatial-replay", "info", str(output), "--decisions"])
-            show(f"  {command_line} shows what was tried, and why it was given up")
-        show(f"the log: {planned.name} is {planned.verdict}")
-        for name, verdict in planned.others.items():
-            show(f"  {name}, of which the planner knew nothing, is {verdict}")
-        # a planner that timed out ended the run: an unreached goal is then no violation
-        return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])
-
-    return command
-
-
-for _scenario in SCENARIOS:
-    plan.add_command(planning_command(_scenario))
+    show(
+        f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
+        f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
+    )
+    for note in filter(None, (planned.bounds, planned.yaws)):
+        show(note)
+    show_film(simulation["cameras"])
+    show(f"planning took {planned.planning_s:.2f} s", err=True)
+    show(f"the planner: {planned.reason}")
+    if planned.ended == "no path":
+        command_line = shlex.join(["spatial-replay", "info", str(output), "--decisions"])
+        show(f"  {command_line} shows what was tried, and why it was given up")
+    show(f"the log: {planned.name} is {planned.verdict}")
+    for name, verdict in planned.others.items():
+        show(f"  {name}, of which the planner knew nothing, is {verdict}")
+    # a planner that timed out ended the run: an unreached goal is then no violation
+    return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])

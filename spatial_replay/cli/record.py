@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, Final, TypedDict, TypeVar
 
 import click
 
@@ -41,6 +40,8 @@ if TYPE_CHECKING:
     from spatial_replay.recording.log import VerdictChange
     from spatial_replay.runs.record_video import FrameSource, KeepVideo
     from spatial_replay.simulation.world import Injection, Start
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 def duration_ns(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
@@ -237,14 +238,8 @@ def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
     return [offset - min(0, *offsets) for offset in offsets]
 
 
-SCENARIOS: Mapping[str, str] = MappingProxyType(
-    {
-        "push": "three blocks on a table, and a robot that pushes them",
-        "pick-place": "nine things on a table, and a robot that picks and places them",
-        "table-setting": "cutlery, a cup and a plate, and a robot that sets the table",
-    }
-)
-"""The simulated worlds, with a description of each."""
+SCENARIOS: Final = ("push", "pick-place", "table-setting")
+"""The simulated worlds."""
 
 
 def _injections(
@@ -337,83 +332,111 @@ def show_film(videos: Sequence[Path]) -> None:
         show(f"filmed {listed}: spatial-replay record video {listed} --tags {tags} -o seen.mcap")
 
 
-def recording_command(scenario: str) -> click.Command:
-    """Return the command `record SCENARIO`."""
-    help_text = f"""Record a simulated world: {SCENARIOS[scenario]}.
+class RecordGroup(click.Group):
+    """`record SCENARIO`, and commands that record other sources."""
 
-    The robot follows a script. Equal options give an equal log, byte for byte. Needs the extra `sim`.
+    allow_extra_args = False
+    allow_interspersed_args = True
 
-    \b
-    Examples:
-      spatial-replay record {scenario} -o run.mcap
-      spatial-replay record {scenario} -o run.mcap --seed 3 --duration 10s
-      spatial-replay record {scenario} -o run.mcap --noise 0.002 --inject slip@4s
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args and args[0] in self.commands:
+            ctx.args = args
+            return args
+        return click.Command.parse_args(self, ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        if not ctx.args:
+            return click.Command.invoke(self, ctx)
+        name, *arguments = ctx.args
+        # beside this context: below it, the usage would name SCENARIO, too
+        path = f"{ctx.info_name} {name}"
+        with self.commands[name].make_context(path, arguments, parent=ctx.parent) as context:
+            return context.command.invoke(context)
+
+    def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
+        return click.Command.collect_usage_pieces(self, ctx)
+
+
+def scenario_argument(*, required: bool, others: Sequence[str] = ()) -> Callable[[_Command], _Command]:
+    """Return the argument SCENARIO.
+
+    Args:
+        required: whether the command needs one.
+        others: commands that may stand there, for completion.
     """
 
-    @click.command(scenario, help=help_text)
-    @log_output_option("Log to write (MCAP).")
-    @durability_option
-    @specs_option(
-        "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
+    def complete(context: click.Context, parameter: click.Parameter, begin: str) -> list[str]:
+        return [name for name in (*SCENARIOS, *others) if name.startswith(begin)]
+
+    return click.argument(
+        "scenario",
+        metavar="SCENARIO",
+        type=click.Choice(list(SCENARIOS)),
+        required=required,
+        shell_complete=complete,
     )
-    @constants_option
-    @click.option(
-        "--duration",
-        "length_ns",
-        metavar="T",
-        callback=duration_ns,
-        help="Simulated time, such as 10s.  [default: to the end of the script]",
-    )
-    @simulation_options
-    def command(
-        output: Path,
-        durability: Durability,
-        specs: tuple[LogFile, ...],
-        constants: Mapping[str, float | str],
-        length_ns: int | None,
-        simulation: SimulationArguments,
-    ) -> int:
-        # imported here so that --help stays fast
-        from spatial_replay.runs.scripted import record_script
-        from spatial_replay.simulation.tabletop import default_specification
-
-        files = load_spec_options(specs, constants, lambda: default_specification(scenario))
-        with progress("samples") as advance:
-            recorded = record_script(
-                scenario,
-                output,
-                files or None,
-                duration_ns=length_ns,
-                inputs=local_files(specs),
-                advance=advance,
-                durability=durability,
-                **simulation,
-            )
-        show(
-            f"wrote {output}: {counted(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
-            f"{counted(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
-        )
-        show(f"the robot: {recorded.outcome}")
-        show_film(simulation["cameras"])
-        return ExitCode.SATISFIED
-
-    return command
 
 
-@click.group()
-def record() -> None:
-    """Record a run as a log (MCAP).
+@click.group(cls=RecordGroup)
+@scenario_argument(required=True, others=("tracks", "video"))
+@log_output_option("Log to write (MCAP).")
+@durability_option
+@specs_option("Specification to evaluate while recording; repeat for several.  [default: the scenario's own]")
+@constants_option
+@click.option(
+    "--duration",
+    "length_ns",
+    metavar="T",
+    callback=duration_ns,
+    help="Simulated time, such as 10s.  [default: to the end of the script]",
+)
+@simulation_options
+def record(
+    scenario: str,
+    output: Path,
+    durability: Durability,
+    specs: tuple[LogFile, ...],
+    constants: Mapping[str, float | str],
+    length_ns: int | None,
+    simulation: SimulationArguments,
+) -> int:
+    """Record a run of a simulated world as a log (MCAP), or with the commands below another source.
+
+    SCENARIO is push (three blocks on a table, and a robot that pushes them), pick-place (nine things on a
+    table, and a robot that picks and places them) or table-setting (cutlery, a cup and a plate, and a robot
+    that sets the table). The robot follows a script. Equal options give an equal log, byte for byte. Needs
+    the extra `sim`.
 
     \b
     Examples:
+      spatial-replay record push -o run.mcap --seed 3 --duration 10s
+      spatial-replay record pick-place -o run.mcap --noise 0.002 --inject drop@7s
       spatial-replay record tracks blocks.jsonl.gz -o run.mcap
-      spatial-replay record push -o run.mcap
       spatial-replay record video table.mp4 --tags tags.yaml -o run.mcap
     """
+    # imported here so that --help stays fast
+    from spatial_replay.runs.scripted import record_script
+    from spatial_replay.simulation.tabletop import default_specification
 
-
-for _scenario in SCENARIOS:
-    record.add_command(recording_command(_scenario))
+    files = load_spec_options(specs, constants, lambda: default_specification(scenario))
+    with progress("samples") as advance:
+        recorded = record_script(
+            scenario,
+            output,
+            files or None,
+            duration_ns=length_ns,
+            inputs=local_files(specs),
+            advance=advance,
+            durability=durability,
+            **simulation,
+        )
+    show(
+        f"wrote {output}: {counted(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
+        f"{counted(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
+    )
+    show(f"the robot: {recorded.outcome}")
+    show_film(simulation["cameras"])
+    return ExitCode.SATISFIED
 
 
 record.add_command(video)

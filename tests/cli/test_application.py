@@ -147,6 +147,10 @@ def test_a_shell_completes_commands_and_options(tmp_path: Path) -> None:
     for words, expected in (
         ("spatial-replay ch", "plain,check"),
         ("spatial-replay check --str", "plain,--strict-names"),
+        ("spatial-replay record pu", "plain,push"),
+        ("spatial-replay record vi", "plain,video"),
+        ("spatial-replay record push --inj", "plain,--inject"),
+        ("spatial-replay record video --hold", "plain,--hold-hidden"),
     ):
         completed = run_process(
             cwd=tmp_path,

@@ -156,6 +156,7 @@ def test_settings_come_from_a_file_and_options_have_precedence(tidied, tmp_path)
         (("--set", "yaws=0,3x"), "3x"),
         (("--set", "skill=throw"), "--set skill: expected push (the path matters)"),
         (("push",), "--redo takes no scenario"),
+        (("--seed", "0"), "--seed is for a run; leave it out with --redo"),
     ],
 )
 def test_a_mistake_on_the_command_line_is_named(tidied, arguments, message):
@@ -164,10 +165,10 @@ def test_a_mistake_on_the_command_line_is_named(tidied, arguments, message):
     assert message in found.output
 
 
-def test_options_of_a_run_come_after_its_scenario():
-    found = run("plan", "--set", "room=0.1", "push", "-o", "run.mcap")
+def test_a_scenario_is_required_without_a_log_to_redo():
+    found = run("plan", "--set", "room=0.1", "-o", "run.mcap")
     assert found.exit_code == 2
-    assert "after its scenario" in found.output
+    assert "Missing a scenario (push, pick-place, table-setting), or --redo LOG." in found.output
 
 
 def test_every_setting_is_in_the_schema_in_the_help_and_on_the_page():
