@@ -38,7 +38,6 @@ from spatial_replay.spec.formula import (
     TrackedName,
     iter_nodes,
     judged,
-    judged_operands,
     operands_of,
     operator_of,
 )
@@ -198,7 +197,7 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
 
     Args:
         node: its id as written.
-        sign: 1 if it has to hold, -1 if it must not, 0 if both count. Only in the first is it an implication.
+        sign: 1 if it has to hold, -1 if it must not, 0 if neither, as for a goal. Only the first is one.
     """
     operands = list(_operands_with_ids(formula, node))
     operator = operator_of(formula)
@@ -241,8 +240,16 @@ def _without_negation(formula: Formula, node: int) -> tuple[Formula, int]:
     return (operands_of(formula)[0], node + 1) if is_negation else (formula, node)
 
 
+_GOALS = frozenset({("F", 0), ("O", 0), ("U", 1), ("S", 1), ("W", 1), ("R", 0)})
+"""Operators and the places of their operands that hold in some sample, not in all."""
+
+
+def _body(node: Quantified) -> Formula:
+    return _implications_of(node.body, sign=int(node.quantifier == "forall")).formula
+
+
 def _sign_below(operator: str, place: int, sign: int) -> int:
-    if operator in ("xor", "<->"):
+    if operator in ("xor", "<->") or (operator, place) in _GOALS:
         return 0
     return -sign if operator == "not" or (operator == "->" and place == 0) else sign
 
@@ -386,7 +393,7 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
 
     Within the consequent of another one, which is said as well, both antecedents have to hold.
     """
-    stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_implications_of(node.body).formula, ())]
+    stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
     while stack:
         current, given = stack.pop()
         if isinstance(current, Quantified):
@@ -522,9 +529,7 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
         if is_about_having_rates(bound):
             result[:, place] = leaves[[low, high], place]
         elif isinstance(bound, Quantified):
-            body = _implications_of(bound.body).formula
-            (body,) = judged_operands(bound.quantifier, (body,))
-            column = evidence.columns([replace(bound, body=_without_tests(body))])
+            column = evidence.columns([_without_tests(bound)])
             result[:, place] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)
@@ -533,12 +538,13 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
 
 
 def _without_tests(formula: Formula) -> Formula:
-    """Return the body of a quantifier with unknown atoms, but for those in antecedents."""
+    """Return a quantifier whose body has unknown atoms, but for those in antecedents."""
     match formula:
         case Atom():
             return _UNKNOWN
         case Quantified():
-            return replace(formula, body=_without_tests(formula.judged))
+            judged_body = replace(formula, body=_body(formula)).judged
+            return replace(formula, body=_without_tests(judged_body))
         case Boolean(operator="->" | "given" | "with", operands=(antecedent, consequent)):
             return replace(formula, operands=(antecedent, _without_tests(consequent)))
         case Boolean():

@@ -257,10 +257,18 @@ def test_a_window_that_the_end_of_the_log_cut_is_said_where_it_decides(
     assert _document(folder, "hold.spatial", "--to", "5s", "--fail-on", "cut")[0] == 0
 
 
+@pytest.mark.parametrize(
+    "body",
+    [
+        "x ovlp plate -> x dist cup >= 1",
+        "not (x ovlp plate) or x dist cup >= 1",
+        "not (x ovlp plate and not (x dist cup >= 1))",
+    ],
+)
 def test_an_antecedent_that_held_for_no_member_tests_nothing(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: pytest.CaptureFixture[str], body: str
 ) -> None:
-    body = "forall x in (all except plate): (x ovlp plate -> x dist cup >= 1)"
+    body = f"forall x in (all except plate): ({body})"
     (folder / "each.spatial").write_text(f"spec polite = G ({body})\n")
     code, document = _document(folder, "each.spatial")
     (polite,) = document["specifications"]

@@ -309,6 +309,7 @@ def test_a_pass_that_tested_nothing_is_marked(formula: str, reason: str, message
         "G (not (p >= 9 and q >= 0))",
         "G (not (q >= 9))",
         "F (p >= 3 or q >= 9)",
+        "F (not (q >= 9) or q >= 12)",
     ],
 )
 def test_a_pass_that_tested_something_is_not_marked(formula: str) -> None:
