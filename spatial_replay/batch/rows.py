@@ -91,6 +91,7 @@ class ResultRow:
         tested: what the verdict was tested by, see `SpecResult.tested`; None if there is an error.
         untested: sentences on the parts for which that is not "full".
         vacuous: sentences on the parts that decided nothing.
+        left: sentences on the members of groups that left the log within reach of a threshold and came back.
         dropped: what the recorder of the log dropped, in words; None for nothing.
         samples: how many were evaluated.
         start_ns: time of the first of them.
@@ -123,6 +124,7 @@ class ResultRow:
     tested: Tested | None = None
     untested: tuple[str, ...] = ()
     vacuous: tuple[str, ...] = ()
+    left: tuple[str, ...] = ()
     dropped: str | None = None
     samples: int = 0
     start_ns: int | None = None
@@ -254,6 +256,7 @@ def _rows_of_file(
         faults=_some(replayed.faults),
         remarks=_some(replayed.remarks),
         missing=_some([_missing(each) for each in replayed.missing]),
+        left=_some([departure.message for departure in replayed.left]),
         dropped=replayed.dropped.text or None,
     )
     pairs = zip(replay.trees, replayed.results, strict=True)

@@ -537,7 +537,7 @@ def run_batch(
 
     Args:
         results: the folder of results or its address, made if need be.
-        fail_on: "vacuous", "cut" and "unknown": what fails although the case allows it.
+        fail_on: "vacuous", "cut", "unknown" and "left": what fails although the case allows it.
         progress: shows how many logs have been hashed, and evaluated.
 
     Raises:
@@ -708,7 +708,7 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
     return pa.table({field.name: columns[field.name] for field in schema}, schema=schema)
 
 
-_JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "dropped", "faults", "error"]
+_JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "left", "dropped", "faults", "error"]
 
 
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:

@@ -483,7 +483,7 @@ def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     """Return the row of a result that only the baseline has, given its row there."""
     kept = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
     nothing: dict[str, Any] = {
-        name: [] for name in ("explanation", "untested", "vacuous", "faults", "remarks", "missing")
+        name: [] for name in ("explanation", "untested", "vacuous", "left", "faults", "remarks", "missing")
     }
     nothing |= dict.fromkeys(("robustness", "lower", "upper"), math.nan)
     return {

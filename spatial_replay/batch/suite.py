@@ -131,7 +131,7 @@ class Expectation:
         """Return why a result with a verdict does not pass, in a few words; None if it does.
 
         Args:
-            fail_on: "vacuous", "cut" and "unknown": what fails although the case allows it.
+            fail_on: "vacuous", "cut", "unknown" and "left": what fails although the case allows it.
         """
         failure = self._unexpected(outcome)
         is_unknown = outcome.verdict == Verdict.UNKNOWN
@@ -141,6 +141,8 @@ class Expectation:
             failure = f"{VACUOUS}: {outcome.vacuous[0]}"
         elif failure is None and "cut" in fail_on and outcome.tested == "cut":
             failure = f"cut: {outcome.untested[0]}"
+        elif failure is None and "left" in fail_on and outcome.left:
+            failure = f"left: {outcome.left[0]}"
         elif failure is None and "vacuous" not in self.allow and outcome.tested == "nothing":
             failure = f"{UNTESTED}: {outcome.untested[0]}"
         elif failure is None and "dropped" not in self.allow and outcome.dropped:

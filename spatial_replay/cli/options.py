@@ -219,7 +219,7 @@ fail_on_option = click.option(
     metavar="KINDS",
     callback=partial(_read_kinds, FAILING_KINDS),
     default="",
-    help="Exit with 1 on these as well: vacuous, cut, unknown, or several with commas between.",
+    help="Exit with 1 on these as well: vacuous, cut, unknown, left, or several with commas between.",
 )
 
 allow_option = click.option(

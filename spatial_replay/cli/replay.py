@@ -371,7 +371,8 @@ def replay(
     nothing in the log tested a result, or if the recorder dropped samples; --allow lets these pass. With
     --fail-on vacuous it is 1 if a part of a specification decided nothing: an empty window, an antecedent
     that never held, a group without members, a template without objects. With --fail-on cut it is 1 if a
-    deciding window was cut short by the end of the log.
+    deciding window was cut short by the end of the log, with --fail-on left if a member of a class left
+    within reach of a threshold and came back.
 
     With --watch the log stays in memory, and is evaluated again whenever a specification file is saved. The
     key w writes the values of --const into the files. Ctrl-C ends it with exit code 130.
@@ -453,6 +454,8 @@ def _failures(replayed: Replayed, kinds: frozenset[str], allow: frozenset[str]) 
     if "vacuous" in kinds and (replayed.vacuous or any(result.vacuous for result in results)):
         yield "violated"
     if "cut" in kinds and any(result.tested == "cut" for result in results):
+        yield "violated"
+    if "left" in kinds and replayed.left:
         yield "violated"
     if "vacuous" not in allow and (replayed.vacuous or any(each.tested == "nothing" for each in results)):
         yield "unknown"

@@ -14,7 +14,7 @@ from spatial_replay.text import nearest_hint
 Semantics: TypeAlias = Literal["ltlf", "paper"]
 """Robustness over finite traces, or the paper's Def. 16 to the letter."""
 
-FAILING_KINDS: Final = ("vacuous", "cut", "unknown")
+FAILING_KINDS: Final = ("vacuous", "cut", "unknown", "left")
 """Kinds of results that fail where asked (`fail_on`)."""
 ALLOWED_KINDS: Final = ("vacuous", "dropped")
 """Kinds of results that pass where asked (`allow`)."""

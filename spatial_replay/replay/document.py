@@ -38,6 +38,10 @@ def document_from_replay(
             **json_fields(replayed, "samples", "start_ns", "end_ns", "faults", "remarks"),
             "damaged": bool(replayed.faults),
             "missing": [each.message for each in replayed.missing],
+            "left": [
+                json_fields(departure, "name", "start_ns", "end_ns", "distance", "message")
+                for departure in replayed.left
+            ],
             "dropped_samples": replayed.dropped.count,
             "unreadable_observations": replayed.unreadable,
         },

@@ -39,6 +39,7 @@ from spatial_replay.logs.messages import (
     merge,
     read_ahead,
 )
+from spatial_replay.monitor.departures import Departure, Departures
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
@@ -111,6 +112,7 @@ class Replayed:
         vacuous: templates without instances; what decided nothing within a result is in its own `vacuous`.
         certificate: hashes of what went in and came out; empty if none was asked for.
         semantics: the semantics of the formulas.
+        left: members of open groups that left within reach of a threshold and came back; also in `remarks`.
     """
 
     log: str
@@ -127,6 +129,7 @@ class Replayed:
     vacuous: tuple[UntestedPart, ...]
     certificate: Mapping[str, str]
     semantics: Semantics = "ltlf"
+    left: tuple[Departure, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -168,9 +171,14 @@ class Replay:
         self._written_files = files
         self._selection = Selection(source, files, options)
         self.files = logged_specifications(files, source.axes.units)
+        instances = [self._selection.instances(file) for file in self.files]
+        self._departures = [
+            Departures(of_file, file.regions, source.axes.units.get("", ""))
+            for of_file, file in zip(instances, self.files, strict=True)
+        ]
         self._evaluation = AnnotatedEvaluation(
             self.files,
-            [self._selection.instances(file) for file in self.files],
+            instances,
             options.semantics,
             source.attachments,
             show=show,
@@ -261,6 +269,8 @@ class Replay:
     def _add(self, trace: Trace, messages: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults
         self._names.add(trace)
+        for departures in self._departures:
+            departures.add(trace)
         own = trace.without_filling()
         self._samples += len(own)
         self._unreadable += own.unreadable_count
@@ -292,6 +302,7 @@ class Replay:
         dropped = dropped_samples(self._source)
         options = self._selection.options
         first_ns = first_sample_ns(self._source) if options.window.start_ns else self._times[0]
+        left = self._left(first_ns)
         return Replayed(
             log=self._source.name,
             samples=self._samples,
@@ -299,7 +310,12 @@ class Replay:
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=counted_from(self._faults, first_ns),
-            remarks=(*counted_from(self._remarks, first_ns), *dropped.remarks, *self._empty_ends(first_ns)),
+            remarks=(
+                *counted_from(self._remarks, first_ns),
+                *dropped.remarks,
+                *self._empty_ends(first_ns),
+                *(departure.message for departure in left),
+            ),
             missing=missing,
             dropped=dropped,
             unreadable=self._unreadable,
@@ -323,6 +339,19 @@ class Replay:
                 self._written_files, dict(self._source.metadata()).get(PLAN_METADATA)
             ),
             semantics=options.semantics,
+            left=left,
+        )
+
+    def _left(self, first_ns: int) -> tuple[Departure, ...]:
+        """Return each departure once, whichever specifications it is of, by time."""
+        by_start = {
+            (departure.start_ns, departure.name): departure
+            for departures in self._departures
+            for departure in departures.departures
+        }
+        return tuple(
+            replace(departure, message=counted_from([departure.message], first_ns)[0])
+            for _, departure in sorted(by_start.items())
         )
 
     def _empty_ends(self, first_ns: int) -> Iterator[Sentence]:

@@ -333,3 +333,32 @@ def test_a_kind_of_failure_that_there_is_not_is_refused(
 ) -> None:
     assert run(["replay", str(LOG), "--spec", "idle.spatial", "--fail-on", "vacous"]) == 2
     assert "--fail-on: 'vacous' is not a kind of result; did you mean 'vacuous'?" in capsys.readouterr().err
+
+
+def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def seen(name: str, x: float, class_name: str) -> dict[str, object]:
+        return {"name": name, "class": class_name, "parts": [{"vertices": [[x, 0.0]], "radius": 0.0}]}
+
+    samples = []
+    for k in range(60):
+        objects = [seen("cart", 0.0, "robot"), seen("person_5", 0.7, "dog" if 41 <= k < 50 else "person")]
+        objects += [] if 22 <= k < 38 else [seen("person_3", 0.6, "person"), seen("person_4", 9.0, "person")]
+        samples.append({"time_ns": k * 100_000_000, "objects": objects})
+    (folder / "visits.jsonl").write_text("\n".join(map(json.dumps, samples)))
+    (folder / "safe.spatial").write_text(
+        'group people = class "person"\nspec safe = G (forall p in people: cart dist p >= 0.5)\n'
+    )
+    arguments = ["replay", "visits.jsonl", "--spec", "safe.spatial", "--json", "-"]
+    assert run(arguments) == 0
+    left = json.loads(capsys.readouterr().out)["log"]["left"]
+    assert [departure["message"] for departure in left] == [
+        "person_3 was not in the log from 2.200 s to 3.800 s; it was 0.6 away before, from cart",
+        "person_5 was not of the class 'person' but 'dog' from 4.100 s to 5.000 s; it was 0.7 away before,"
+        " from cart",
+    ]
+    assert run([*arguments, "--fail-on", "left"]) == 1
+    assert left[0]["message"] in capsys.readouterr().err
+    assert run(["batch", "visits.jsonl", "--spec", "safe.spatial", "--fail-on", "left", "-o", "out"]) == 1
+    assert f"left: {left[0]['message']}" in capsys.readouterr().out
