@@ -519,7 +519,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 
 
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
-    """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers, empty groups and rates."""
+    """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers, empty groups, rates."""
     low, high = low_and_high(len(leaves), wide=True)
     result = roomy((2, *leaves.shape[1:]), np.float64)
     result[0], result[1] = -np.inf, np.inf

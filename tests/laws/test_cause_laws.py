@@ -30,6 +30,7 @@ from spatial_replay.spec.formula import (
     Truth,
     iter_nodes,
     operands_of,
+    operator_of,
 )
 
 _BEYOND = st.builds(
@@ -150,6 +151,9 @@ def test_a_vacuous_part_can_be_replaced_by_true(formula, trace):
 @examples(200)
 @given(condition=formulas_of_leaves, response=formulas_of_leaves, trace=signal_runs())
 def test_every_spelling_of_an_implication_is_tested_by_the_same(condition, response, trace):
+    # `not a or not b` has two conditions, and `not (not a and not b)` none
+    assume("not" not in (operator_of(condition), operator_of(response)))
+
     def negation(operand: Formula) -> Formula:
         return Boolean("not", (operand,))
 
