@@ -191,8 +191,7 @@ _OUTPUTS = (
         "-o",
         "--output",
         metavar="RESULTS",
-        help="Folder for results, local or in a bucket; the next run continues from it.  "
-        "[default: results, or SUITE.results]",
+        help="Folder for results, or address of one.  [default: results, or SUITE.results]",
     ),
     click.option("--junit", metavar="FILE", type=click.Path(path_type=Path), help="JUnit report to write."),
     click.option(
@@ -207,12 +206,12 @@ _OUTPUTS = (
     click.option(
         "--baseline",
         metavar="RESULTS",
-        help="Results of an earlier run: results that got worse, or are missing now, fail.",
+        help="Earlier results; a result that is worse now, or missing, fails.",
     ),
     click.option(
         "--tolerance",
         metavar="T",
-        help="With --baseline: how much worse a result may be and still pass, as 5% or 0.02m.",
+        help="With --baseline: how much worse may pass, as 5% or 0.02m.",
     ),
     click.option("--update-baseline", is_flag=True, help="Write this run's results to --baseline."),
 )
@@ -245,9 +244,8 @@ def batch(
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
     folder; another run evaluates only what is new. A log that cannot be read has a row with its error.
 
-    One exit code covers all logs, with the meanings of replay. It is 0 if everything is as expected, 1 if
-    anything fails, 2 if an option does not fit a log. It is 3 if logs are damaged or unfit, 70 if the machine
-    failed. It is 4 if results are unknown, tested by nothing, or from logs with dropped samples.
+    One exit code covers all logs, with the meanings of replay: 0 if everything is as expected, 1 if anything
+    fails, 3 if logs are damaged or unfit, 4 if results are unknown or tested by nothing.
 
     \b
     Examples:

@@ -68,16 +68,16 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     "mapping_file",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Mapping file (YAML), as for a log of the same topics.  [default: samples on /spatial/objects]",
+    help="Mapping file (YAML).  [default: samples on /spatial/objects]",
 )
 @constants_option
-@output_option("Log of the whole run to write (MCAP), with the robot's own messages.")
+@output_option("Log of the whole run to write (MCAP).")
 @overwrite_option
 @click.option(
     "--topics",
     metavar="PATTERN",
     multiple=True,
-    help="Topics whose messages are written, such as '/camera/*'; repeat for several.  [default: mapped]",
+    help="Messages to write, such as '/camera/*'; repeat for several.  [default: mapped]",
 )
 @click.option(
     "--for", "length_s", metavar="T", callback=_seconds, help="End after so much time, such as 60s."
@@ -85,7 +85,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
 @click.option(
     "--until",
     type=click.Choice(["violated", "satisfied", "settled"]),
-    help="End when a spec is violated, when all are satisfied, or (settled) when each is one of these.",
+    help="End when any is violated, all are satisfied, or each is decided.",
 )
 @click.option(
     "--topic-timeout",
@@ -101,7 +101,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     callback=_seconds,
     default="200ms",
     show_default=True,
-    help="How long a sample waits for transforms and for stamps that lag behind.",
+    help="How long a sample waits for late messages.",
 )
 @click.option(
     "--trigger",
@@ -136,7 +136,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     callback=_bytes,
     default="256MB",
     show_default=True,
-    help="With --clips: memory for what waits for a trigger.",
+    help="With --clips: memory for messages.",
 )
 @click.option("--serve", "serves", is_flag=True, help="Show what is monitored to viewers over WebSocket.")
 @serving_options(8766, "With --serve: ")
@@ -164,11 +164,11 @@ def monitor(
 ) -> ExitCode:
     """Monitor a running robot through foxglove_bridge, or another server of Foxglove's WebSocket protocol.
 
-    Prints each change of a verdict with its reason, as it happens. While the connection is lost, everything
-    is unknown; the connection is made again as soon as the server is back. Ctrl-C ends the run.
+    Prints each change of a verdict with its reason. While the connection is lost, everything is unknown.
+    Ctrl-C ends the run.
 
-    Exits with 0 if the run satisfies all specifications, 1 if any is violated, 4 if none is violated
-    and any is unknown. It exits with 3 if the server does not answer, or its time jumps back.
+    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown, 3 if the server does
+    not answer or its time jumps back.
 
     With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1
     fires it, too, and so does the service `trigger` of --serve.
@@ -176,10 +176,8 @@ def monitor(
     \b
     Examples:
       spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial
-      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --for 60s -o live.mcap
-      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --until violated
-      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --trigger violated \
---before 10s --after 5s --clips clips/
+      spatial-replay monitor ws://robot:8765 --spec safety.spatial --for 60s -o live.mcap
+      spatial-replay monitor ws://robot:8765 --spec safety.spatial --trigger violated --clips clips/
     """
     by_signal = _SignalTrigger()
     if clips is not None:

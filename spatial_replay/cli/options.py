@@ -79,19 +79,14 @@ def serving_options(port: int, only_with: str = "") -> _Option:
             metavar="ADDRESS",
             default="127.0.0.1",
             show_default=True,
-            help=help_of(
-                "Address to listen on. If other machines can reach it, viewers need the token in the"
-                " printed address."
-            ),
+            help=help_of("Address to listen on; other machines need the printed token."),
         ),
         click.option(
             "--allow-origin",
             "origins",
             metavar="ORIGIN",
             multiple=True,
-            help=help_of(
-                "Web page that may connect, such as https://viewer.example.org; repeat for several."
-            ),
+            help=help_of("Web page that may connect; repeat for several."),
         ),
     ]
 
@@ -154,7 +149,7 @@ durability_option = click.option(
     type=click.Choice(["process", "disk"]),
     default="process",
     show_default=True,
-    help="process: written chunks survive a crash of this process; disk: also one of the computer (fsync).",
+    help="Written chunks survive a crash of the process, or of the computer.",
 )
 
 
@@ -181,7 +176,7 @@ constants_option = click.option(
     metavar="NAME=VALUE",
     multiple=True,
     callback=_read_constants,
-    help="Value of a constant in place of the written one, such as near=80 or hold=2s; repeat for several.",
+    help="Value of a constant, such as near=80; repeat for several.",
 )
 
 
@@ -192,8 +187,7 @@ def keep_option(text: str, default: str = "all") -> Callable[[_Command], _Comman
         "keep",
         metavar="all|mapped|PATTERN",
         multiple=True,
-        help=f"{text}: all, mapped (of mapped topics), or of topics such as '/camera/*'; repeat for several."
-        f"  [default: {default}]",
+        help=f"{text}: all, of mapped topics, or of topics such as '/camera/*'.  [default: {default}]",
     )
 
 
@@ -202,8 +196,7 @@ semantics_option = click.option(
     type=click.Choice(["ltlf", "paper"]),
     default="ltlf",
     show_default=True,
-    help="Meaning of formulas. ltlf: robustness over finite traces; paper: exactly Def. 16 of SpaTiaL's"
-    " paper.",
+    help="ltlf: finite traces; paper: Def. 16 of the paper.",
 )
 
 
@@ -216,19 +209,18 @@ def _read_kinds(
 
 fail_on_option = click.option(
     "--fail-on",
-    metavar="KINDS",
+    metavar="KIND,…",
     callback=partial(_read_kinds, FAILING_KINDS),
     default="",
-    help="Exit with 1 on these as well: vacuous, cut, unknown, left, or several with commas between.",
+    help=f"Exit with 1 on these, too: {', '.join(FAILING_KINDS)}.",
 )
 
 allow_option = click.option(
     "--allow",
-    metavar="KINDS",
+    metavar="KIND,…",
     callback=partial(_read_kinds, ALLOWED_KINDS),
     default="",
-    help="Let these pass instead of exit code 4: vacuous (tested by nothing), dropped (samples that the "
-    "recorder lost), or both with a comma between.",
+    help=f"Let these pass instead of exit code 4: {', '.join(ALLOWED_KINDS)}.",
 )
 
 
@@ -252,7 +244,7 @@ plugin_option = click.option(
     is_eager=True,
     expose_value=False,
     callback=_allow_plugins,
-    help="Python module or file with your own relations and signals; its code is run. Repeat for several.",
+    help="Module or file with your own relations and signals; its code is run.",
 )
 
 
@@ -311,26 +303,24 @@ _READING = (
         "--mapping",
         metavar="FILE",
         type=LogPath(),
-        help="Mapping file (YAML): which topics of an external log carry which objects.",
+        help="Mapping file (YAML) of an external log: topics and their objects.",
     ),
     click.option(
         "--max-lateness",
         metavar="T|all",
-        help="External logs: by how much messages may be out of order, such as 2s. 'all' sorts the whole log."
-        "  [default: 1s]",
+        help="By how much messages of an external log may be late.  [default: 1s]",
     ),
     click.option(
         "--max-gap",
         metavar="T",
-        help="If samples pause for longer than T, everything is unknown there. If one topic pauses for"
-        " longer than T, only its objects are unknown.",
+        help="Objects are unknown in longer pauses of the log or their topic.",
     ),
     click.option(
         "--read",
         metavar="KEY=VALUE",
         multiple=True,
         callback=_read_pairs,
-        help="Other options of reading, such as rate=29.97, lost=keep, y_down=true, concave=hull,"
+        help="Other options of reading: rate=29.97, lost=keep, y_down=true, concave=hull,"
         " on_time_jump=split; repeat for several.",
     ),
 )
@@ -383,15 +373,15 @@ def input_files(*files: LogFile, reading: Reading) -> tuple[Path, ...]:
 strict_names_option = click.option(
     "--strict-names",
     is_flag=True,
-    help="Refuse names that the log never has, instead of warning that they are unknown.",
+    help="Refuse names that the log never has, instead of a warning.",
 )
 
 choices_option = click.option(
     "--each",
     "choices",
     multiple=True,
-    metavar="VAR=class:C|NAME",
-    help="Objects for a template's parameter VAR: VAR=class:C, VAR=NAME or VAR=all.",
+    metavar="VAR=class:C|NAME|all",
+    help="Objects for a template's parameter, such as ego=class:person.",
 )
 
 _CONDITIONS = (
@@ -402,7 +392,7 @@ _CONDITIONS = (
         metavar="N",
         type=click.IntRange(min=1),
         default=1,
-        help="Use every Nth sample of the log; bounds in samples, such as F[0, 10], count only these.",
+        help="Use every Nth sample; bounds in samples count only these.",
     ),
     choices_option,
     constants_option,
@@ -413,7 +403,7 @@ _CONDITIONS = (
 def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add LOG and the options that say what to evaluate; the command takes them as `request`."""
     log = click.argument("log", type=LogPath())
-    specs = specs_option("Specification file; repeat for several.  [default: those in the log]")
+    specs = specs_option("Specification; repeat for several.  [default: those in the log]")
     gathered = reading_options(gather("request", EvaluationArguments, command))
     return add_options((log, specs, *_CONDITIONS), gathered)
 

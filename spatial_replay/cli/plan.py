@@ -138,12 +138,10 @@ _OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations_
     "log",
     metavar="LOG",
     type=LogPath(),
-    help="Instead of a run: decide again on the samples of a planned one, with the changes given here.",
+    help="Decide again on the samples of a planned run, with these options.",
 )
-@click.option("--json", "as_json", is_flag=True, help="With --redo: print one JSON object instead of text.")
-@log_output_option(
-    "Log to write (MCAP); with --redo, a copy of LOG with old and redone decisions.", required=False
-)
+@click.option("--json", "as_json", is_flag=True, help="With --redo: print JSON instead of text.")
+@log_output_option("Log to write (MCAP); with --redo, a copy with both decisions.", required=False)
 @durability_option
 @click.option(
     "--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for.  [default: the scenario's own]"
@@ -154,7 +152,7 @@ _OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations_
     metavar="SPEC",
     multiple=True,
     type=LogPath(),
-    help="Specification to evaluate, of which the planner knows nothing; repeat for several.",
+    help="Specification that is evaluated only; repeat for several.",
 )
 @constants_option
 @setting_options
@@ -162,7 +160,7 @@ _OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations_
 @click.option(
     "--timings",
     is_flag=True,
-    help="Log how long each decision took, on /spatial/log; logs of equal options then differ.",
+    help="Log how long decisions took; logs of equal options then differ.",
 )
 @click.pass_context
 def plan(

@@ -136,9 +136,9 @@ def video(
     \b
     Examples:
       spatial-replay record video table.mp4 --tags tags.yaml --spec table.spatial -o run.mcap
-      spatial-replay record video left.mp4 right.mp4 --tags tags.yaml -o run.mcap --offset right.mp4=0.12s
+      spatial-replay record video left.mp4 right.mp4 --tags tags.yaml -o run.mcap --offset 2=0.12s
       spatial-replay record video drive.bag --topic /camera/image_raw --tags tags.yaml -o run.mcap
-      spatial-replay record video --camera 0 --tags tags.yaml --spec table.spatial -o run.mcap --for 60s
+      spatial-replay record video --camera 0 --tags tags.yaml -o run.mcap --for 60s
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_existing
@@ -264,7 +264,11 @@ def _starts(context: click.Context, parameter: click.Parameter, texts: tuple[str
 
 _SIMULATION = (
     click.option(
-        "--seed", type=click.IntRange(0), default=0, help="Seed of initial poses and noise.  [default: 0]"
+        "--seed",
+        metavar="N",
+        type=click.IntRange(0),
+        default=0,
+        help="Seed of initial poses and noise.  [default: 0]",
     ),
     click.option(
         "--noise",
@@ -280,7 +284,7 @@ _SIMULATION = (
         metavar="MISHAP",
         multiple=True,
         callback=_injections,
-        help="Mishap to inject: drop@7s, slip@7s, or slip for the whole run; repeat for several.",
+        help="Mishap: drop@7s, slip@7s, or slip throughout; repeat for several.",
     ),
     click.option(
         "--start",
@@ -288,20 +292,17 @@ _SIMULATION = (
         metavar="NAME=X,Y[,TURN]",
         multiple=True,
         callback=_starts,
-        help="Where an object is at the beginning, in metres and radians; repeat for several."
-        "  [default: as the seed has it]",
+        help="First place of an object, in metres and radians; repeat for several.",
     ),
-    click.option(
-        "--gui", is_flag=True, help="Show the world in a window, no faster than real time. Needs a display."
-    ),
+    click.option("--gui", is_flag=True, help="Show the world in a window, no faster than real time."),
     click.option(
         "--camera",
         "cameras",
         metavar="VIDEO",
         multiple=True,
         type=click.Path(path_type=Path),
-        help="Film the run with AprilTags on the objects: a video, and its tags file beside it. Given"
-        " twice, from two sides, so that the arm hides less. Needs the extra `vision`.",
+        help="Film the run with AprilTags on the objects, and write a tags file beside the video. Given"
+        " twice, from two sides. Needs the extra `vision`.",
     ),
 )
 

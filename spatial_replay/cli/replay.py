@@ -326,7 +326,7 @@ def _serve(
     "--arrow",
     metavar="RESULT",
     default="",
-    help="With -o: the violated result that the scene's arrow points at.  [default: the first violated one]",
+    help="With -o: violated result for the scene's arrow.  [default: the first]",
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Results to write, as one JSON object.")
 @click.option("--series", is_flag=True, help="With --json: add four numbers of every node at every sample.")
@@ -334,7 +334,7 @@ def _serve(
     "--to-end",
     "signal",
     is_flag=True,
-    help="With --json: as --series, plus, for each node and sample, the robustness from there to the end.",
+    help="With --json: as --series, with the robustness to the end, too.",
 )
 @click.option(
     "--window",
@@ -363,30 +363,20 @@ def replay(
 ) -> int:
     """Evaluate specifications over a recorded log.
 
-    Write a time T as 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
     2026-01-31T12:00:00Z.
 
-    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown.
-    It exits with 3 if the log is damaged; the verdicts cover only the readable part. The code is also 4 if
-    nothing in the log tested a result, or if the recorder dropped samples; --allow lets these pass. With
-    --fail-on vacuous it is 1 if a part of a specification decided nothing: an empty window, an antecedent
-    that never held, a group without members, a template without objects. With --fail-on cut it is 1 if a
-    deciding window was cut short by the end of the log, with --fail-on left if a member of a class left
-    within reach of a threshold and came back.
-
-    With --watch the log stays in memory, and is evaluated again whenever a specification file is saved. The
-    key w writes the values of --const into the files. Ctrl-C ends it with exit code 130.
+    Exits with 0 if all results are satisfied, 1 if any is violated, 3 if the log is damaged. The code is 4 if
+    a result is unknown or tested by nothing, or if the recorder dropped samples. With --watch, the key w
+    writes the values of --const into the files.
 
     \b
     Examples:
       spatial-replay replay run.mcap --spec blocks.spatial -o annotated.mcap
       spatial-replay replay run.mcap --spec edited.spatial --json -
       spatial-replay replay run.mcap --spec blocks.spatial --const near=80 --fail-on vacuous,unknown
-      spatial-replay replay run.mcap --spec blocks.spatial --window 10s
-      spatial-replay replay run.mcap --spec blocks.spatial --watch
       spatial-replay replay walk.jsonl --spec walk.spatial --each ego=class:person
-      spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial
-      spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --topics '/camera/*'
+      spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial --watch
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.messages import MAPPED

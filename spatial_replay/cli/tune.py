@@ -130,7 +130,7 @@ def tune(
     Examples:
       spatial-replay tune --spec blocks.spatial --good good/*.mcap --bad bad/*.mcap
       spatial-replay tune --spec blocks.spatial --good good/*.mcap --vary near=40:100 --write
-      spatial-replay tune --spec blocks.spatial --good a.mcap --vary near --vary hold=1s:4s -o surface.png
+      spatial-replay tune --spec blocks.spatial --good a.mcap --vary near --vary hold -o surface.png
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_inputs
