@@ -1,7 +1,8 @@
 """Read YAML that people write: text in; plain values with their line numbers, or all errors at once, out.
 
 Size and depth are limited; tags, aliases and repeated keys are errors. Plain scalars follow YAML 1.2, so that
-`no` and `12:30` are texts: a topic or a name never becomes a truth value or a number of minutes. A document
+`no` and `12:30` are texts: a topic or a name never becomes a truth value or a number of minutes. Numbers
+that are not finite are errors, since comparing with one holds always or never. A document
 is checked against a JSON Schema, whose descriptions say what belongs where; what a schema cannot express,
 the caller adds.
 """
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
+from math import isfinite
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -128,7 +130,13 @@ def _value(node: yaml.Node, place: Place, document: Document) -> Value:
         return [_value(each, (*place, index), document) for index, each in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
         return _table(node, place, document)
-    return _scalar(node.value) if isinstance(node, yaml.ScalarNode) and node.style is None else node.value
+    if not isinstance(node, yaml.ScalarNode) or node.style is not None:
+        return node.value
+    value = _scalar(node.value)
+    if isinstance(value, float) and not isfinite(value):
+        fault = f"{_text_from_place(place)}{cut(node.value, 60)} is no finite number; give one, such as 0.5"
+        document.faults.append((node.start_mark.line + 1, fault))
+    return value
 
 
 def _table(node: yaml.MappingNode, place: Place, document: Document) -> dict[str, Value]:

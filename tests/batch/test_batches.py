@@ -505,6 +505,10 @@ def test_a_suite_requires_what_info_prints_and_refuses_unfit_logs(fleet: Path) -
         (error,) = ElementTree.parse("junit.xml").getroot().iter("error")
         assert error.get("type") == "unfit"
         assert lacking in str(error.get("message"))
+    for number in ("requires: {samples: {rate: .nan}}", "at_least: .nan", "tolerance: .inf"):
+        Path("suite.yaml").write_text(f"{suite}{number}")
+        refused = batch("suite.yaml")
+        assert (refused.code, "is no finite number; give one" in refused.err) == (2, True)
     Path("suite.yaml").write_text(f"{suite}requires: {{topics: {{/tf: {{rates: 5}}}}}}")
     assert "did you mean 'rate'?" in batch("suite.yaml").err
 
