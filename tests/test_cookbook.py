@@ -25,6 +25,15 @@ def at(places: Sequence[tuple[float, float]], class_name: str | None = None) -> 
     return [sr.TrackedObject(sr.Footprint.disc(x, y, 0.01), class_name=class_name) for x, y in places]
 
 
+def visits(places: Sequence[tuple[float, float] | None]) -> sr.Trace:
+    """A robot at the origin, and ann at these places, one a sample; None where she is not in view."""
+    robot, *ann = at([(0, 0), *(place or OUT for place in places)])
+    return sr.Trace.from_samples(
+        sr.Sample(step * SECOND, {"robot": robot, **({"ann": each} if place else {})})
+        for step, (each, place) in enumerate(zip(ann, places, strict=True))
+    )
+
+
 def run(
     objects: dict[str, list[sr.TrackedObject]] | None = None,
     signals: dict[str, Sequence[float]] | None = None,
@@ -91,6 +100,7 @@ CASES = {
     "two_of_three": (three([OUT, IN, IN], [OUT, OUT, IN]), three([OUT, IN, OUT], [OUT, OUT, IN])),
     "one_at_a_time": (three([IN, OUT, OUT], [OUT, OUT, IN]), three([IN, IN, OUT], [OUT, IN, IN])),
     "twice": (run({"robot": at([IN, OUT, IN])}), run({"robot": at([OUT, IN, IN])})),
+    "seen": (visits([None, (2, 0), None, (1, 0)]), visits([(2, 0), None, (0.4, 0)])),
     "steady": (
         run({"cup": at([(0, 0), (0, 0), (0.5, 0)]), "kettle": at([(2, 0), (0.1, 0), (2, 0)])}),
         run({"cup": at([(0, 0), (0.1, 0), (0.5, 0)]), "kettle": at([(2, 0), (0.1, 0), (2, 0)])}),

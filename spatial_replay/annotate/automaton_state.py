@@ -54,8 +54,8 @@ class AutomatonRun:
     Cutting the samples into blocks changes no message.
 
     Attributes:
-        propositions: the nodes that are the automaton's propositions; of one that is about rates, the node that
-            it judges.
+        propositions: the nodes that are the automaton's propositions, or that these judge where rates have
+            values.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class AutomatonRun:
 
 
 def _node_of(proposition: Formula, formula: Formula, numbers: Mapping[int, int]) -> int:
-    """Return the node that a proposition is, or that it is about where it leaves samples without a rate out."""
+    """Return the node that a proposition is, or that it judges where rates have values."""
     if id(proposition) in numbers:
         return numbers[id(proposition)]
     if isinstance(proposition, Boolean):

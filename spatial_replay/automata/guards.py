@@ -217,7 +217,6 @@ class Propositions:
             self.all.append(Proposition(formula, self._text(formula), formula.name))
         self._literals[id(formula)] = self._numbers[shape], True
 
-
     def _text(self, formula: Formula) -> str:
         """Return the text of a proposition, which says how it treats a rate without a value if it has to."""
         text = format_formula(formula)

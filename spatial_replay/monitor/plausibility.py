@@ -396,7 +396,7 @@ def _binding(atom: Atom, around: tuple[Quantified, ...], parameter: str | None) 
 
     The objects of a template are all but those that the atom names: no distance to itself is meant.
     """
-    wanted = _variables(terms_of(atom.expression))
+    wanted = _variables([*terms_of(atom.expression), *atom.terms])
     bound: list[Quantified] = []
     for each in reversed(around):
         if wanted.intersection(each.variables):

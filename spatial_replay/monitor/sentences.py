@@ -256,6 +256,10 @@ def sentences_of(
     elif witness.deciding.unknown:
         sentences.append(_unknown(witness, witness.deciding, first_ns))
         sentences += [gap_sentence(each, first_ns) for each in witness.gaps]
+        if (shown := witness.while_present) is not None:
+            are = "is" if len(shown.names) == 1 else "are"
+            what = f"Asked only while {' and '.join(shown.names)} {are} in the samples"
+            sentences.append(Sentence(f"{what}, it is {shown.verdict}: write `{shown.text}`."))
     elif witness.verdict is Verdict.UNKNOWN:
         sentences.append(_uncertain(witness, witness.deciding, first_ns))
     else:
@@ -514,6 +518,8 @@ def _measured(measured: Measured, units: Mapping[str, str]) -> str:
         case "misalignment":
             degrees = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - value))))
             return f"{names[0]} is turned by {number_text(degrees)}° from {names[1]}"
+        case "present":
+            return f"{names[0]} is {'' if value else 'not '}in the sample"
         case "speed" | "rate":
             of = names[0] if measured.quantity == "rate" else ""
             size = with_unit(abs(value), per_second(units.get(of, "")))

@@ -37,6 +37,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Outline,
+    Present,
     Projection,
     Protrusion,
     Quantified,
@@ -113,8 +114,8 @@ def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
         case Negative():
             return _times(_built(expression.operand, regions), Fraction(-1))
         case Equality(signal, value):
-            if is_text_number(value):
-                raise OverflowError("a text")
+            if is_text_number(value) or isinstance(signal, Present):
+                raise OverflowError("a text, or whether an object is in the sample")
             return _built(compare(signal, "==", value), regions)
         case Scaled():
             return _times(_built(expression.operand, regions), 1 / exact(expression.divisor))

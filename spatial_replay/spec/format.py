@@ -108,6 +108,8 @@ def format_relation(
         if len(values) == 2:
             return f"{measured} {values[0]} {values[1]}"
         return f"{values[0]} {values[1]} {measured} {values[2]} {values[3]}"
+    if relation == "present":
+        return f"present({names[0]})"
     if relation == "closer":
         return f"{names[0]} closer {names[1]} than {names[2]}"
     bracket = f"[{', '.join(values)}]" if values else ""

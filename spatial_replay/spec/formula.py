@@ -260,6 +260,13 @@ class HasRate(Signal):
 
 
 @dataclass(frozen=True, slots=True)
+class Present(Signal):
+    """Whether a sample has an object, wherever it is: 1 or 0, never unknown (`present(a)`)."""
+
+    term: TrackedName | Variable
+
+
+@dataclass(frozen=True, slots=True)
 class Equality(_Arithmetic):
     """+inf where a signal is equal to a number, -inf where it is not; unknown where the signal is.
 

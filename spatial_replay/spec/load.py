@@ -103,6 +103,7 @@ from spatial_replay.spec.walks import (
     looks_back,
     named_members,
     other_names,
+    presence_of,
     rate_of,
     scaled,
     speed_of,
@@ -177,6 +178,16 @@ class AtomBuilder:
         terms = tuple([self._moving(each, scope, alone=len(given) == 1) for each in given])
         return self._limited("speed", speed_of(*terms), terms, (), written, scope)
 
+    def presence(self, written: Call, scope: Scope) -> Formula:
+        """Return the atom of `present(a)`; `true` of anything but one object."""
+        if len(written.arguments) == 1 and not isinstance(written.arguments[0], (NumberSyntax, Arithmetic)):
+            term = self.resolver.term(written.arguments[0], scope)
+            if isinstance(term, (TrackedName, Variable)):
+                return self._atom("present", presence_of(term), (term,), (), written, scope)
+        hint = "write present(a) for an object a, or forall p in GROUP: present(p)"
+        self.resolver.fault(written.span, scope, "'present' takes one object of the log", hint)
+        return Truth(True)
+
     def _moving(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope, *, alone: bool) -> Term:
         """Return a term that `speed` takes."""
         if isinstance(written, (NumberSyntax, Arithmetic)):
@@ -250,7 +261,7 @@ class AtomBuilder:
         expression: Expression,
         terms: tuple[Term, ...],
         parameters: tuple[float | str, ...],
-        written: RelationSyntax | DistanceSyntax | RateSyntax | ComparisonSyntax,
+        written: RelationSyntax | DistanceSyntax | RateSyntax | ComparisonSyntax | Call,
         scope: Scope,
     ) -> Atom:
         text = format_relation(relation, terms, parameters, self.names)
@@ -666,6 +677,8 @@ class Elaborator:
         macro = self.names.definitions.get(name)
         if isinstance(macro, BrokenStatement):
             return Truth(True)
+        if name == "present" and not isinstance(macro, DefStatement | SpecStatement):
+            return self.atoms.presence(written, scope)
         if not isinstance(macro, DefStatement):
             self._report_call(written, scope)
             return Truth(True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any, Literal
 
 from spatial_replay.spec.format import format_number, format_relation, format_term
@@ -29,6 +30,7 @@ from spatial_replay.spec.formula import (
     Misalignment,
     Negative,
     Number,
+    Present,
     PreviousSignal,
     Projection,
     Protrusion,
@@ -127,6 +129,11 @@ def rate_of(signal: Signal) -> Rate:
     return Rate(f"rate({written_name(signal.name, RELATION_NAMES)})", (), signal)
 
 
+def presence_of(term: TrackedName | Variable) -> Equality:
+    """Return that a sample has an object."""
+    return Equality(Present(f"present({format_term(term)})", term), 1.0)
+
+
 def rates_of(formula: Formula) -> list[Rate]:
     """Return the rates of change that a formula is about."""
     return [part for part in iter_parts(formula) if isinstance(part, Rate)]
@@ -167,7 +174,7 @@ def logged_signals(expression: Expression) -> Iterator[str]:
     for part in iter_expressions(expression):
         signal = part.signal if isinstance(part, Rate) else part
         signal = signal.of if isinstance(signal, PreviousSignal) else signal
-        if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal | HasRate):
+        if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal | HasRate | Present):
             yield signal.name
 
 
@@ -258,7 +265,8 @@ def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
 def other_names(formula: Formula) -> frozenset[str]:
     """Return the names in a formula of objects, regions, groups and specs: all but variables."""
     names = {each.name for each in iter_formulas(formula) if each.name is not None}
-    for base in map(base_of, iter_terms([formula])):
+    objects = (part.term for part in iter_parts(formula) if isinstance(part, Present))
+    for base in map(base_of, chain(iter_terms([formula]), objects)):
         if isinstance(base, (TrackedName, RegionName, Group)):
             names.add(base.name)
         if isinstance(base, Group):
@@ -331,6 +339,22 @@ def rewritten(formula: Formula, change: Callable[[Atom], Atom]) -> Formula:
             return replace(formula, operands=tuple([rewritten(each, change) for each in formula.operands]))
 
 
+def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) -> Formula:
+    """Return a formula with other operands of the operator that is a node, by its id."""
+    if not isinstance(formula, Boolean | Temporal):
+        return formula
+    if node == 0:
+        return replace(formula, operands=operands)
+    own: list[Formula] = []
+    place = 1
+    for operand in formula.operands:
+        count = sum(1 for _ in iter_nodes(operand))
+        is_within = place <= node < place + count
+        own.append(with_operands(operand, node - place, operands) if is_within else operand)
+        place += count
+    return replace(formula, operands=tuple(own))
+
+
 def without_variables(formula: Quantified) -> Formula:
     """Return the body of a quantifier with variables that are known by their place alone."""
     inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
@@ -389,6 +413,9 @@ def map_leaves(
             return Maximum(tuple([map_leaves(each, change) for each in expression.operands]))
         case Scaled():
             return Scaled(map_leaves(expression.operand, change), expression.divisor)
+        case Equality(Present() as presence):
+            signal: Any = change(presence)
+            return replace(expression, signal=signal)
         case Equality():
             return expression
         case _:
@@ -399,6 +426,9 @@ def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], T
     """Return a number, a signal or a measurement with other terms in place of its own."""
     if isinstance(leaf, Rate):
         return speed_of(*map(change, leaf.terms)) if leaf.terms else leaf
+    if isinstance(leaf, Present):
+        term: Any = change(leaf.term)
+        return presence_of(term).signal
     return leaf if isinstance(leaf, Number | Signal) else map_terms(leaf, change)
 
 

@@ -35,6 +35,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Outline,
+    Present,
     Projection,
     Protrusion,
     Quantified,
@@ -368,6 +369,9 @@ class Observed:
             case Signal():
                 number = self.signals[t].get(expression.name, math.nan)
                 return None if math.isnan(number) else Interval(number, number)
+            case Equality(Present(term=term)):
+                (name,) = _names([term], bindings)
+                return TRUE if name in self.objects[t] else FALSE
             case Equality(HasRate(rate=rate)):
                 if self._changing(rate, t, bindings, uncertain) is None:
                     return None

@@ -35,7 +35,7 @@ class Vocabulary:
         regions, groups: names that the text around defines.
         axes: for the relations along an axis.
         delays: whether terms may be those of an earlier sample.
-        rates: whether rates of change are compared.
+        rates: whether rates of change are compared, and whether objects are present.
         future, past: whether such operators are drawn.
         times: whether windows may be in seconds.
         quantifiers: whether open quantifiers are drawn (over `all` and `classes`).
@@ -99,7 +99,7 @@ def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
     """The text of a relation or comparison; parameters are always written."""
     kinds = ["plain", "parameter", "dist", "within", "closer", "prec", "between"]
     kinds += ["signal"] if words.signals else []
-    kinds += ["speed", "closing", *(["rate"] if words.signals else [])] if words.rates else []
+    kinds += ["present", "speed", "closing", *(["rate"] if words.signals else [])] if words.rates else []
     kinds += ["oriented"] if words.oriented else []
     first, second = draw(terms(words)), draw(terms(words))
     tracked = draw(st.sampled_from(words.objects))
@@ -124,6 +124,8 @@ def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
         case "rate":
             signal, comparison = draw(st.sampled_from(words.signals)), draw(st.sampled_from(COMPARISONS))
             return f"rate({signal}) {comparison} {draw(numbers)}"
+        case "present":
+            return f"present({tracked})"
         case "speed":
             return f"{draw(numbers)} <= speed({tracked}) < {draw(numbers)}"
         case "closing":

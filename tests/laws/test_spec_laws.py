@@ -11,8 +11,8 @@ from examples import examples
 from laws.strategies_spec import Vocabulary, formula_texts, noise, specification_texts
 from spatial_replay import SpecificationError, parse_specification
 from spatial_replay.spec import check_names, format_formula, format_specification, object_names
-from spatial_replay.spec.formula import Formula, TrackedName, Variable, operands_of, operator_of
-from spatial_replay.spec.walks import base_of, has_rate, iter_formulas, substitute
+from spatial_replay.spec.formula import Formula, TrackedName, Variable, operands_of
+from spatial_replay.spec.walks import base_of, iter_formulas, substitute
 
 
 def formula_of(text: str) -> Formula:

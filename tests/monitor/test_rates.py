@@ -104,7 +104,7 @@ def test_a_deadline_beside_a_rate_has_the_verdict_that_it_has_alone() -> None:
 
 
 def arrivals(order: str) -> list[Sample]:
-    """People who walk at 1 m/s from when they come; the names of those in the next sample, sample by sample."""
+    """People who walk at 1 m/s; the names of those in each sample."""
     samples = []
     for step, names in enumerate(order.split()):
         people = {

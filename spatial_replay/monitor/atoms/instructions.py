@@ -39,6 +39,7 @@ from spatial_replay.spec.formula import (
     Minimum,
     Negative,
     Number,
+    Present,
     Projection,
     Quantified,
     Rate,
@@ -54,7 +55,7 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import change_of, map_leaves, map_terms, substitute_term
+from spatial_replay.spec.walks import change_of, map_leaves, map_terms, presence_of, substitute_term
 from spatial_replay.text import TEXTS
 
 
@@ -365,6 +366,9 @@ class LeafCode:
             case Equality(HasRate(rate=rate)):
                 return self._row(HAS_VALUE, self._expression(rate, bindings), self._current(rate, bindings))
             case Equality(signal, value):
+                if isinstance(signal, Present):
+                    term: Any = substitute_term(signal.term, bindings)
+                    signal = presence_of(term).signal
                 constant = self.constants.setdefault(value, len(self.constants))
                 return self._row(EQUAL, self.signals.setdefault(signal, len(self.signals)), constant)
             case Scaled(operand, divisor):

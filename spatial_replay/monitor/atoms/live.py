@@ -60,6 +60,7 @@ from spatial_replay.spec.formula import (
     Group,
     Misalignment,
     Outline,
+    Present,
     PreviousSignal,
     Quantified,
     RegionName,
@@ -595,7 +596,11 @@ class LeafPlan:
         if len(samples) > 1:
             numbers = [0.0 if sample else ABSENT for sample in samples]
         for signal in self._signals:
-            numbers.append(_signal(signal, newest, samples[self._previous]))
+            if isinstance(signal, Present):
+                name = stands_for.get(signal.term.name, signal.term.name)
+                numbers.append(name in newest.objects or name in newest.unknown)
+            else:
+                numbers.append(_signal(signal, newest, samples[self._previous]))
         if not self._places:
             return self._pack(*numbers)
         packed = [b""]

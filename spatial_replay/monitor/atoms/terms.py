@@ -23,6 +23,7 @@ from spatial_replay.spec.formula import (
     Formula,
     Group,
     Outline,
+    Present,
     PreviousSignal,
     RegionName,
     Signal,
@@ -182,6 +183,8 @@ class TraceScene:
             return np.append(np.nan, np.diff(times_ns) / 1e9)[: len(times_ns)]
         if isinstance(signal, PreviousSignal):
             return np.append(np.nan, self._signal(signal.of))[:-1]
+        if isinstance(signal, Present):
+            return np.asarray(self._rows_of(signal.term.name) != ABSENT, np.float64)
         if isinstance(signal, ComputedSignal):
             return np.array([computed_signal(signal, sample) for sample in self.trace.samples()], np.float64)
         return self.trace.signals.get(signal.name, np.full(len(times_ns), np.nan))

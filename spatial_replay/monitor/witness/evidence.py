@@ -170,7 +170,7 @@ def named_parts(formula: Formula) -> list[NamedPart]:
     """Return the signals and objects that a formula names, each once."""
     atoms = list(iter_atoms(formula))
     found = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
-    terms = [term for atom in atoms for term in atom.terms]
+    terms = [term for atom in atoms if atom.relation != "present" for term in atom.terms]
     found += [NamedPart(name, False) for term in terms for name in _object_names(base_of(term))]
     return list(dict.fromkeys(found))
 

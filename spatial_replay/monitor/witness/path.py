@@ -42,6 +42,7 @@ from spatial_replay.spec.formula import (
     Misalignment,
     Negative,
     Number,
+    Present,
     PreviousSignal,
     Projection,
     Protrusion,
@@ -185,7 +186,7 @@ class DecidingPath(NamedTuple):
 
     Attributes:
         steps: at least one. The last is at a leaf, at `true` or `false`, or at an operator without a sample,
-            such as an empty window, a next sample beyond the log, or rates without a value in all of its window.
+            such as an empty window, a next sample beyond the log, or a window of samples that are left out.
         end: which end of the last node's interval decides.
     """
 
@@ -454,7 +455,8 @@ class Measured:
     """A number that decides an atom.
 
     Attributes:
-        quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal", "speed", "rate".
+        quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal", "present", "speed" or
+            "rate".
         names: the objects or regions measured, each with its delay and enlargement; or the signal.
         value: the number.
         spread: its uncertainty, from that of the objects.
@@ -633,6 +635,8 @@ def _measured(scene: TraceScene, part: Expression) -> Measured:
             low, high = _intervals(scene, [_as_atom(part)])[0]
             names = tuple(map(format_term, part.terms)) or ((part.signal or part).name,)
             return Measured("speed" if part.terms else "rate", names, (low + high) / 2, (high - low) / 2)
+        case Present():
+            return Measured("present", (part.term.name,), float(scene.signal(part)[0]))
         case Signal():
             return Measured("signal", (part.name,), float(scene.signal(part)[0]))
         case Misalignment():

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished
+from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.evidence import Evidence, Gap
@@ -23,16 +24,27 @@ from spatial_replay.monitor.witness.path import (
     short_title,
 )
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
-from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.format import format_formula, title_of
 from spatial_replay.spec.formula import (
     Atom,
+    Boolean,
+    BooleanOperator,
     Formula,
     Quantified,
+    TrackedName,
+    Variable,
     judged_operands,
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import declared_unit
+from spatial_replay.spec.walks import (
+    base_of,
+    declared_unit,
+    iter_terms,
+    nodes_of,
+    presence_of,
+    with_operands,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +66,20 @@ class WitnessStep:
     text: str
     time_ns: int
     has_rates: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WhilePresent:
+    """What an unknown formula is if it is asked for only while its objects are in the samples.
+
+    Attributes:
+        names: of these objects.
+        text: how that is written.
+    """
+
+    names: tuple[str, ...]
+    text: str
+    verdict: Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +109,7 @@ class Witness:
         closest_path: from the response to that atom.
         units: those that the log declares, of signals by their names, of lengths by "".
         unit: the declared one of `lower` and `upper`, or "".
+        while_present: of a formula that is unknown only because samples lack its objects; else None.
     """
 
     name: str
@@ -102,6 +129,7 @@ class Witness:
     closest_path: tuple[WitnessStep, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict, repr=False, hash=False)
     unit: str = ""
+    while_present: WhilePresent | None = None
 
     @property
     def node(self) -> int:
@@ -167,6 +195,9 @@ def find_witness(
         gaps = evidence.gaps(deciding.atom, at_ns)
         if any(gap.name is None and gap.longest_ns[0] <= at_ns < gap.longest_ns[1] for gap in gaps):
             deciding = replace(deciding, unknown=("the samples pause there",))
+    while_present = None
+    if verdict is Verdict.UNKNOWN and deciding is not None and deciding.unknown and not goes_on:
+        while_present = _while_present(evidence, leaves, times_ns, node, found)
     threshold = None
     if deciding is not None and flips:
         over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
@@ -212,7 +243,49 @@ def find_witness(
         closest_path,
         evidence.units,
         declared_unit(nodes[node], evidence.units),
+        while_present,
     )
+
+
+def _while_present(
+    evidence: Evidence, leaves: Floats, times_ns: Integers, node: int, path: DecidingPath
+) -> WhilePresent | None:
+    """Return what a node is while its objects are present, by the innermost operator on the path to a leaf.
+
+    None where that is unknown, too, or the leaf's objects are in all samples.
+    """
+    instance, bindings = evidence.instance, evidence.instance.bindings
+    formula, order = instance.formula, instance.program.leaves
+    nodes = nodes_of(formula)
+    around = [step.node for step in path.steps if operator_of(nodes[step.node]) in ("G", "H", "F", "O")]
+    objects = dict.fromkeys(map(base_of, iter_terms([nodes[path.steps[-1].node]])))
+    terms = [
+        term
+        for term in objects
+        if isinstance(term, TrackedName) or (isinstance(term, Variable) and term.name in bindings)
+    ]
+    if not around or not terms:
+        return None
+    conditions = [Atom(each.signal.name, "present", each) for each in map(presence_of, terms)]
+    columns = evidence.columns(conditions)[:, :, : len(times_ns)]
+    absent = [place for place in range(len(terms)) if (columns[0, place] < 0.0).any()]
+    if not absent:
+        return None
+    condition = Boolean("and", tuple(conditions[place] for place in absent))
+    operator = nodes[around[-1]]
+    how: BooleanOperator = "->" if operator_of(operator) in ("G", "H") else "and"
+
+    body = Boolean(how, (condition, *operands_of(operator)))
+    asked = with_operands(formula, around[-1], (body,))
+    both = joined_channels([leaves, columns], axis=1)
+    done = evaluate_offline(asked, (*order, *conditions), both, times_ns)
+    # nodes before the operator and around it keep their ids
+    verdict = final_verdict(*done.interval(node))
+    if verdict is Verdict.UNKNOWN:
+        return None
+    written = " and ".join(conditions[place].text for place in absent)
+    names = tuple(bindings.get(terms[place].name, terms[place]).name for place in absent)
+    return WhilePresent(names, f"{title_of(operator)} ({written} {how} …)", verdict)
 
 
 def time_of_least(

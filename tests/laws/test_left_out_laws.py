@@ -1,0 +1,71 @@
+"""Laws of samples and members that are left out, because a rate has no value there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from examples import examples
+from laws.strategies_monitor import CLASSES, HEADER, NAMES, WORDS, recordings
+from laws.strategies_spec import formula_texts
+from spatial_replay import Sample, evaluate, parse_specification
+
+without_rates = formula_texts(replace(WORDS, rates=False))
+with_rates = formula_texts(replace(WORDS, max_depth=2))
+
+
+@examples(80)
+@given(text=without_rates, other=with_rates, recording=recordings())
+def test_a_conjunct_without_rates_is_untouched_by_one_with(text, other, recording):
+    specification = parse_specification(
+        f"{HEADER}spec own = {text}\nspec alone = own\nspec task = own and ({other})\n"
+    )
+    evaluation = evaluate(specification, recording.trace())
+    alone, task = (evaluation.result(name) for name in ("alone", "task"))
+    nodes = {node.name: node for node in (*alone.nodes, *task.nodes)}
+    (alone_id,) = (node.id for node in alone.nodes if node.name == "own")
+    count = len(alone.nodes) - alone_id
+    task_id = nodes["own"].id
+    assert task.series[task_id : task_id + count].tobytes() == alone.series[alone_id:].tobytes()
+    assert task.final[task_id : task_id + count].tobytes() == alone.final[alone_id:].tobytes()
+
+
+_bodies = st.sampled_from(
+    ["speed(p) <= 4", "(speed(p) <= 4) and (a dist p <= 3)", "(speed(p) >= 1) -> (speed(p, a) <= 2)"]
+)
+
+
+@examples(80)
+@given(body=_bodies, recording=recordings(max_size=7))
+def test_members_are_judged_as_instances_of_a_template_are_while_they_are_present(body, recording):
+    """New members are left out at their first sample, whoever comes first."""
+    specification = parse_specification(
+        f"spec every = G (forall p in all: {body})\nspec own(p) = G (present(p) -> ({body}))\n"
+    )
+    evaluation = evaluate(specification, recording.trace(), each={"p": "all"})
+    every, *own = [result.final[0] for result in evaluation]
+    np.testing.assert_array_equal(every, np.min([*own, [np.inf, np.inf]], axis=0))
+
+
+@examples(60)
+@given(data=st.data(), class_name=st.sampled_from(CLASSES), recording=recordings(max_size=6))
+def test_the_order_of_members_changes_no_bit(data, class_name, recording):
+    specification = parse_specification(
+        f'spec calm = G (forall p in class "{class_name}": speed(p) <= 3)\n'
+        f'spec runs = F (exists p, q in class "{class_name}": speed(p, q) >= 1)\n'
+    )
+    names = dict(zip(NAMES, data.draw(st.permutations(NAMES)), strict=True))
+    swapped = [
+        Sample(each.time_ns, {names[name]: one for name, one in reversed(each.objects.items())}, each.signals)
+        for each in recording.samples
+    ]
+    unreadable = frozenset((t, names[name]) for t, name in recording.unreadable)
+    results = evaluate(specification, recording.trace())
+    others = evaluate(
+        specification, replace(recording, samples=tuple(swapped), unreadable=unreadable).trace()
+    )
+    for result, other in zip(results, others, strict=True):
+        np.testing.assert_array_equal(result.series, other.series)
