@@ -316,14 +316,14 @@ class LoadedLog:
             Those that changed.
 
         Raises:
-            UsageError: the files may not be written; no such constant.
+            UsageError: the files may not be written; no such constant; a save has changed one of them since.
                 SpecificationError, MissingFileError, OutputError: see `write_constants`.
         """
         if self._saved is None:
             raise UsageError(
                 "constants are written into files that are watched; give --spec FILE and --watch"
             )
-        return self._saved.write(self._by_file(values))
+        return self._saved.write(self._by_file(values), self._files)
 
     def was_written(self, name: str) -> bool:
         """Say whether a constant has the value in its file that `write_constants` gave it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import stat
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Lock
 from typing import Final, TypeAlias
@@ -108,17 +108,21 @@ class SpecificationFiles:
         ):
             yield self._saved() if self._state() != self._read else None
 
-    def write(self, values: Sequence[Mapping[str, float | str]] = ()) -> dict[str, float | str]:
+    def write(
+        self, values: Sequence[Mapping[str, float | str]] = (), loaded: Sequence[Specification] = ()
+    ) -> dict[str, float | str]:
         """Write values of constants into the files; they are no longer used in place of what is there.
 
         Args:
             values: for each of the files, by their names in it, besides those given at the start.
+            loaded: the files as they were loaded when the values were chosen.
 
         Returns:
             Those that changed.
 
         Raises:
-            MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
+            UsageError: a save has changed one of the numbers since.
+                MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
         """
         with self._turn:
             files = load_specifications(self.paths, constants=self._constants)
@@ -132,6 +136,8 @@ class SpecificationFiles:
                     for name, value in plain_values(with_given).items()
                     if with_given.constants[name] != written.constants[name]
                 }
+                if loaded:
+                    self._check_saves(index, own, loaded[index].constants, with_given.constants)
                 new = {**given, **own}
                 names = write_constants(path, new)
                 changed |= {name: new[name] for name in names}
@@ -139,6 +145,22 @@ class SpecificationFiles:
                 self._written |= {(index, name): after.constants[name] for name in names}
             self._constants = {}
             return changed
+
+    def _check_saves(
+        self,
+        index: int,
+        names: Iterable[str],
+        loaded: Mapping[str, Constant],
+        present: Mapping[str, Constant],
+    ) -> None:
+        """Refuse to write over a number that somebody else has saved since the file was loaded."""
+        for name in names:
+            constant = present.get(name)
+            if constant not in (None, loaded[name], self._written.get((index, name))):
+                saved = str(constant_value(constant)).removesuffix(".0")
+                raise UsageError(
+                    f"{name} was saved as {saved} meanwhile; write it again once the saved file is evaluated"
+                )
 
     def _saved(self) -> list[Specification] | SpatialReplayError | None:
         """Return the files as saved; None if their text is the one before, or they change all the time."""

@@ -288,7 +288,9 @@ class Session:
         self._transport = Transport(start_ns, end_ns)
         self.edited = loaded.edit({})
         self._pending = PendingRequests()
+        # awaited from the next requests on, and from those that are being done
         self._awaited: Future[Evaluated] | None = None
+        self._due: Future[Evaluated] | None = None
         self._requested = Condition()
         self._is_over = False
         self._loops = False
@@ -460,6 +462,7 @@ class Session:
                 patience_s if is_playing or is_due else None,
             )
             pending, self._pending = self._pending, PendingRequests()
+            self._due, self._awaited = self._awaited, None
             return pending
 
     def play_up_to(self, reach_ns: int) -> PlaySpan | None:
@@ -513,23 +516,20 @@ class Session:
         return self.pause()
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
-        """Let `wait_for_evaluation` return."""
-        awaited = self._take_awaited()
-        if awaited is not None:
-            awaited.set_result(evaluated)
+        """Let `wait_for_evaluation` return where it was called before the last `next_requests`."""
+        with self._requested:
+            due, self._due = self._due, None
+        if due is not None:
+            due.set_result(evaluated)
 
     def end(self) -> None:
         """Let `wait_for_evaluation` raise, now and from now on."""
         with self._requested:
             self._is_over = True
-        awaited = self._take_awaited()
-        if awaited is not None:
-            awaited.set_exception(session_over())
-
-    def _take_awaited(self) -> Future[Evaluated] | None:
-        with self._requested:
-            awaited, self._awaited = self._awaited, None
-            return awaited
+            open_futures = [future for future in (self._awaited, self._due) if future is not None]
+            self._awaited = self._due = None
+        for future in open_futures:
+            future.set_exception(session_over())
 
 
 MOST_A_SECOND: Final = 600
@@ -667,13 +667,19 @@ class Player:
         try:
             while not (requests := self._session.next_requests(PERIOD_S, is_due=self._shows_again)).stop:
                 try:
-                    self._do(requests)
-                    self._play_on()
+                    self._turn(requests)
                 except SpatialReplayError as error:
                     self._viewers.send_note(Note(LOG, str(error)))
                     self._viewers.send_state(self._session.pause())
         finally:
             self._session.end()
+
+    def _turn(self, requests: PendingRequests) -> None:
+        try:
+            self._do(requests)
+        finally:
+            self._session.provide_evaluation(self._playback.evaluated)
+        self._play_on()
 
     def _do(self, requests: PendingRequests) -> None:
         shows_again, self._shows_again = self._shows_again, False
@@ -686,7 +692,6 @@ class Player:
             self._show(time_ns)
         if requests.topics:
             self._resend(requests.topics)
-        self._session.provide_evaluation(self._playback.evaluated)
 
     def _evaluate(self, edited: EditedFiles) -> bool:
         """Evaluate the whole log with other constants; after an error, restore the former values."""

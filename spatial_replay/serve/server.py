@@ -27,7 +27,7 @@ from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, UsageError, system_reason
 from spatial_replay.logs.messages import EVENT_LOG, EVENTS, LAYOUT, Channel, Messages, Schema
 from spatial_replay.replay.document import document_from_replay, explain_results
-from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, Playback
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, Playback, constant_values
 from spatial_replay.serve.player import (
     ARROW,
     CONSTANTS,
@@ -81,22 +81,33 @@ def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[st
 
 def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Replay with other constants; what is shown stays as it is."""
-    changed = request.get("constants", {})
+    changed = _constants_in(request, evaluated)
     if changed:
         evaluated = evaluated.loaded.evaluate({**evaluated.edited.given, **changed})
     results = tuple(replace(result, has_series=False) for result in evaluated.replayed.results)
-    return document_from_replay(replace(evaluated.replayed, results=results))
+    document = document_from_replay(replace(evaluated.replayed, results=results))
+    return {**document, "constants": _constants_of(evaluated)}
 
 
 def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     explanations = explain_results(evaluated.replayed, node=request.get("node"), object=request.get("object"))
-    return {"explanations": [each.document for each in explanations]}
+    documents = [explanation.document for explanation in explanations]
+    return {"explanations": documents, "constants": _constants_of(evaluated)}
 
 
 def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Write what viewers changed, and what the request gives, into the files of the specifications."""
-    values = {**evaluated.edited.given, **request.get("constants", {})}
-    return {"written": dict(evaluated.loaded.write_constants(values))}
+    values = {**evaluated.edited.given, **_constants_in(request, evaluated)}
+    written = evaluated.loaded.write_constants(values)
+    return {"written": _in_seconds(written), "constants": _constants_of(evaluated) | _in_seconds(values)}
+
+
+def _constants_in(request: Mapping[str, Any], evaluated: Evaluated) -> Values:
+    return _as_written(request.get("constants", {}), constant_values(evaluated.edited.constants))
+
+
+def _constants_of(evaluated: Evaluated) -> dict[str, float]:
+    return _in_seconds(constant_values(evaluated.edited.constants))
 
 
 def _object(title: str, **properties: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -105,7 +116,7 @@ def _object(title: str, **properties: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 _CONSTANTS = {
-    "description": "Numbers and, as texts, durations, by name; the others stay as they are shown.",
+    "description": "Numbers, for durations in seconds, by name; the others stay as they are shown.",
     "type": "object",
     "properties": {},
     "additionalProperties": {"type": ["number", "string"]},
@@ -615,11 +626,15 @@ def _parameters(values: Mapping[str, float | str | bool]) -> list[Parameter]:
 
 
 def _constants(values: Values) -> list[Parameter]:
+    return _parameters(_in_seconds(values))
+
+
+def _in_seconds(values: Values) -> dict[str, float]:
     """Return constants as viewers have them, who type no quotes: durations are seconds."""
-    seconds = {
-        name: duration_ns_from_text(each) / 1e9 for name, each in values.items() if isinstance(each, str)
+    return {
+        name: duration_ns_from_text(value) / 1e9 if isinstance(value, str) else value
+        for name, value in values.items()
     }
-    return _parameters({**values, **seconds})
 
 
 def _value(parameter: Parameter) -> float | str | bool:
@@ -646,7 +661,9 @@ def _as_written(values: Mapping[str, float | str | bool], present: Values) -> Va
     for name, value in values.items():
         if isinstance(value, bool):
             raise _misfit(name, value)
-        is_seconds = isinstance(present.get(name), str) and isinstance(value, float) and 0 <= value < _MOST_S
+        is_seconds = (
+            isinstance(present.get(name), str) and not isinstance(value, str) and 0 <= value < _MOST_S
+        )
         written[name] = format_duration(round(float(value) * 1e9)) if is_seconds else value
     return written
 

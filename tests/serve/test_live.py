@@ -545,12 +545,26 @@ def test_services_answer_in_json(server: Serving) -> None:
         shown = await own.call("evaluate", {})
         assert [each["verdict"] for each in shown["specifications"]] == ["satisfied", "unknown"]
         assert "series" not in shown["specifications"][0]
+        assert shown["constants"] == {"far": 0.5, "soon": 10}
         other = await own.call("evaluate", {"constants": {"far": 3.0, "soon": "1s"}})
         assert [each["verdict"] for each in other["specifications"]] == ["violated", "violated"]
+        assert other["constants"] == {"far": 3, "soon": 1}
+        assert (await own.call("evaluate", {"constants": {"soon": 1}}))["constants"]["soon"] == 1
         assert await own.constants() == {"far": 0.5, "soon": 10}
         [why] = (await own.call("explain", {"node": "apart"}))["explanations"]
         assert why["explanation"][0].startswith("`apart` is unknown")
         assert len((await own.call("explain", None, raw=b""))["explanations"]) == 2
+
+    watch(server, looking)
+
+
+def test_services_answer_with_the_constants_that_viewers_were_told(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        await own.subscribe([CURVES_TOPIC, ROBUSTNESS, SCENE])
+        for number in range(10):
+            # the player is busy with showing the former values
+            far = (await own.set(far=number / 7))["far"]
+            assert (await own.call("evaluate", {}))["constants"]["far"] == far
 
     watch(server, looking)
 

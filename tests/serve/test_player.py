@@ -98,11 +98,13 @@ def loaded_of(count: int, step_ns: int = STEP_NS) -> LoadedLog:
 
 
 @contextmanager
-def playing(loaded: LoadedLog, clock: Clock) -> Iterator[tuple[Session, RecordingViewers]]:
+def playing(
+    loaded: LoadedLog, clock: Clock, viewers: RecordingViewers | None = None
+) -> Iterator[tuple[Session, RecordingViewers]]:
     playback = Playback(loaded.evaluate())
     playback.seek(0)
     session = Session(loaded, playback.start_ns, playback.end_ns, clock=clock)
-    viewers = RecordingViewers()
+    viewers = viewers or RecordingViewers()
     with ThreadPoolExecutor(1) as thread:
         running = thread.submit(Player(playback, session, viewers).run)
         try:
@@ -295,6 +297,28 @@ def answering(session: Session) -> Iterator[Questions]:
         finally:
             questions.stop()
             running.result(PATIENCE_S)
+
+
+def test_an_evaluation_has_what_was_set_before_it_was_asked_for() -> None:
+    is_sending, may_send = Event(), Event()
+
+    class BusyViewers(RecordingViewers):
+        def publish(self, messages: Messages) -> None:
+            is_sending.set()
+            may_send.wait(PATIENCE_S)
+
+    with (
+        playing(loaded_of(5), Clock(), BusyViewers()) as (session, _),
+        ThreadPoolExecutor(1) as asking,
+    ):
+        session.resend(ROBUSTNESS)
+        assert is_sending.wait(PATIENCE_S)
+        session.set_constants({"far": 3.0})
+        asked = asking.submit(session.wait_for_evaluation)
+        while not asked.running():
+            pass
+        may_send.set()
+        assert asked.result(PATIENCE_S).edited.given == {"far": 3.0}
 
 
 def test_an_error_in_an_answer_is_raised_where_it_was_asked() -> None:
