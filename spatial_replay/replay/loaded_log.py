@@ -535,12 +535,13 @@ def _edited(file: Specification, values: Mapping[str, float | str]) -> Specifica
 def _stored(edited: Specification, written: Specification, kept: Specification) -> Specification:
     """Return an edited specification as a log stores it: its text says the new values.
 
-    Messages refer to nodes by their place in the text, so the canonical text is parsed to get the places.
+    Messages refer to nodes by their place in the text. If a log stores a canonical text of the written one,
+    that of the edited one is parsed to get the places.
 
     Args:
         kept: the written specification as a log stores it.
     """
-    if edited == written and kept.source == written.source:
+    if kept.source == written.source:
         return replace(edited, filename=kept.filename)
     with suppress(SpecificationError):
         read_back = parse_specification(format_specification(edited), filename=edited.filename)

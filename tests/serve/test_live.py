@@ -258,7 +258,7 @@ def test_a_changed_constant_changes_the_verdict_the_curves_and_the_messages(serv
         shown = await own.message(ROBUSTNESS, lambda each: value(each) == expected)
         assert shown.time_ns == 2 * STEP_NS
         await own.message(
-            SPECIFICATION, lambda each: ">= 3" in Specification.FromString(each.data).files[0].source
+            SPECIFICATION, lambda each: "const far = 3" in Specification.FromString(each.data).files[0].source
         )
 
     watch(server, looking)
@@ -567,6 +567,20 @@ def test_services_answer_with_the_constants_that_viewers_were_told(server: Servi
             assert (await own.call("evaluate", {}))["constants"]["far"] == far
 
     watch(server, looking)
+
+
+def test_advice_names_a_constant_that_a_viewer_changed() -> None:
+    text = "const near = 4\nregion goal = box(4, -1, 9, 2)\nspec close = G (cube dist goal <= near)\n"
+    loaded = LoadedLog(PiecewiseSource(run(5), 7), [sr.parse_specification(text)])
+    with open_server(loaded.evaluate(), port=0) as server:
+
+        async def looking(own: Viewer) -> None:
+            await own.set(near=1.5)
+            answer = await own.call("explain", {})
+            assert answer["constants"] == {"near": 1.5}
+            assert "or more instead of 1.5 for `near`" in answer["explanations"][0]["explanation"][-1]
+
+        watch(server, looking)
 
 
 @pytest.mark.parametrize(
