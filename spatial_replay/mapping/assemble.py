@@ -13,7 +13,7 @@ Messages wait in the first stage until none that is earlier can arrive.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import compress, repeat
 from math import pi
 from typing import Any, Final, NamedTuple
@@ -28,12 +28,12 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
 from spatial_replay.mapping.binding import BY_PLACE, Codes
-from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.mapping_file import DEFAULT_MAX_AGE_NS, parse_mapping
 from spatial_replay.mapping.topic_reader import MISFITS, Extractor, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.text import Instant, Sentence, counted, nearest_hint, number_text, times_apart
-from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
+from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
 _LONGEST_STEP: Final = 8_192
@@ -115,6 +115,7 @@ class _Assembling:
             report=self._add_fault,
         )
         self._sample_times = _SampleTimes(plan, name, self._window_ns[0])
+        self._sampled_ends = _SampledEnds(plan, self._readers, self._window_ns)
         self._begin_ns: int | None = None
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
@@ -142,9 +143,11 @@ class _Assembling:
         Raises:
             UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
         """
-        trace = self._settle(max(self._newest_ns, self._latest_ns))
+        trace = self._settle(max(self._newest_ns, self._latest_ns), is_last=True)
         if not self._is_live:
             self._remarks.add_pauses()
+            self._remarks.add_silences()
+        self._remark_ends()
         for text in self._tree.remarks():
             self._remarks.add(text)
         # of a system that runs, there is no log to cut
@@ -176,6 +179,21 @@ class _Assembling:
         self._check_fixed_frame()
         self._settled_ns = LATEST_NS
         return trace
+
+    def _remark_ends(self) -> None:
+        """Remark where samples are taken at other topics than the sampled one."""
+        ends, sampled = self._sampled_ends, self._plan.sampled_topic
+        others = " and ".join(sorted(self._plan.fallback_topics))
+        if ends.before_ns is not None and ends.first_ns is None:
+            self._remarks.add(f"samples are taken at {others}, since {sampled} has no message")
+        if ends.before_ns is not None and ends.first_ns is not None:
+            before = f"samples are taken at {sampled}, which begins at "
+            how = ("; those before, from ", Instant(ends.before_ns, 0), f" on, are at {others}")
+            self._remarks.add(Sentence(before, Instant(ends.first_ns, 0), *how))
+        if ends.after_ns is not None and ends.last_ns is not None:
+            before = f"samples are taken at {sampled}, which ends at "
+            how = ("; those after, until ", Instant(ends.after_ns, 0), f", are at {others}")
+            self._remarks.add(Sentence(before, Instant(ends.last_ns, 0), *how))
 
     def _check_fixed_frame(self) -> None:
         """Raise UsageError if a whole log has frames, but not the fixed one."""
@@ -292,21 +310,32 @@ class _Assembling:
             sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
             reader.pending.add((times_ns, sequences, log_times_ns, recorded), stamped.contents)
 
-    def _settle(self, upto_ns: int) -> Trace:
+    def _comes_again(self, last_ns: int) -> bool | None:
+        """Return whether the sampled topic goes on after a silence; None if that is not known."""
+        return None
+
+    def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
         """Return the samples up to a time; messages before it that come later count from then on.
+
+        Args:
+            is_last: whether the log ends here, so that nothing waits.
 
         Raises:
             LogError, UsageError: as `Assembler.add`.
         """
+        newest_ns = max(self._newest_ns, self._latest_ns)
+        upto_ns = self._sampled_ends.limit(upto_ns, newest_ns, self._comes_again, is_last=is_last)
         if upto_ns <= self._settled_ns:
             return Trace.empty()
         start_ns, end_ns = self._window_ns
         # logs contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
-            times_ns = self._sample_times.upto(self._tracker.advance(upto_ns), upto_ns)
+            sampled_ns, others_ns = self._tracker.advance(upto_ns)
+            others_ns = self._sampled_ends.besides(sampled_ns, others_ns)
+            times_ns = self._sample_times.upto(np.concatenate([sampled_ns, others_ns]), upto_ns)
             times_ns = times_ns[(times_ns >= start_ns) & (times_ns < end_ns)]
             self._remarks.samples.add(times_ns)
-            trace = self._tracker.trace(times_ns, max(self._newest_ns, self._latest_ns))
+            trace = self._tracker.trace(times_ns, newest_ns)
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
         # looking through all transforms takes longer than a sample
@@ -335,13 +364,46 @@ class _Assembling:
 
 
 class Assembler(_Assembling):
-    """Assembles the samples of one log from its messages; for the arguments see `_Assembling`.
+    """Assembles the samples of one log from its messages; for the other arguments see `_Assembling`.
 
     Add thousands of messages at once, because it works on columns. The samples do not depend on how the
     messages are divided.
+
+    Args:
+        goes_on: whether the log has a message of the sampled topic after a log time. Without it, the samples
+            after a long silence of that topic wait until it goes on, or the log ends.
     """
 
     _step, _count, _bytes = _FIRST_STEP, 0, 0
+
+    def __init__(
+        self,
+        plan: ReadingPlan,
+        decoder: Callable[[str], Decoder],
+        *,
+        goes_on: Callable[[int], bool] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(plan, decoder, **options)
+        self._goes_on = goes_on
+        self._silence: tuple[int, bool] = -1, False
+        self._newest_log_ns = -1
+
+    def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
+        """Note the times of the first messages of the log, where reading begins after them.
+
+        Args:
+            sampled_ns: of the sampled topic, if that one is not read.
+            others_ns: of the topics that are sampled before it begins.
+        """
+        self._sampled_ends.know_start(sampled_ns, others_ns)
+
+    def _comes_again(self, last_ns: int) -> bool | None:
+        if self._goes_on is None:
+            return None
+        if self._silence[0] != last_ns:
+            self._silence = last_ns, self._goes_on(self._newest_log_ns)
+        return self._silence[1]
 
     def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
         """Add messages in the order of the log; return the samples that are final now.
@@ -358,6 +420,7 @@ class Assembler(_Assembling):
             read = int(ends[begin - 1]) if begin else 0
             by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
             stop = min(begin + self._step - self._count, by_size, len(columns))
+            self._newest_log_ns = max(self._newest_log_ns, int(columns.log_time_ns[begin:stop].max()))
             self._add_step(select(columns, slice(begin, stop)))
             self._count += stop - begin
             self._bytes += int(ends[stop - 1]) - read
@@ -490,6 +553,111 @@ class _SampleTimes:
                 " together; give a longer step"
             )
         return np.arange(first, max(first, stop), dtype=np.int64) * step_ns
+
+
+class _SampledEnds:
+    """Decides where other topics are sampled: before the sampled topic begins, and after it ends.
+
+    Samples wait until that is decided: for a second, the plan's `silence_ns` or five intervals of the topic.
+
+    Attributes:
+        first_ns, last_ns: times of the first and the last message of the sampled topic; None without any.
+        before_ns: time of the first sample before these; None without any.
+        after_ns: time of the last sample after these; None without any.
+    """
+
+    def __init__(
+        self, plan: ReadingPlan, readers: Mapping[str, TopicReader], window_ns: tuple[int, int]
+    ) -> None:
+        self._silence_ns = max(plan.silence_ns, DEFAULT_MAX_AGE_NS)
+        self._window_ns = window_ns
+        self._sampled = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
+        self._others = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
+        self._others_begin_ns: int | None = None
+        self._interval_ns: int | None = None
+        self._longest_ns = 0
+        self._has_ended = self._begins_late = False
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self.before_ns: int | None = None
+        self.after_ns: int | None = None
+
+    def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
+        """Note the times of the first messages of the log, where reading begins after them."""
+        self.first_ns = self.last_ns = sampled_ns
+        self._others_begin_ns = others_ns
+
+    def limit(
+        self, upto_ns: int, newest_ns: int, comes_again: Callable[[int], bool | None], *, is_last: bool
+    ) -> int:
+        """Return the time up to which samples are decided.
+
+        Args:
+            upto_ns: time up to which all messages have come.
+            newest_ns: time of the newest message.
+            comes_again: says by the time of its last message whether the sampled topic goes on after a long
+                silence; None if that is not known yet.
+            is_last: whether the log ends here.
+        """
+        if self._sampled is None or not self._others:
+            return upto_ns
+        if self._others_begin_ns is None:
+            begins_ns = [int(pending.times_ns.min()) for pending in self._others if len(pending)]
+            self._others_begin_ns = min(begins_ns, default=None)
+        waiting_ns = self._sampled.times_ns
+        past_ns, next_ns = waiting_ns[waiting_ns <= upto_ns], waiting_ns[waiting_ns > upto_ns]
+        last_ns = int(past_ns.max()) if len(past_ns) else self.last_ns
+        if last_ns is None:
+            return self._limit_at_start(upto_ns, newest_ns, next_ns, is_last=is_last)
+        silence_ns = newest_ns - last_ns
+        self._has_ended = False
+        if len(next_ns):
+            return upto_ns
+        # a topic that is sampled slowly on purpose is not taken for one that has ended
+        usual_ns = max(self._silence_ns, LONG_PAUSE * self._longest_ns)
+        if silence_ns > (self._tail_ns(past_ns) if is_last else usual_ns):
+            again = comes_again(last_ns)
+            self._has_ended = not again if is_last else again is False
+            return upto_ns if is_last or again is not None else min(upto_ns, last_ns)
+        return upto_ns if is_last else min(upto_ns, last_ns)
+
+    def _limit_at_start(self, upto_ns: int, newest_ns: int, next_ns: Integers, *, is_last: bool) -> int:
+        if self._others_begin_ns is None:
+            return upto_ns
+        silence_ns = int(next_ns.min(initial=newest_ns)) - self._others_begin_ns
+        self._begins_late = silence_ns > self._silence_ns or (is_last and not len(next_ns))
+        is_decided = self._begins_late or is_last or len(next_ns) > 0
+        return upto_ns if is_decided else min(upto_ns, self._others_begin_ns - 1)
+
+    def _tail_ns(self, past_ns: Integers) -> int:
+        """Return how long the sampled topic is silent at most before the log ends."""
+        times_ns = np.unique(past_ns if self.last_ns is None else np.append(past_ns, self.last_ns))
+        interval_ns = int(times_ns[-1] - times_ns[-2]) if len(times_ns) > 1 else self._interval_ns
+        return self._silence_ns if interval_ns is None else min(self._silence_ns, LONG_PAUSE * interval_ns)
+
+    def besides(self, sampled_ns: Integers, others_ns: Integers) -> Integers:
+        """Return the times of other topics that are sampled, given the messages up to the `limit`."""
+        is_before, is_after = np.full((2, len(others_ns)), [[self._begins_late], [False]])
+        if len(sampled_ns):
+            times_ns = np.unique(sampled_ns if self.last_ns is None else np.append(sampled_ns, self.last_ns))
+            if len(times_ns) > 1:
+                self._interval_ns = int(times_ns[-1] - times_ns[-2])
+                self._longest_ns = max(self._longest_ns, int(np.diff(times_ns).max()))
+            self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
+            self.last_ns = int(times_ns[-1])
+        if self.first_ns is not None and self.last_ns is not None:
+            begins_ns = self.first_ns if self._others_begin_ns is None else self._others_begin_ns
+            is_late = self.first_ns - begins_ns > self._silence_ns
+            is_before = (others_ns < self.first_ns) & is_late
+            is_after = (others_ns > self.last_ns) & self._has_ended
+        start_ns, end_ns = self._window_ns
+        is_inside = (others_ns >= start_ns) & (others_ns < end_ns)
+        if (is_before & is_inside).any() and self.before_ns is None:
+            self.before_ns = int(others_ns[is_before & is_inside].min())
+        if (is_after & is_inside).any():
+            self.after_ns = int(others_ns[is_after & is_inside].max())
+        chosen: Integers = others_ns[is_before | is_after]
+        return chosen
 
 
 _MOMENT_S: Final = 0.001
@@ -636,7 +804,7 @@ class LiveAssembler(_Assembling):
         self._held = [each for each in self._held if each.topic not in gone]
         self._patient_ns = self._newest_ns
         self._silent.clear()
-        so_far = self._settle(self._newest_ns)
+        so_far = self._settle(self._newest_ns, is_last=True)
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return so_far
@@ -647,6 +815,9 @@ class LiveAssembler(_Assembling):
         lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
         self._tracker.forget(lost_ns)
         return Trace.concatenate([so_far, lost])
+
+    def _comes_again(self, last_ns: int) -> bool | None:
+        return False
 
     def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         name = reader.name

@@ -6,9 +6,9 @@ The raw messages and their definitions go into copies of the log, so that viewer
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -100,9 +100,11 @@ class MappedSource(FileSource):
         kept = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
         copied = _CopiedMessages(reader.channels(kept))
         read = mapped | copied.topics
+        first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
         assembler = Assembler(
             plan,
             lambda topic: reader.decoder(by_name[topic]),
+            goes_on=lambda log_ns: first_ns([plan.sampled_topic], log_ns + 1) is not None,
             name=self.name,
             start_ns=start_ns,
             end_ns=end_ns,
@@ -124,6 +126,10 @@ class MappedSource(FileSource):
         if static:
             # they count from before a window, and the first of a frame before it was recorded, too
             assembler.know_static(open_messages(self.path).iter_messages(static))
+        if start_ns is not None and plan.by_log_time and plan.sampled_topic is not None:
+            sampled_ns = first_ns([plan.sampled_topic])
+            is_read = sampled_ns is None or sampled_ns >= plan.first_read_ns(start_ns)
+            assembler.know_start(None if is_read else sampled_ns, first_ns(plan.fallback_topics))
         as_recorded = self.reading.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded and plan.late_ns < LATEST_NS:
@@ -253,6 +259,15 @@ class _CopiedMessages:
         return taken.raw(self._channels)
 
 
+def _first_ns(
+    opened: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
+) -> int | None:
+    """Return when the first message of some topics was logged, from a time on; None without any."""
+    named = [topic for topic in topics if topic is not None]
+    messages = opened().iter_messages(named, log_ns) if named else ()
+    return next((message.log_time_ns for message in messages), None)
+
+
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
     """Return remarks on topics that are not mapped and could not be, with their numbers of messages."""
     unread = [each for each in topics if each.unreadable and each.count != 0 and each.name not in plan.topics]
@@ -279,10 +294,8 @@ def _columns(
     if not plan.by_log_time or (not start_ns and end_ns is None):
         return reader.iter_columns(topics, as_recorded=as_recorded)
     last = None if end_ns is None else end_ns + plan.margin_ns
-    lookback = {topic: plan.lookback_ns(topic) for topic in plan.topics}
-    known = [each for each in lookback.values() if each is not None]
-    first = max(0, (start_ns or 0) - max(known, default=0))
-    lasting = [topic for topic, each in lookback.items() if each is None]
+    first = plan.first_read_ns(start_ns or 0)
+    lasting = [topic for topic in plan.topics if plan.lookback_ns(topic) is None]
     window = reader.iter_columns(topics, first or None, last, as_recorded=as_recorded)
     if not lasting or not first:
         return window

@@ -172,6 +172,7 @@ class LogMapping:
         fixed_frame: the frame that coordinates are transformed into; None leaves them as they are.
         topics: in the file's order.
         max_gap_ns: what lies in a longer pause of a topic is unknown.
+        trims_ends: whether samples before a needed topic begins, and after it ends, are left out.
         axes: those of the fixed frame, or of the messages without one.
         origin: latitude and longitude in degrees where the fixes of satellite receivers have (0, 0).
     """
@@ -184,6 +185,7 @@ class LogMapping:
     sampling: Sampling = Sampling()
     max_age_ns: int | None = None
     max_gap_ns: int | None = None
+    trims_ends: bool = True
     axes: Axes = OUR_AXES
     origin: tuple[float, float] | None = None
 
@@ -266,6 +268,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
         max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
+        trims_ends=value.get("ends", "trim") == "trim",
         origin=(float(origin[0]), float(origin[1])) if origin else None,
         axes=Axes(
             value.get("axes", {}).get("y", "up"),

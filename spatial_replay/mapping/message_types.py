@@ -8,9 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, field, replace
+from fnmatch import translate
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
+from spatial_replay.mapping.field_paths import name_from_topic
 from spatial_replay.mapping.mapping_file import (
     ClassMapping,
     Measure,
@@ -206,6 +208,27 @@ def short_type(name: str) -> str:
     words = re.split(r"[/.]|::", name)
     short = f"{words[0]}/{words[-1]}" if len(words) > 1 else name
     return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short)
+
+
+def name_pattern(layout: MessageLayout, mapping: TopicMapping) -> str:
+    """Return a regular expression for the names that objects of a topic may have."""
+    parts = re.split(r"\{([^{}]+)\}", layout.name)
+    texts = [name_from_topic(mapping.topic) if part == "topic" else None for part in parts[1::2]]
+    fields = [".+" if text is None else re.escape(text) for text in texts]
+    literals = [re.escape(part) for part in parts[::2]]
+    template = literals[0] + "".join(field + text for field, text in zip(fields, literals[1:], strict=True))
+    only, without = ("|".join(map(translate, patterns)) for patterns in (mapping.only, mapping.without))
+    return (f"(?={only})" if only else "") + (f"(?!{without})" if without else "") + template
+
+
+def possible_classes(layout: MessageLayout) -> frozenset[str] | None:
+    """Return the classes that objects may have, in lower case; None for any."""
+    if not layout.class_field:
+        return frozenset({layout.class_name.casefold()} if layout.class_name else ())
+    if not layout.class_has_other:
+        return None
+    names = (*layout.class_table.values(), layout.class_other)
+    return frozenset(name.casefold() for name in names if name)
 
 
 def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:

@@ -88,6 +88,7 @@ class PlannedTopic:
         layout: where its objects are; None for a topic without objects.
         max_age_ns: how long an observation or a signal stays valid.
         between_ns: its objects are unknown between transforms that are farther apart.
+        silence_ns: after so long a silence it has ended, also where its last message stays valid.
         is_transforms: whether its transforms place frames; `is_static`: at all times.
         is_lasting: whether a message counts however old it is.
         is_latched: whether it may have been sent long before it was recorded.
@@ -99,6 +100,7 @@ class PlannedTopic:
     layout: MessageLayout | None
     max_age_ns: int
     between_ns: int
+    silence_ns: int
     is_transforms: bool
     is_static: bool
     is_lasting: bool
@@ -119,6 +121,8 @@ class ReadingPlan:
         lost: topics with transforms that cannot be decoded, with the reason.
         absent: optional topics that the log lacks.
         sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
+        fallback_topics: the topics that are sampled before that one begins and after it ends.
+        silence_ns: silence of that topic at either end of the log before these are sampled.
         remarks: what is doubtful about the choice of that topic.
     """
 
@@ -129,6 +133,8 @@ class ReadingPlan:
     late_ns: int = DISORDER_NS
     planned: tuple[PlannedTopic, ...] = ()
     sampled_topic: str | None = None
+    fallback_topics: frozenset[str] = frozenset()
+    silence_ns: int = DEFAULT_MAX_AGE_NS
     lost: tuple[tuple[str, str], ...] = ()
     absent: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -157,14 +163,20 @@ class ReadingPlan:
             names.append(sampled)
         planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
         waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
+        silence_ns = max((topic.silence_ns for topic in planned if topic.name == sampled), default=0)
+        if sampled is not None:
+            silence_ns = max(silence_ns, DEFAULT_MAX_AGE_NS)
+        longest_ns = max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0, silence_ns)
         return cls(
             mapping=mapping,
             topics=tuple(names),
             by_log_time=all(topic.clock == "log" for topic in planned),
             late_ns=late_ns,
-            margin_ns=late_ns + max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0),
+            margin_ns=late_ns + longest_ns,
             planned=planned,
             sampled_topic=sampled,
+            fallback_topics=_fallback_topics(planned, sampled),
+            silence_ns=silence_ns,
             lost=tuple(lost),
             absent=tuple(topic for topic in mapped if topic not in known),
             remarks=(
@@ -183,12 +195,19 @@ class ReadingPlan:
             if each.layout is not None and not each.is_lasting and not each.is_transforms
         ]
         own = planned.max_age_ns if planned.mapping is not None else 0
+        if topic == self.sampled_topic:
+            own = max(own, self.silence_ns)
         if planned.is_transforms and not planned.is_static:
             # an observation of the window may be that old, and is placed by a transform of its time
             own = max(own, HISTORY_NS + max(ages, default=0))
             if any(each.is_lasting and each.layout is not None for each in self.planned):
                 return None
         return None if planned.is_lasting or own + self.late_ns >= FOREVER_NS else own + self.late_ns
+
+    def first_read_ns(self, start_ns: int) -> int:
+        """Return from which log time on messages count in a window that starts at a time."""
+        lookbacks = [self.lookback_ns(topic) for topic in self.topics]
+        return max(0, start_ns - max((lookback for lookback in lookbacks if lookback is not None), default=0))
 
 
 def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
@@ -242,6 +261,18 @@ def _most_frequent(mapping: LogMapping, known: Mapping[str, Topic]) -> str:
     names = [entry.topic for entry in present if entry.reads_objects] or [entry.topic for entry in present]
     counts = [known[name].count for name in names]
     return names[0] if None in counts else max(names, key=lambda name: known[name].count or 0)
+
+
+def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> frozenset[str]:
+    """Return the topics that are sampled where the sampled one is silent: those that keep coming."""
+    mapped = [
+        topic
+        for topic in planned
+        if topic.mapping is not None
+        and not (topic.is_static or topic.is_latched or (topic.layout is not None and topic.layout.stays))
+    ]
+    with_objects = [topic for topic in mapped if topic.layout is not None]
+    return frozenset(topic.name for topic in with_objects or mapped) - {sampled}
 
 
 _MANY_TIMES = 10
@@ -301,6 +332,7 @@ def _planned(
         layout=layout,
         max_age_ns=max_age_ns,
         between_ns=min(given or DEFAULT_MAX_AGE_NS, HISTORY_NS),
+        silence_ns=DEFAULT_MAX_AGE_NS if given is None or given >= FOREVER_NS else given,
         is_transforms=is_transforms,
         is_static=is_static,
         is_latched=topic.latched,
@@ -903,6 +935,11 @@ class PendingMessages:
     def first_ns(self) -> int | None:
         """The time of the first message that waits."""
         return min((int(each[0].min()) for each in self._columns if len(each[0])), default=None)
+
+    @property
+    def times_ns(self) -> Integers:
+        """The times of the messages that wait, in the order of arrival."""
+        return np.concatenate([np.empty(0, np.int64), *(times_ns for times_ns, *_ in self._columns)])
 
     def add(self, columns: tuple[Integers, Integers, Integers, Integers], contents: list[Any]) -> None:
         """Add messages in the order of arrival.

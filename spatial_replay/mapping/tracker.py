@@ -21,11 +21,13 @@ from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, footprints_from_solids
 from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping
-from spatial_replay.mapping.topic_reader import ReadingPlan, ReportFault, TopicReader
+from spatial_replay.mapping.message_types import name_pattern, possible_classes
+from spatial_replay.mapping.topic_reader import PlannedTopic, ReadingPlan, ReportFault, TopicReader
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.observations import Observations, check_observations
-from spatial_replay.trace.trace import ABSENT, Pauses, Trace, class_order, renumbered
+from spatial_replay.trace.spans import TopicSpan
+from spatial_replay.trace.trace import ABSENT, LONG_PAUSE, Pauses, Trace, class_order, renumbered
 from spatial_replay.trace.units import Axes
 
 LEFT = -1
@@ -323,43 +325,70 @@ class Tracker:
         self._added: list[ObservationRows] = []
         self._events = {name: Events.none() for name in self.readers}
         self._reported: dict[str, Integers] = {}
+        self._placed_messages: dict[str, Booleans] = {}
+        self._begun_ns: dict[str, int] = {}
+        self._unplaced_at: dict[str, list[Integers]] = defaultdict(list)
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
+        self._objects_of: dict[str, frozenset[str]] = {}
         self._advances = 0
+        self._unheard = {
+            name: _unheard(reader.planned) for name, reader in self.readers.items() if reader.is_mapped
+        }
 
-    def advance(self, upto_ns: int) -> Integers:
-        """Process the pending messages up to a time; return the times of those that may be sampled."""
+    def advance(self, upto_ns: int) -> tuple[Integers, Integers]:
+        """Process the pending messages up to a time.
+
+        Returns:
+            times of the messages that are sampled; times of those sampled where the sampled topic is silent.
+        """
         self._advances += 1
-        sampled = [np.empty(0, np.int64)]
+        sampled, others = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for name, reader in self.readers.items():
             if not reader.pending:
                 continue
             times_ns, log_times_ns, contents = reader.pending.take(upto_ns)
+            is_placed = np.ones(len(times_ns), np.bool_)
             if reader.is_mapped:
                 columns = reader.read(log_times_ns, contents)
                 times_ns, log_times_ns = times_ns[columns.good], log_times_ns[columns.good]
+                is_placed = np.ones(len(times_ns), np.bool_)
                 if columns.detections is not None and len(times_ns):
-                    self._take_detections(reader, times_ns, log_times_ns, columns.detections)
+                    is_placed = self._take_detections(reader, times_ns, log_times_ns, columns.detections)
                 elif columns.signals.size:
                     self._count_replaced(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
                     before_ns, before = self._signals.get((name, index), (times_ns[:0], values[:0]))
                     series = np.concatenate([before_ns, times_ns]), np.concatenate([before, values])
                     self._signals[name, index] = series
-            if reader.is_mapped and not (reader.planned.is_lasting or reader.planned.is_latched):
-                latest_ns = self._reported.get(name, times_ns[:0])[-1:]
-                self._reported[name] = np.concatenate([latest_ns, times_ns])
-                start_ns, end_ns = self.window_ns
-                if name != self.plan.sampled_topic:
-                    # the pauses of that one are those of samples
-                    self.remarks.messages[name].add(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
+            if reader.is_mapped and len(times_ns):
+                self._note_messages(reader.planned, times_ns, is_placed)
             if reader.extractor is not None:
                 self.remarks.note_frames(reader.extractor.noted_frames)
             if self.plan.sampled_topic in (None, name):
                 sampled.append(times_ns)
+            elif name in self.plan.fallback_topics:
+                others.append(times_ns)
         self._store_added()
-        return np.concatenate(sampled)
+        return np.concatenate(sampled), np.concatenate(others)
+
+    def _note_messages(self, planned: PlannedTopic, times_ns: Integers, is_placed: Booleans) -> None:
+        """Note the times of a topic's messages, and which of them transforms place."""
+        name = planned.name
+        self._begun_ns.setdefault(name, int(times_ns[0]))
+        latest_ns, latest = self._reported.get(name, times_ns[:0])[-1:], self._placed_messages.get(name)
+        self._reported[name] = np.concatenate([latest_ns, times_ns])
+        self._placed_messages[name] = np.concatenate(
+            [is_placed[:0] if latest is None else latest[-1:], is_placed]
+        )
+        if planned.max_age_ns >= FOREVER_NS:
+            stays = planned.layout is not None and planned.layout.stays
+            why = "since the topic is latched" if planned.is_latched else "as markers do" if stays else ""
+            self.remarks.lasting[name] = why or "by its `max_age: forever`"
+        if not planned.is_static:
+            start_ns, end_ns = self.window_ns
+            self.remarks.messages[name].add(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
 
     def trace(self, times_ns: Integers, newest_ns: int) -> Trace:
         """Return the samples at some times, up to the time of the last `advance`.
@@ -405,6 +434,7 @@ class Tracker:
             reported_ns=None if (reported_ns == times_ns[:, None])[rows >= 0].all() else reported_ns,
             signals_reported_ns=signals_reported_ns,
             lasting=frozenset(names[i] for i in order if self._is_lasting(int(codes[i]))),
+            spans=self._spans(times_ns) if self.plan.mapping.trims_ends else (),
         )
 
     def _is_lasting(self, name: int) -> bool:
@@ -412,6 +442,39 @@ class Tracker:
         planned = self.readers[self._topic_of_name[name]].planned
         # frames are placed anew in every sample
         return planned.is_lasting and not planned.is_static
+
+    def _spans(self, times_ns: Integers) -> tuple[TopicSpan, ...]:
+        """Return when each mapped topic could be judged in some samples."""
+        spans = []
+        for topic, reader in self.readers.items():
+            if not reader.is_mapped:
+                continue
+            judged_ns = times_ns[self._is_judged(reader.planned, times_ns)]
+            heard_ns = self._reported.get(topic, times_ns[:0])
+            first_ns, last_ns = judged_ns[[0, -1]].tolist() if len(judged_ns) else (None, None)
+            spans.append(
+                replace(
+                    self._unheard[topic],
+                    objects=self._objects_of.get(topic, frozenset()),
+                    begun_ns=self._begun_ns.get(topic),
+                    heard_ns=int(heard_ns[-1]) if len(heard_ns) else None,
+                    first_ns=first_ns,
+                    last_ns=last_ns,
+                )
+            )
+        self._unplaced_at.clear()
+        return tuple(spans)
+
+    def _is_judged(self, planned: PlannedTopic, times_ns: Integers) -> Booleans:
+        """Return in which samples a topic has begun, is not silent, and is placed by transforms."""
+        begun_ns, heard_ns = self._begun_ns.get(planned.name), self._reported.get(planned.name)
+        if begun_ns is None or heard_ns is None:
+            return np.zeros(len(times_ns), np.bool_)
+        at = np.maximum(np.searchsorted(heard_ns, times_ns, "right") - 1, 0)
+        is_placed = self._placed_messages[planned.name][at]
+        is_old = times_ns - heard_ns[at] > planned.max_age_ns
+        is_unplaced = np.isin(times_ns, np.concatenate([times_ns[:0], *self._unplaced_at[planned.name]]))
+        return np.asarray((times_ns >= begun_ns) & is_placed & ~is_old & ~is_unplaced)
 
     def forget(self, upto_ns: int) -> None:
         """Drop what no later sample needs: all but the last observation of each object and signal."""
@@ -437,6 +500,7 @@ class Tracker:
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
         """Make unknown, from a time on, what some topics have reported: objects stay, without a place."""
         for topic in topics:
+            self._begun_ns.pop(topic, None)
             last = self._events[topic].last()
             last = select(last, np.flatnonzero(last.expires_ns > time_ns))
             rows = self._add(ObservationRows.blank(last.class_code))
@@ -451,7 +515,8 @@ class Tracker:
 
     def _take_detections(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
-    ) -> None:
+    ) -> Booleans:
+        """Store the objects of messages; return which messages (M,) transforms place."""
         if detections.skipped:
             self.remarks.skipped[reader.name] += detections.skipped
         self._claim_names(reader.name, detections.name)
@@ -486,6 +551,10 @@ class Tracker:
             is_complete=is_complete,
         )
         self._events[reader.name] = events.after(before)
+        is_placed = np.ones(len(times_ns), np.bool_)
+        if transforms is not None:
+            is_placed[detections.message[~transforms.known]] = False
+        return is_placed
 
     def _place_following(self, topic: str, times_ns: Integers, states: States) -> None:
         """Replace the rows (T, N) of objects that stay in moving frames by those of each time."""
@@ -508,6 +577,7 @@ class Tracker:
             fixed, frame, times_ns, by_stamp=False, log_ns=log_ns, longest_ns=longest_ns, holds=True
         )
         self._count_missing(topic, frame, times_ns[~found.known])
+        self._unplaced_at[topic].append(times_ns[~found.known])
         # while nothing moves, one observation is enough
         changed = _changes(found)
         repeated, moved = detections.repeated(index, len(changed)), found.select(changed)
@@ -540,7 +610,11 @@ class Tracker:
         return np.arange(first, first + len(rows), dtype=np.int64)
 
     def _claim_names(self, topic: str, names: Integers) -> None:
-        for code in set(names.tolist()):
+        codes = set(names.tolist())
+        new = {self.names.by_code[code] for code in codes.difference(self._topic_of_name)}
+        if new:
+            self._objects_of[topic] = self._objects_of.get(topic, frozenset()) | new
+        for code in codes:
             owner = self._topic_of_name.setdefault(code, topic)
             if owner != topic:
                 raise UsageError(
@@ -596,7 +670,8 @@ class Tracker:
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
         """Return at which times a topic pauses for longer than `max_gap`."""
         most_ns, known = self.plan.mapping.max_gap_ns, self._reported.get(topic)
-        if most_ns is None or known is None or not len(known):
+        planned = self.readers[topic].planned
+        if most_ns is None or known is None or planned.is_lasting or planned.is_latched:
             return np.zeros(len(times_ns), np.bool_)
         first = self.readers[topic].pending.first_ns
         # where no message follows, the time up to now shows whether this is a pause
@@ -670,6 +745,7 @@ class Remarks:
         replaced: messages that have the time of a later one, by topic.
         skipped: objects without solids, by topic.
         samples, messages: the intervals between samples, and between messages by topic.
+        lasting: topics whose messages stay valid, with the reason.
     """
 
     def __init__(self, name: str, mapping: LogMapping) -> None:
@@ -681,6 +757,7 @@ class Remarks:
         self._frames: set[str] = set()
         self.samples = Pauses()
         self.messages: dict[str, Pauses] = defaultdict(Pauses)
+        self.lasting: dict[str, str] = {}
 
     def count_stale(
         self, topic: str, name: str, times_ns: Integers, stale: Booleans, in_gap: Booleans
@@ -695,6 +772,8 @@ class Remarks:
         """Remark pauses of topics, but for those in which there are no samples either."""
         pauses = self.samples.found()
         for topic, messages in sorted(self.messages.items()):
+            if topic in self.lasting:
+                continue
             own = messages.found()
             is_common = all(
                 any(at < start + length and start < at + long for at, long in pauses) for start, length in own
@@ -702,6 +781,24 @@ class Remarks:
             remark = messages.remark(f"{topic}: messages", self._mapping.max_gap_ns)
             if not is_common and remark is not None:
                 self.add(remark)
+
+    def add_silences(self) -> None:
+        """Remark topics that came regularly and stopped, and whose last message stays valid."""
+        for topic, why in sorted(self.lasting.items()):
+            messages = self.messages[topic]
+            last_ns, end_ns, usual_ns = messages.last_ns, self.samples.last_ns, messages.usual_ns
+            if last_ns is None or end_ns is None or not messages.is_regular:
+                continue
+            if end_ns - last_ns > LONG_PAUSE * usual_ns:
+                stops = Sentence(f"{topic}: its messages stop at ", Instant(last_ns, 0))
+                usual = (
+                    f", where one usually comes every {usual_ns / 1e9:.3g} s; the last one stays valid until "
+                )
+                self.add(
+                    Sentence(
+                        stops, usual, Instant(end_ns, 0), f", {why}; a shorter `max_age` makes it unknown"
+                    )
+                )
 
     def add(self, text: str) -> None:
         self._texts.append(text)
@@ -762,6 +859,23 @@ class Remarks:
                 Instant(first_ns, 0),
                 f": the topic was silent for longer than {limit}",
             )
+
+
+def _unheard(planned: PlannedTopic) -> TopicSpan:
+    """Return the span of a topic before its first message."""
+    entry, layout = planned.mapping, planned.layout
+    return TopicSpan(
+        topic=planned.name,
+        objects=frozenset(),
+        pattern=None if entry is None or layout is None else name_pattern(layout, entry),
+        signals=frozenset(() if entry is None else (signal.name for signal in entry.signals)),
+        classes=None if layout is None else possible_classes(layout),
+        limit_ns=planned.silence_ns,
+        begun_ns=None,
+        heard_ns=None,
+        first_ns=None,
+        last_ns=None,
+    )
 
 
 def _replaced(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:

@@ -32,6 +32,7 @@ from spatial_replay.text import (
     text_number,
     times_apart,
 )
+from spatial_replay.trace.spans import TopicSpan, join_spans
 from spatial_replay.trace.units import checked_units
 
 LATEST_NS = 2**63 - 1
@@ -329,7 +330,7 @@ class Trace(Displayed):
     that is not finite is stored too, so that nothing is lost, but under the row number -2 - row: the
     object is unknown there (unreadable).
 
-    Two traces are equal if they hold the same samples; `faults`, `remarks`, `units`, the order of
+    Two traces are equal if they hold the same samples; `faults`, `remarks`, `units`, `spans`, the order of
     observations and names that no sample uses do not matter.
 
     Attributes:
@@ -350,6 +351,7 @@ class Trace(Displayed):
         faults: messages about samples lost or left out while reading, each with its place.
         remarks: other messages about the log, where nothing was lost.
         units: those that are declared, of signals by their names, of lengths by "".
+        spans: when each mapped topic could be judged, for logs whose ends are trimmed.
         cache: measurements already taken from this trace.
 
     Raises:
@@ -371,6 +373,7 @@ class Trace(Displayed):
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    spans: tuple[TopicSpan, ...] = field(default=(), repr=False)
     cache: MeasurementCache = field(default_factory=MeasurementCache, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -644,6 +647,7 @@ class Trace(Displayed):
             faults=tuple(fault for trace in traces for fault in trace.faults),
             remarks=tuple(remark for trace in traces for remark in trace.remarks),
             units={name: unit for trace in traces for name, unit in trace.units.items()},
+            spans=join_spans(trace.spans for trace in traces),
         )
 
 
@@ -816,10 +820,21 @@ class Pauses:
     def found(self) -> list[tuple[int, int]]:
         """Return the start and the length of each pause, the longest first."""
         held = self._held
-        starts, lengths = held[:, held[1] > LONG_PAUSE * self.usual_ns].tolist()
-        if self._count < _FEWEST or len(starts) > max(1, self._count // _RARE):
+        if not self.is_regular:
             return []
+        starts, lengths = held[:, held[1] > LONG_PAUSE * self.usual_ns].tolist()
         return sorted(zip(starts, lengths, strict=True), key=lambda each: -each[1])
+
+    @property
+    def last_ns(self) -> int | None:
+        """The latest time; None without any."""
+        return int(self._last[-1]) if len(self._last) else None
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether there are enough intervals to show which is usual, and few are long."""
+        long = int(np.count_nonzero(self._held[1] > LONG_PAUSE * self.usual_ns))
+        return self._count >= _FEWEST and long <= max(1, self._count // _RARE)
 
     @property
     def usual_ns(self) -> int:
