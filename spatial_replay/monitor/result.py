@@ -13,6 +13,7 @@ import numpy as np
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed, data_frame
+from spatial_replay.monitor.ends import Needs, trim_trace
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.sentences import (
@@ -576,6 +577,7 @@ class Evaluation(Displayed):
         specification: what was evaluated.
         objects, signals, classes: the names in the trace.
         each: the objects that templates were evaluated for, by parameter.
+        left_out: sentences on the samples that were left out at the ends.
     """
 
     results: tuple[SpecResult, ...]
@@ -585,6 +587,7 @@ class Evaluation(Displayed):
     signals: tuple[str, ...]
     classes: tuple[str, ...]
     each: Mapping[str, str]
+    left_out: tuple[Sentence, ...] = ()
 
     @cached_property
     def remarks(self) -> tuple[Diagnostic, ...]:
@@ -714,7 +717,8 @@ def evaluate(
     Args:
         semantics: "ltlf", finite-trace robustness, or "paper", Def. 16 of the paper to the letter.
         start_ns, end_ns: evaluate the samples from start to before end; terms that look back (`a[-3]`) may
-            look before the start.
+            look before the start. Without them, samples of a mapped log are left out at an end where a needed
+            topic has not begun, or has ended (`ends: trim` of the mapping); `Evaluation.left_out` names them.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
         strict_names: names that the trace never has are errors; otherwise objects and signals are unknown, a
             template has no result for a class, and `Evaluation.remarks` warns of them.
@@ -734,6 +738,8 @@ def evaluate(
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
+    first_ns, needs = int(trace.times_ns[0]), Needs.of([specification], each or {})
+    trace, left_out = trim_trace(trace, needs, start=not window[0], end=window[1] >= FOREVER)
     specification = with_numbers(specification, trace.units)
     if strict_names:
         _require_names(specification, trace, each or {})
@@ -754,6 +760,7 @@ def evaluate(
         tuple(trace.signals),
         _classes(trace),
         dict(each or {}),
+        counted_from(left_out, first_ns),
     )
 
 

@@ -170,6 +170,7 @@ class Replay:
         self._source = source
         self._written_files = files
         self._selection = Selection(source, files, options)
+        self._ends = self._selection.run_ends()
         self.files = logged_specifications(files, source.axes.units)
         instances = [self._selection.instances(file) for file in self.files]
         self._departures = [
@@ -262,7 +263,7 @@ class Replay:
 
     def _evaluated(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
         """Yield each block with its samples and their evaluation."""
-        with closing(self._selection.read_blocks(messages=messages)) as blocks:
+        with closing(self._selection.read_blocks(messages=messages, ends=self._ends)) as blocks:
             for block, trace in blocks:
                 yield block, trace, self._evaluation.extend(trace)
 
@@ -301,7 +302,7 @@ class Replay:
         missing = self._selection.missing_names(self._names)
         dropped = dropped_samples(self._source)
         options = self._selection.options
-        first_ns = first_sample_ns(self._source) if options.window.start_ns else self._times[0]
+        first_ns = first_sample_ns(self._source) if options.window.start_ns else self._ends.log_begin_ns
         left = self._left(first_ns)
         return Replayed(
             log=self._source.name,

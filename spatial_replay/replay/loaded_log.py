@@ -40,6 +40,7 @@ from spatial_replay.logs.messages import (
     read_ahead,
     read_blocks,
 )
+from spatial_replay.monitor.ends import Needs
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import idle_templates
@@ -61,7 +62,7 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.text import counted_from, listed
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Trace, within
 
 _FEW: Final = 2_000
 _FEW_BYTES: Final = 1 << 26
@@ -88,6 +89,7 @@ class OwnMessages:
         self._few: dict[Channel, list[Messages]] = {}
         self._counts: dict[Channel, int] = {}
         self._bytes = 0
+        self._samples_ns: tuple[int, int] = 0, 0
         self.start_ns, self.end_ns = 0, -1
 
     @property
@@ -99,7 +101,11 @@ class OwnMessages:
         window = self._selection.window
         messages = block.messages.within(window.start_ns, window.end_ns)
         self._span(messages.log_time_ns)
-        self._span(self._selection.inside(block.trace).times_ns)
+        times_ns = self._selection.inside(block.trace).times_ns
+        self._span(times_ns)
+        if len(times_ns):
+            first_ns = self._samples_ns[0] or int(times_ns[0])
+            self._samples_ns = first_ns, int(times_ns[-1]) + 1
         self._count(messages)
         # a log without messages is played from memory; others are read again
         if self._counts:
@@ -131,7 +137,9 @@ class OwnMessages:
     def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
         """Read the log from a time on; from memory, in small pieces, if samples are all that it has."""
         if self._counts:
-            yield from read_blocks(self._selection.source, start_ns, self._selection.window.end_ns)
+            for block in read_blocks(self._selection.source, start_ns, self._selection.window.end_ns):
+                # samples at the ends of the log are left out
+                yield replace(block, trace=within(block.trace, *self._samples_ns))
             return
         if len(self._samples) > 1:
             self._samples = [Trace.concatenate(self._samples)]
@@ -273,7 +281,8 @@ class LoadedLog:
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
-        for block, trace in read_ahead(selection.read_blocks()):
+        ends = selection.run_ends()
+        for block, trace in read_ahead(selection.read_blocks(ends=ends)):
             traces.append(trace)
             remarks += block.remarks
             self.own.add(block)
@@ -285,20 +294,23 @@ class LoadedLog:
             raise selection.nothing_to_evaluate(self.faults)
         self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
-        self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
+        self.first_ns = first_sample_ns(source) if options.window.start_ns else ends.log_begin_ns
+        self._needs, self._has_spans = ends.needs, ends.has_spans
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
         """Return the log with other specifications; samples and measurements are those in memory.
 
-        The log is read again only if these look back at samples before the window, and the former did not.
+        The log is read again only if these look back at samples before the window, and the former did not, or
+        if these name other objects or signals of a log whose ends are trimmed.
 
         Raises:
             UsageError: an option that does not fit these specifications.
             SpecificationError: names that the log never has, if names are strict.
         """
-        if self.options.window.start_ns and look_before(files) and not self._looks_back:
+        looks_farther = self.options.window.start_ns and look_before(files) and not self._looks_back
+        if looks_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
             options = replace(self.options, keep=self._keep)
             return LoadedLog(self._source, files, options, saved=self._saved)
         other = copy(self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -36,6 +37,7 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.atoms.terms import look_back
+from spatial_replay.monitor.ends import Needs, RunEnds
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.stream import Instance, check_parameters, find_instances
 from spatial_replay.monitor.verdict import Semantics
@@ -44,7 +46,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
-from spatial_replay.text import listed, time_text
+from spatial_replay.text import Sentence, listed, time_text
 from spatial_replay.trace.trace import FOREVER, Trace, within
 
 if TYPE_CHECKING:
@@ -251,12 +253,34 @@ class Selection:
     def window(self) -> Window:
         return self.options.window
 
-    def read_blocks(self, *, messages: bool = True) -> Generator[tuple[Block, Trace], None, None]:
+    def run_ends(self) -> RunEnds:
+        """Return the rule for the ends of the log; a start or an end of the window overrides it."""
+        needs = Needs.of(self.files, self.options.each)
+        return RunEnds(needs, start=not self.window.start_ns, end=self.window.end_ns >= FOREVER)
+
+    def read_blocks(
+        self, *, messages: bool = True, ends: RunEnds | None = None
+    ) -> Generator[tuple[Block, Trace], None, None]:
         """Read each block, with its samples in the window, and before it if a specification looks back.
 
         Args:
             messages: whether the blocks have to hold messages.
+            ends: new from `run_ends`, for callers who ask it afterwards.
         """
+        ends = ends or self.run_ends()
+        waiting: deque[Block] = deque()
+        for block, trace in self._read_strided(messages=messages):
+            waiting.append(block)
+            for counting in ends.add(trace):
+                yield _trimmed(waiting.popleft(), ends), counting
+        for counting in ends.finish():
+            yield _trimmed(waiting.popleft(), ends), counting
+        if ends.remarks:
+            remarks = tuple(Sentence(f"{self.source.name}: ", remark) for remark in ends.remarks)
+            yield Block(Trace.empty(), remarks=remarks), Trace.empty()
+
+    def _read_strided(self, *, messages: bool) -> Iterator[tuple[Block, Trace]]:
+        """Read each block, with every Nth of its samples."""
         window = self.window
         # every Nth sample is counted from the log's first, wherever the window starts
         from_start = look_before(self.files) or window.every > 1
@@ -281,7 +305,7 @@ class Selection:
         Args:
             advance: called with the number of samples of each block.
         """
-        if isinstance(self.source, MemorySource) and self.window.is_whole:
+        if isinstance(self.source, MemorySource) and self.window.is_whole and not self.source.trace.spans:
             # with the measurements that it has cached
             advance(len(self.source.trace))
             return self.source.trace
@@ -377,6 +401,11 @@ class Selection:
     def _missing_names(self, names: LogNames) -> list[Diagnostic]:
         remarks = [remark for file in self.files for remark in names.check(file, self.options.each)]
         return [remark for remark in remarks if remark.severity == "error"]
+
+
+def _trimmed(block: Block, ends: RunEnds) -> Block:
+    """Return a block whose samples count, with all of its messages."""
+    return replace(block, trace=ends.trim(block.trace))
 
 
 def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:

@@ -203,8 +203,8 @@ def object_names(specification: Specification) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _group_classes(specification: Specification) -> tuple[str, ...]:
-    """Return the classes of open groups, in the order of the text."""
+def group_classes(specification: Specification) -> tuple[str, ...]:
+    """Return the classes of open groups, in the order of the text; `ANY_CLASS` for all objects."""
     groups: list[Term] = []
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
@@ -213,7 +213,7 @@ def _group_classes(specification: Specification) -> tuple[str, ...]:
             elif isinstance(formula, Atom):
                 groups += terms_of(formula.expression)
     bases = [base for term in groups if isinstance(base := base_of(term), Group)]
-    return tuple(dict.fromkeys(name for each in bases if (name := each.class_name) and name != ANY_CLASS))
+    return tuple(dict.fromkeys(name for each in bases if (name := each.class_name)))
 
 
 def signal_names(specification: Specification) -> tuple[str, ...]:
@@ -287,9 +287,9 @@ def check_names(
             report("class", name, known_classes, spec.span)
         elif kind != "class" and chosen not in ("all", *objects):
             report("object", chosen, objects, spec.span)
-    for name in _group_classes(specification):
+    for name in group_classes(specification):
         # a log may lack a class; one that is nearly spelt like another is taken for a mistake
-        if name.casefold() not in taken and nearest_hint(name, known_classes):
+        if name != ANY_CLASS and name.casefold() not in taken and nearest_hint(name, known_classes):
             report("class", name, known_classes, places.get(name, Span(0, 0)))
     for name, span in defined.items():
         if name in objects:

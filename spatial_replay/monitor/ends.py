@@ -1,0 +1,237 @@
+"""Where the evaluation of a log begins and ends: specifications and spans of topics in, samples out.
+
+A recorded log, a trace and a running robot follow one rule. Evaluation begins at the first sample where
+each needed topic has sent a message and can be placed, and ends at the last such sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.spec.checks import group_classes, object_names, signal_names
+from spatial_replay.spec.formula import ANY_CLASS, Specification
+from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.trace.spans import TopicSpan
+from spatial_replay.trace.trace import FOREVER, Trace, within
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """The objects, signals and classes that specifications name.
+
+    Attributes:
+        classes: in lower case; `ANY_CLASS` for objects of any class.
+    """
+
+    objects: frozenset[str] = frozenset()
+    signals: frozenset[str] = frozenset()
+    classes: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, files: Iterable[Specification], each: Mapping[str, str]) -> Needs:
+        """Return the needs of specifications.
+
+        Args:
+            each: for parameters of templates, the objects that they stand for: "all", "class:NAME" or a name.
+        """
+        objects: set[str] = set()
+        signals: set[str] = set()
+        classes: set[str] = set()
+        for file in files:
+            objects.update(object_names(file))
+            signals.update(signal_names(file))
+            classes.update(group_classes(file))
+            for parameter in {spec.parameter for spec in file.results} - {None}:
+                kind, _, name = each.get(parameter or "", "all").partition(":")
+                if kind == "class":
+                    classes.add(name)
+                elif kind == "all":
+                    classes.add(ANY_CLASS)
+                else:
+                    objects.add(kind if not name else f"{kind}:{name}")
+        return cls(frozenset(objects), frozenset(signals), frozenset(name.casefold() for name in classes))
+
+    def choose(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
+        """Return the spans of the topics that carry a needed object or signal, or may do so."""
+        unseen = self.objects.difference(*(span.objects for span in spans))
+        return [span for span in spans if self._is_needed(span, unseen)]
+
+    def _is_needed(self, span: TopicSpan, unseen: frozenset[str]) -> bool:
+        if not (self.objects.isdisjoint(span.objects) and self.signals.isdisjoint(span.signals)):
+            return True
+        if span.pattern is None:
+            return False
+        of_class = bool(self.classes) and (
+            ANY_CLASS in self.classes or span.classes is None or not self.classes.isdisjoint(span.classes)
+        )
+        return of_class or any(map(span.may_have, unseen))
+
+
+class RunEnds:
+    """Leaves out the samples at both ends of a log in which a needed topic cannot be judged.
+
+    Samples are left out only before a needed topic begins, after it ends, and where no transform places it.
+    At each end at most the topic's `limit_ns` is left out. A topic that is missing for longer leaves a hole.
+
+    Args:
+        start, end: whether samples are left out at the start, and at the end.
+        within_ns: replaces the limits of the topics at the start.
+
+    Attributes:
+        log_begin_ns: time of the first sample.
+        begin_ns: time of the first sample that counts; None until that is decided.
+        end_ns: samples from this time on are left out; known after `finish`.
+        late: needed topics that could not be judged in time, so that evaluation began without them.
+    """
+
+    def __init__(
+        self, needs: Needs, *, start: bool = True, end: bool = True, within_ns: int | None = None
+    ) -> None:
+        self.needs = needs
+        self._start, self._end, self._within_ns = start, end, within_ns
+        self._spans: dict[str, TopicSpan] = {}
+        self._since_ns: dict[str, int | None] = {}
+        self._held: list[Trace] = []
+        self.log_begin_ns = self._log_end_ns = 0
+        self._is_empty = True
+        self.begin_ns: int | None = None
+        self.end_ns = FOREVER
+        self.late: tuple[str, ...] = ()
+        self.remarks: tuple[Sentence, ...] = ()
+
+    @property
+    def has_spans(self) -> bool:
+        """Whether the log says when its topics could be judged."""
+        return bool(self._spans)
+
+    def add(self, trace: Trace) -> list[Trace]:
+        """Add the next samples; return those that count now, one trace for each that was added, in order."""
+        if self.begin_ns is not None and not self._end:
+            return [trace]
+        if len(trace):
+            if self._is_empty:
+                self.log_begin_ns, self._is_empty = int(trace.times_ns[0]), False
+            self._log_end_ns = int(trace.times_ns[-1])
+            self._note(trace)
+        self._held.append(trace)
+        if self.begin_ns is None and not self._decide_begin():
+            return []
+        return self._release(self._open_since_ns())
+
+    def finish(self) -> list[Trace]:
+        """Return the remaining samples that count, at the end of the log."""
+        if self._is_empty:
+            return self._release(FOREVER)
+        if self.begin_ns is None:
+            self._begin()
+        self.end_ns = self._open_since_ns()
+        if self.end_ns < FOREVER:
+            self._remark_end()
+        return self._release(FOREVER)
+
+    def _note(self, trace: Trace) -> None:
+        times_ns = trace.times_ns
+        for span in trace.spans:
+            before = self._spans.get(span.topic)
+            self._spans[span.topic] = span if before is None else before.join(span)
+            # the first sample after the last one in which the topic could be judged
+            after = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
+            since_ns = int(times_ns[after]) if after < len(times_ns) else None
+            if after == 0 and before is not None:
+                since_ns = self._since_ns[span.topic] or since_ns
+            self._since_ns[span.topic] = since_ns
+
+    def _limit_ns(self, span: TopicSpan) -> int:
+        return span.limit_ns if self._within_ns is None else self._within_ns
+
+    def _decide_begin(self) -> bool:
+        """Begin if no needed topic is waited for any more."""
+        passed_ns = self._log_end_ns - self.log_begin_ns
+        is_waiting = self._is_empty or (
+            self._start
+            and any(
+                span.first_ns is None and passed_ns <= self._limit_ns(span)
+                for span in self.needs.choose(tuple(self._spans.values()))
+            )
+        )
+        if not is_waiting:
+            self._begin()
+        return not is_waiting
+
+    def _begin(self) -> None:
+        needed = self.needs.choose(tuple(self._spans.values())) if self._start else []
+        delays = [(span, (span.first_ns or FOREVER) - self.log_begin_ns) for span in needed]
+        self.late = tuple(span.topic for span, delay in delays if delay > self._limit_ns(span))
+        in_time = [span for span, delay in delays if delay <= self._limit_ns(span)]
+        self.begin_ns = max((span.first_ns or 0 for span in in_time), default=self.log_begin_ns)
+        last = max(in_time, key=lambda span: span.first_ns or 0, default=None)
+        if last is not None and self.begin_ns > self.log_begin_ns:
+            self._remark_begin(last, self.begin_ns)
+
+    def _remark_begin(self, span: TopicSpan, begin_ns: int) -> None:
+        times_ns = np.concatenate([trace.times_ns for trace in self._held])
+        left_out = times_ns[times_ns < begin_ns]
+        why: list[str | Instant] = [f"no transform places {span.topic} before"]
+        if span.begun_ns is not None and span.begun_ns > int(left_out[-1]):
+            why = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
+        self._remark("beginning", left_out, why)
+
+    def _remark_end(self) -> None:
+        span = min(self._open_spans(), key=lambda span: self._since_ns[span.topic] or FOREVER)
+        times_ns = np.concatenate([trace.times_ns for trace in self._held])
+        left_out = times_ns[times_ns >= self.end_ns]
+        why: list[str | Instant] = [f"no transform places {span.topic} then"]
+        if span.heard_ns is not None and self.end_ns - span.heard_ns > span.limit_ns:
+            why = [f"{span.topic} ends at ", Instant(span.heard_ns, 0)]
+        self._remark("end", left_out, why)
+
+    def _remark(self, which: str, left_out: Integers, why: Iterable[str | Instant]) -> None:
+        first, last = (Instant(int(at), 0) for at in left_out[[0, -1]])
+        count = counted(len(left_out), "sample")
+        are = "is" if len(left_out) == 1 else "are"
+        sentence = Sentence(f"{count} at the {which} {are} left out, from ", first, " to ", last, ": ", *why)
+        self.remarks = (*self.remarks, sentence)
+
+    def _open_spans(self) -> Iterator[TopicSpan]:
+        """Yield the spans that end before the newest sample, by no more than their limits."""
+        if not self._end:
+            return
+        for span in self.needs.choose(tuple(self._spans.values())):
+            since_ns = self._since_ns[span.topic]
+            begin_ns = self.begin_ns or 0
+            if since_ns is not None and since_ns > begin_ns and self._log_end_ns - since_ns <= span.limit_ns:
+                yield span
+
+    def _open_since_ns(self) -> int:
+        """Return since when a needed topic cannot be judged, if that may be the end of the log."""
+        return min((self._since_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
+
+    def _release(self, before_ns: int) -> list[Trace]:
+        """Return the traces that end before a time, and drop them here."""
+        count = 0
+        for trace in self._held:
+            if len(trace) and int(trace.times_ns[-1]) >= before_ns:
+                break
+            count += 1
+        released, self._held = self._held[:count], self._held[count:]
+        return [self.trim(trace) for trace in released]
+
+    def trim(self, trace: Trace) -> Trace:
+        """Return the samples of a trace that count, as far as that is decided."""
+        return replace(within(trace, self.begin_ns, self.end_ns), spans=())
+
+
+def trim_trace(
+    trace: Trace, needs: Needs, *, start: bool = True, end: bool = True
+) -> tuple[Trace, tuple[Sentence, ...]]:
+    """Return the samples of a whole trace that count, and remarks on those left out."""
+    if not trace.spans:
+        return trace, ()
+    ends = RunEnds(needs, start=start, end=end)
+    (counting,) = [*ends.add(trace), *ends.finish()]
+    # a trace that stays whole keeps its measurements
+    return (counting, ends.remarks) if ends.remarks else (trace, ())
