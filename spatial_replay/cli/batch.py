@@ -244,8 +244,8 @@ def batch(
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
     folder; another run evaluates only what is new. A log that cannot be read has a row with its error.
 
-    One exit code covers all logs, with the meanings of replay: 0 if everything is as expected, 1 if anything
-    fails, 3 if logs are damaged or unfit, 4 if results are unknown or tested by nothing.
+    One exit code covers all logs, with the meanings of replay. It is 0 if everything is as expected, 1 if
+    anything fails, 3 if logs are damaged or unfit, 4 if results are unknown or tested by nothing.
 
     \b
     Examples:

@@ -403,9 +403,8 @@ def record(
 ) -> int:
     """Record a run of a simulated world as a log (MCAP), or with the commands below another source.
 
-    SCENARIO is push (three blocks on a table, and a robot that pushes them), pick-place (nine things on a
-    table, and a robot that picks and places them) or table-setting (cutlery, a cup and a plate, and a robot
-    that sets the table). The robot follows a script. Equal options give an equal log, byte for byte. Needs
+    A robot follows a script. In push it pushes three blocks, in pick-place it picks and places nine things,
+    and in table-setting it sets a table. Equal options give an equal log, byte for byte. Needs
     the extra `sim`.
 
     \b
