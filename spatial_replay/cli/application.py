@@ -289,9 +289,10 @@ def message_from_error(error: BaseException) -> str:
             if isinstance(error, click.NoSuchOption):
                 remedy = new_form(error.option_name, context.command)
                 what = f"no option {error.option_name}; {remedy}" if remedy else what
-            if "unexpected extra" in what and any("--spec" in each.opts for each in context.command.params):
+            parameters = context.command.params
+            if "unexpected extra" in what and any("--spec" in parameter.opts for parameter in parameters):
                 what += f"; specifications come after --spec: {path} LOG --spec FILE; batch takes many logs"
-            if "'--spec'" in what and any(each.name == "specification" for each in context.command.params):
+            if "'--spec'" in what and any(parameter.name == "specification" for parameter in parameters):
                 what += f" {path} FILE takes the specification without it."
             return f"{what}\n  see '{path} --help'"
         case click.ClickException():

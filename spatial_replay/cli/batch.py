@@ -26,7 +26,7 @@ from spatial_replay.cli.options import (
     naming_option,
     objects_by_parameter,
     plugin_option,
-    refuse_given,
+    refuse_values,
     semantics_option,
 )
 from spatial_replay.cli.output import VERDICT_COLOURS
@@ -72,24 +72,25 @@ def print_totals(table: pa.Table, by: By) -> None:
     from spatial_replay.batch.run_table import WORSE, counts_of, totals
 
     rows = totals(table, by)
-    titles = [_title(each, by, len({each.group["case"] for each in rows}) > 1) for each in rows]
+    has_cases = len({total.group["case"] for total in rows}) > 1
+    titles = [_title(total, by, has_cases) for total in rows]
     columns = counts_of(rows)
     if WORSE in table.column_names:
-        columns["worse"] = [each.worse or 0 for each in rows]
+        columns["worse"] = [total.worse or 0 for total in rows]
     width = max([len(by), *map(len, titles)])
     show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in columns)}  least robustness")
-    for place, (title, each) in enumerate(zip(titles, rows, strict=True)):
+    for place, (title, total) in enumerate(zip(titles, rows, strict=True)):
         line: list[str | Coloured] = [f"  {title:<{width}}"]
         for name, counts in columns.items():
             count = counts[place]
             # of verdicts that all were expected, none is bad
-            colour = _COLOURS.get(name) if each.failures or name == "satisfied" else None
-            shown = f"{count:>9,}" if count else f"{'-':>9}"
-            line += ["  ", Coloured(shown, colour) if count and colour else shown]
-        least = "not determined" if each.least is None else f"{each.least:.6g}"
+            colour = _COLOURS.get(name) if total.failures or name == "satisfied" else None
+            cell = f"{count:>9,}" if count else f"{'-':>9}"
+            line += ["  ", Coloured(cell, colour) if count and colour else cell]
+        least = "not determined" if total.least is None else f"{total.least:.6g}"
         show((*line, f"  {least:>16}"))
-        if each.title:
-            show(f"    {each.title}")
+        if total.title:
+            show(f"    {total.title}")
 
 
 def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
@@ -119,7 +120,7 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
         failure = None if row["failure"] == usual else row["failure"]
         for line in (requirement_of(row), failure, row["reason"]):
             if line:
-                show(*(f"      {each}" for each in line.split("\n")))
+                show(*(f"      {part}" for part in line.split("\n")))
 
 
 def write_json_lines(table: pa.Table, file: str, inputs: Sequence[Path]) -> None:
@@ -269,21 +270,21 @@ def batch(
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
     suite = _suite(logs, conditions, semantics).allowing(allow)
     cases = prepare(suite, progress)
-    warnings = [each for case in cases for file in case.files for each in file.warnings]
-    show_diagnostics({str(each): each for each in warnings}.values())
+    warnings = [warning for case in cases for file in case.files for warning in file.warnings]
+    show_diagnostics({str(warning): warning for warning in warnings}.values())
     folder = outputs.output
     if folder is None:
         folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
     check_outputs({"--junit": outputs.junit, "--json": outputs.json_file}, _inputs(suite))
     workers = workers_of(jobs or os.cpu_count() or 1, dask, warn)
-    found = _run(cases, folder, workers, fail_on)
-    differences = None if before is None else compare(found.table, before, tolerance)
+    evaluated = _run(cases, folder, workers, fail_on)
+    differences = None if before is None else compare(evaluated.table, before, tolerance)
     # what is worse than the baseline fails wherever results are shown
     result = (
-        found
+        evaluated
         if before is None
-        else replace(found, table=with_baseline(found.table, before, differences or ()))
+        else replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
     )
     inputs = _inputs(suite)
     pages = {}
@@ -295,22 +296,22 @@ def batch(
     if outputs.update_baseline and outputs.baseline is not None:
         from spatial_replay.batch.store import ResultsFolder
 
-        ResultsFolder.create(outputs.baseline).write_run(found.table)
+        ResultsFolder.create(outputs.baseline).write_run(evaluated.table)
         show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
     if outputs.json_file is not None:
         write_json_lines(result.table, outputs.json_file, inputs)
     if outputs.json_file != "-":
-        _print(result, found, folder)
-    warn(*found.remarks)
-    _warn_of_names(found.table)
-    _warn_of_damage(found.table)
+        _print(result, evaluated, folder)
+    warn(*evaluated.remarks)
+    _warn_of_names(evaluated.table)
+    _warn_of_damage(evaluated.table)
     if is_github():
         for line in worst_annotations(result.table, suite.folder):
             show(line, err=True)
         write_summary(result.table)
-    code = exit_code_from_table(found.table, fail_on)
-    if before is not None and (edited := edited_files(found.table, before)):
-        warn(f"edited since the baseline, which may be why results differ: {_listed(edited)}")
+    code = exit_code_from_table(evaluated.table, fail_on)
+    if before is not None and (edited := edited_files(evaluated.table, before)):
+        warn(f"edited since the baseline, which may be why results differ: {_join_names(edited)}")
     if differences is not None and _print_differences(differences, outputs.json_file == "-"):
         code = most_severe([code, ExitCode.VIOLATED])
     return code
@@ -325,8 +326,8 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
     others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
-    each = objects_by_parameter(given.choices)
-    conditions = Conditions.given(given.reading, each, given.constants, semantics=semantics, **others)
+    objects = objects_by_parameter(given.choices)
+    conditions = Conditions.given(given.reading, objects, given.constants, semantics=semantics, **others)
     suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]
     if not suites:
         if not given.specs:
@@ -350,10 +351,10 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
 
 def _inputs(suite: Suite) -> list[Path]:
     """Return the files that are read, but for the logs, of which there may be very many."""
-    mappings = [case.conditions.mapping for case in suite.cases]
+    mappings = [case.conditions.mapping for case in suite.cases if case.conditions.mapping is not None]
     specs = [spec for case in suite.cases for spec in case.specs]
-    own = [] if suite.path is None else [suite.path]
-    return local_files([*own, *dict.fromkeys([*specs, *(each for each in mappings if each is not None)])])
+    suites = [] if suite.path is None else [suite.path]
+    return local_files([*suites, *dict.fromkeys([*specs, *mappings])])
 
 
 def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
@@ -362,8 +363,8 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     from spatial_replay.batch.store import ResultsFolder, result_files
 
     if outputs.baseline is None:
-        given = {"--update-baseline": outputs.update_baseline, "--tolerance": outputs.tolerance is not None}
-        refuse_given(given, "applies to a baseline; add --baseline RESULTS")
+        options = {"--update-baseline": outputs.update_baseline, "--tolerance": outputs.tolerance}
+        refuse_values(options, "applies to a baseline; add --baseline RESULTS")
         return Tolerance(), None
     with naming_option("--tolerance"):
         tolerance = Tolerance.parse(outputs.tolerance or "0")
@@ -389,20 +390,20 @@ def _run(
         raise
 
 
-def _print(result: BatchResult, found: BatchResult, folder: str) -> None:
+def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     """Print the results of a run, compared with a baseline or not, as all other outputs show them.
 
     Args:
-        found: the same without the comparison.
+        evaluated: the same without the comparison.
     """
     import pyarrow.compute as pc
 
     from spatial_replay.batch.run_table import WORSE, summary_text
 
-    known = result.logs - result.evaluated
-    news = f"{result.evaluated:,} evaluated now, {known:,} known" if known else "all evaluated now"
+    reused = result.logs - result.evaluated
+    news = f"{result.evaluated:,} evaluated now, {reused:,} known" if reused else "all evaluated now"
     # a log that is gone is on the page and in the summary, too
-    gone = len(set(result.table["log"].to_pylist()) - set(found.table["log"].to_pylist()))
+    gone = len(set(result.table["log"].to_pylist()) - set(evaluated.table["log"].to_pylist()))
     news = f"{news}, {gone:,} gone" if gone else news
     show(f"{counted(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
     print_totals(result.table, "spec")
@@ -411,10 +412,10 @@ def _print(result: BatchResult, found: BatchResult, folder: str) -> None:
         show(f"{counted(cut, 'result')} decided by a window that the end of the log cut: see --fail-on cut")
     failures = len(result.failures)
     if failures:
-        shown = f"{failures:,} failed"
+        summary = f"{failures:,} failed"
         if WORSE in result.table.column_names:
-            shown += f", {pc.sum(result.table[WORSE]).as_py():,} of them worse than the baseline, or gone"
-        show(f"{shown}, the worst {_WORST}:" if failures > _WORST else f"{shown}:")
+            summary += f", {pc.sum(result.table[WORSE]).as_py():,} of them worse than the baseline, or gone"
+        show(f"{summary}, the worst {_WORST}:" if failures > _WORST else f"{summary}:")
         print_worst(result.table, _WORST, failing=True)
     show(f"wrote {folder}")
 
@@ -426,24 +427,26 @@ def _warn_of_names(table: pa.Table) -> None:
         for log, messages in _columns(table, "log", name):
             for message in messages:
                 logs.setdefault(message.removeprefix(f"{Path(log).name}: "), {})[log] = None
-    found = [f"{message} (in {_listed(list(names))})" for message, names in logs.items()]
-    warn(*first_lines(found, _MOST_WARNINGS))
+    messages_with_logs = [f"{message} (in {_join_names(list(names))})" for message, names in logs.items()]
+    warn(*first_lines(messages_with_logs, _MOST_WARNINGS))
 
 
 def _warn_of_damage(table: pa.Table) -> None:
     """Name the logs that are damaged or cannot be read, for which the exit code is 3."""
     rows = _columns(table, "log", "faults", "error_kind")
     for what, kind in (("damaged, or not to be read", "log"), ("unfit to be judged", "unfit")):
-        logs = dict.fromkeys(log for log, faults, own in rows if own == kind or (faults and kind == "log"))
+        logs = dict.fromkeys(
+            log for log, faults, error_kind in rows if error_kind == kind or (faults and kind == "log")
+        )
         if logs:
-            warn(f"{what}: {_listed(list(logs))}")
+            warn(f"{what}: {_join_names(list(logs))}")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     """Return the first few names, and how many others there are."""
     more = [f"{len(names) - _MOST_NAMED:,} more"] if len(names) > _MOST_NAMED else []
-    listed = [*names[:_MOST_NAMED], *more]
-    return " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
+    parts = [*names[:_MOST_NAMED], *more]
+    return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
 
 
 def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
@@ -452,12 +455,12 @@ def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
 
 def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bool:
     """Print what differs from the baseline, and return whether any of it fails."""
-    worse = [each for each in differences if each.fails]
+    worse = [difference for difference in differences if difference.fails]
     better = len(differences) - len(worse)
     heads = ["worse than the baseline, or gone" if worse else "nothing is worse than the baseline"]
     heads += [f"{better:,} better: --update-baseline keeps that"] if better else []
     show("; ".join(heads) + (":" if worse else ""), err=to_errors)
-    for line in first_lines([each.text for each in worse], _MOST_DIFFERENCES):
+    for line in first_lines([difference.text for difference in worse], _MOST_DIFFERENCES):
         show(f"  {line}", err=to_errors)
     return bool(worse)
 

@@ -23,7 +23,7 @@ from spatial_replay.cli.options import (
     load_spec_options,
     plugin_option,
     reading_options,
-    refuse_given,
+    refuse_values,
     require_choice,
     strict_names_option,
 )
@@ -80,9 +80,13 @@ def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None
         # imported here so that --help stays fast
         from spatial_replay.batch.outputs import annotation, repository_path
 
-        for each in diagnoses:
+        for diagnosis in diagnoses:
             file = repository_path(path)
-            show(annotation(_level(each), file, each.line, _message(each), column=each.column))
+            show(
+                annotation(
+                    _level(diagnosis), file, diagnosis.line, _message(diagnosis), column=diagnosis.column
+                )
+            )
     elif form == "sarif":
         from spatial_replay.batch.outputs import repository_path
 
@@ -104,22 +108,22 @@ def _sarif(path: str, diagnoses: Sequence[Diagnosis]) -> dict[str, Any]:
     results = [
         {
             "ruleId": "specification",
-            "level": _level(each),
-            "message": {"text": _message(each)},
+            "level": _level(diagnosis),
+            "message": {"text": _message(diagnosis)},
             "locations": [
                 {
                     "physicalLocation": {
                         "artifactLocation": {"uri": quote(path)},
                         "region": {
-                            "startLine": each.line,
-                            "startColumn": each.column,
-                            "endColumn": each.column + getattr(each, "width", 1),
+                            "startLine": diagnosis.line,
+                            "startColumn": diagnosis.column,
+                            "endColumn": diagnosis.column + getattr(diagnosis, "width", 1),
                         },
                     }
                 }
             ],
         }
-        for each in diagnoses
+        for diagnosis in diagnoses
     ]
     return {
         "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
@@ -178,8 +182,8 @@ def check(
     from spatial_replay.sanity import doctor as examine
 
     if dfa is None:
-        given = {"--result": of is not None, "--hz": hz is not None}
-        refuse_given(given, "is for an automaton; add --dfa FILE")
+        options = {"--result": of is not None, "--hz": hz is not None}
+        refuse_values(options, "is for an automaton; add --dfa FILE")
     if as_json and dfa == "-":
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
     if form != "text" and (as_json or dfa == "-"):
@@ -188,19 +192,19 @@ def check(
         )
     if log is None:
         _refuse_log_options(reading, strict_names)
-    shown = str(specification)
-    with findings_of(shown, form):
+    path = str(specification)
+    with findings_of(path, form):
         (parsed,) = load_spec_options([specification], constants)
     inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
-    found = examine(parsed, examples=False).findings
-    diagnostics = [*parsed.warnings, *compared.diagnostics, *(each.diagnostic for each in found)]
+    findings = examine(parsed, examples=False).findings
+    diagnostics = [*parsed.warnings, *compared.diagnostics, *(finding.diagnostic for finding in findings)]
     show_diagnostics(diagnostics)
-    show_findings(form, shown, diagnostics)
-    if any(each.severity == "error" for each in diagnostics):
-        raise SpecificationError([each for each in diagnostics if each.severity == "error"])
+    show_findings(form, path, diagnostics)
+    if any(diagnostic.severity == "error" for diagnostic in diagnostics):
+        raise SpecificationError([diagnostic for diagnostic in diagnostics if diagnostic.severity == "error"])
     if as_json:
         show_json(_document(parsed, diagnostics, compared))
     elif form == "text":
@@ -259,13 +263,13 @@ def _compare_with_log(
             advance(len(block.trace))
     warn(*counted_from(faults, first_ns or 0))
     unknown = names.check(specification, {})
-    missing = sum(each.severity == "error" for each in unknown)
+    missing = sum(diagnostic.severity == "error" for diagnostic in unknown)
     if not strict_names:
-        unknown = tuple(replace(each, severity="warning") for each in unknown)
+        unknown = tuple(replace(diagnostic, severity="warning") for diagnostic in unknown)
     doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source))
-    found = [counted(missing, "name") + " that it never has"] if missing else []
+    counts = [counted(missing, "name") + " that it never has"] if missing else []
     others = len(unknown) - missing + len(doubtful)
-    found += [counted(others, "other warning" if missing else "warning")] if others else []
+    counts += [counted(others, "other warning" if missing else "warning")] if others else []
     summary = (
         f"compared with {counted(numbers.samples, 'sample')} of {source.name} over {numbers.seconds:.3f} s: "
     )
@@ -273,7 +277,7 @@ def _compare_with_log(
         (*unknown, *doubtful),
         window_lines(specification, numbers),
         numbers.ranges,
-        summary + (" and ".join(found) or "all names, thresholds and windows fit"),
+        summary + (" and ".join(counts) or "all names, thresholds and windows fit"),
     )
 
 
@@ -286,15 +290,15 @@ class _CutResults:
         from spatial_replay.trace.trace import FOREVER
 
         self._specification = specification
-        plain = tuple(each for each in specification.specs if each.parameter is None)
+        plain = tuple(spec for spec in specification.specs if spec.parameter is None)
         instances = find_instances(replace(specification, specs=plain), {}, [], 0, FOREVER)
         self._stream = EvaluationStream(instances, specification.regions)
         self._kept: list[list[SeriesBlock]] = [[] for _ in instances]
 
     def add(self, trace: Trace) -> None:
         """Evaluate the next samples."""
-        for kept, block in zip(self._kept, self._stream.extend(trace), strict=True):
-            kept.append(replace(block, series=block.series[..., :0].copy()))
+        for blocks, block in zip(self._kept, self._stream.extend(trace), strict=True):
+            blocks.append(replace(block, series=block.series[..., :0].copy()))
 
     def warnings(self, source: Source) -> Iterator[Diagnostic]:
         """Yield a warning for each result, at its window."""
@@ -305,13 +309,13 @@ class _CutResults:
         def traces() -> Iterator[Trace]:
             return (block.trace for block in source.keeping().iter_blocks())
 
-        own, units = self._specification, source.axes.units
-        text = SourceText.of(own.source, own.filename)
-        for stream, kept in zip(self._stream.streams, self._kept, strict=True):
+        specification, units = self._specification, source.axes.units
+        text = SourceText.of(specification.source, specification.filename)
+        for stream, blocks in zip(self._stream.streams, self._kept, strict=True):
             if not len(stream):
                 continue
-            evidence = Evidence(stream.instance, own.regions, traces, units)
-            result = SpecResult.from_stream(stream, evidence, join_blocks(kept), has_series=False)
+            evidence = Evidence(stream.instance, specification.regions, traces, units)
+            result = SpecResult.from_stream(stream, evidence, join_blocks(blocks), has_series=False)
             for part in result.untested if result.tested == "cut" else ():
                 node = nodes_of(result.formula)[part.node or 0]
                 message = f"{result.name} would be {result.verdict}: {str(part.message).removesuffix('.')}"
@@ -352,19 +356,21 @@ def _document(
             for spec in specification.results
         ],
         "constants": {
-            name: json_fields(each, "value", "duration_ns", "range")
-            for name, each in specification.constants.items()
+            name: json_fields(constant, "value", "duration_ns", "range")
+            for name, constant in specification.constants.items()
         },
         "windows": list(compared.windows),
         "thresholds": [
             {
-                "atom": each.atom.text,
-                **json_fields(each, "objects", "known", "holding", "failing", "least", "greatest"),
-                **({} if each.least <= each.greatest else {"least": None, "greatest": None}),
+                "atom": atom_range.atom.text,
+                **json_fields(atom_range, "objects", "known", "holding", "failing", "least", "greatest"),
+                **({} if atom_range.least <= atom_range.greatest else {"least": None, "greatest": None}),
             }
-            for each in compared.ranges
+            for atom_range in compared.ranges
         ],
-        "warnings": [json_fields(each, "line", "column", "message", "hint") for each in diagnostics],
+        "warnings": [
+            json_fields(diagnostic, "line", "column", "message", "hint") for diagnostic in diagnostics
+        ],
     }
 
 
@@ -427,11 +433,11 @@ def _write_automata(
         _print_automata(specification, names, hz)
         return
     path = Path(file)
-    chosen = automaton(specification, name, rate_hz=hz)
-    text = dict(zip(_AUTOMATON_FILES, (dot_text, hoa_text, svg_text), strict=True))[path.suffix](chosen)
+    graph = automaton(specification, name, rate_hz=hz)
+    text = dict(zip(_AUTOMATON_FILES, (dot_text, hoa_text, svg_text), strict=True))[path.suffix](graph)
     with replacing(path, inputs) as stream:
         stream.write(text.encode())
-    show(f"wrote {path}: {size_words(chosen)}", err=quiet)
+    show(f"wrote {path}: {size_words(graph)}", err=quiet)
     bounds = "" if hz is None else bounds_in_samples(chosen_spec(specification, name).formula, hz)
     if bounds:
         show(bounds, err=quiet)
@@ -494,17 +500,17 @@ def doctor(
 
     if form != "text" and as_json:
         raise UsageError(f"--format {form} writes to standard output; remove --json")
-    shown = str(specification)
-    with findings_of(shown, form):
+    path = str(specification)
+    with findings_of(path, form):
         (parsed,) = load_spec_options([specification], constants)
-    found = examine(parsed, examples=form == "text" or output is not None)
-    files = {} if output is None else _write(found, output, local_files([specification]))
-    show_findings(form, shown, [each.diagnostic for each in found.findings])
+    examination = examine(parsed, examples=form == "text" or output is not None)
+    files = {} if output is None else _write(examination, output, local_files([specification]))
+    show_findings(form, path, [finding.diagnostic for finding in examination.findings])
     if as_json:
-        show_json({"file": parsed.filename, **found.document})
+        show_json({"file": parsed.filename, **examination.document})
     elif form == "text":
-        show(*found.lines(files))
-    return ExitCode.VIOLATED if found.findings else ExitCode.SATISFIED
+        show(*examination.lines(files))
+    return ExitCode.VIOLATED if examination.findings else ExitCode.SATISFIED
 
 
 def _write(found: Examination, output: Path, inputs: list[Path]) -> dict[tuple[str, str], Path]:

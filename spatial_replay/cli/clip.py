@@ -78,7 +78,7 @@ def clip(
         around_ns = duration_ns_from_text(around)
     inputs = open_inputs(request)
     with progress("samples") as advance:
-        found = cut_clip(
+        clip = cut_clip(
             inputs.source,
             inputs.files,
             output,
@@ -88,16 +88,17 @@ def clip(
             inputs=request.inputs,
             advance=advance,
         )
-    warn_of_input(found.whole)
-    print_verdicts(found.replayed, output)
-    show(_summary(found))
-    if found.left_out and not of:
-        show(f"  not kept, since nothing failed there: {', '.join(found.left_out)}; --result NAME keeps one")
-    for title in (each for each in found.changed if of or each not in found.left_out):
-        warn(f"{title} has another verdict in the clip than in the log; only {', '.join(found.kept)} is kept")
-    if found.added:
-        warn(f"{', '.join(found.added)}: fails in the clip alone, which has not all samples of the log")
-    return ExitCode.DAMAGED if found.whole.faults else ExitCode.SATISFIED
+    warn_of_input(clip.whole)
+    print_verdicts(clip.replayed, output)
+    show(_summary(clip))
+    if clip.left_out and not of:
+        show(f"  not kept, since nothing failed there: {', '.join(clip.left_out)}; --result NAME keeps one")
+    left_out = () if of else clip.left_out
+    for title in (title for title in clip.changed if title not in left_out):
+        warn(f"{title} has another verdict in the clip than in the log; only {', '.join(clip.kept)} is kept")
+    if clip.added:
+        warn(f"{', '.join(clip.added)}: fails in the clip alone, which has not all samples of the log")
+    return ExitCode.DAMAGED if clip.whole.faults else ExitCode.SATISFIED
 
 
 def _summary(found: Clip) -> str:
@@ -152,16 +153,16 @@ def _lines(recovery: Recovery, output: Path) -> Iterator[str]:
         yield f"{recovery.name}: nothing is missing; {output.name} holds {saved}"
         return
     yield f"{recovery.name}: {saved} saved in {output.name}; {recovery.losses}"
-    yield from _listed("time", (_span(*span, recovery) for span in recovery.spans))
-    yield from _listed("samples", (_gap(gap, recovery.start_ns) for gap in recovery.samples))
+    yield from _entry_lines("time", (_span(*span, recovery) for span in recovery.spans))
+    yield from _entry_lines("samples", (_gap(gap, recovery.start_ns) for gap in recovery.samples))
     counts = ((topic, missing + recovery.saved[topic]) for topic, missing in recovery.missing.items())
-    yield from _listed(
+    yield from _entry_lines(
         "topic",
         (f"{topic}: {recovery.missing[topic]:,} of {counted(all_, 'message')}" for topic, all_ in counts),
     )
 
 
-def _listed(what: str, entries: Iterable[str]) -> Iterator[str]:
+def _entry_lines(what: str, entries: Iterable[str]) -> Iterator[str]:
     lines = list(entries)
     yield from (f"  {what:<8} {entry}" for entry in lines[:_MOST_LISTED])
     if len(lines) > _MOST_LISTED:
@@ -178,8 +179,8 @@ def _span(start_ns: int, end_ns: int, recovery: Recovery) -> str:
 def _gap(gap: SampleGap, first_ns: int) -> str:
     numbers = f"{gap.first} to {gap.last}" if gap.last > gap.first else str(gap.first)
     sides = (("after", gap.after_ns), ("before", gap.before_ns))
-    known = " and ".join(f"{word} {time_text(at, first_ns)}" for word, at in sides if at is not None)
-    return f"{numbers}, {known}" if known else numbers
+    bounds = " and ".join(f"{word} {time_text(at, first_ns)}" for word, at in sides if at is not None)
+    return f"{numbers}, {bounds}" if bounds else numbers
 
 
 @click.command()
@@ -255,25 +256,25 @@ def verify(
         signature = Path(f"{log}.sig") if isinstance(log, Path) else Path(f"{log.name}.sig")
     if source is None and reading.get("mapping") is not None:
         raise UsageError("--mapping applies to the source of the log; add --source SOURCE")
-    own = open_source(log)
+    annotated = open_source(log)
     original = None
     if source is not None:
         # what is given here has precedence over what the log was made with
-        given = ReadOptions(**reading).given()
-        original = open_source(source, **{**reading, **recorded_reading(own, source.name), **given})
+        options = ReadOptions(**reading).given()
+        original = open_source(source, **{**reading, **recorded_reading(annotated, source.name), **options})
     with progress("samples") as advance:
-        verified = verify_certificate(own, original, advance, explain=explain)
+        verified = verify_certificate(annotated, original, advance, explain=explain)
     faults = list(verified.faults)
-    differences = [f"{log.name}: {each}" for each in verified.differences]
+    differences = [f"{log.name}: {difference}" for difference in verified.differences]
     if verified.recorded and not differences:
         show(f"{log.name}: samples, messages, specifications and results match")
-        show(*(f"{log.name}: {each}" for each in verified.notes if not decisions))
+        show(*(f"{log.name}: {note}" for note in verified.notes if not decisions))
     if decisions:
-        planned = own if original is None else original
+        planned = annotated if original is None else original
         with progress("samples") as advance:
             recomputed = recompute_decisions(planned, advance)
         faults += counted_from(recomputed.faults, known_start_ns(planned) if recomputed.faults else 0)
-        differences += [f"{planned.name}: {each}" for each in recomputed.differences]
+        differences += [f"{planned.name}: {difference}" for difference in recomputed.differences]
         if not recomputed.differences:
             show(
                 f"{planned.name}: {counted(recomputed.decisions, 'decision')} recomputed with "

@@ -78,19 +78,19 @@ def diff(
     if other is None and align != "time":
         raise UsageError("--align applies to two logs; give the second one")
     if other is None:
-        found: SpecificationDiff | LogDiff = _of_specifications(request, output, semantics)
+        difference: SpecificationDiff | LogDiff = _of_specifications(request, output, semantics)
     else:
-        found = _of_logs(request, other, align, output, semantics)
+        difference = _of_logs(request, other, align, output, semantics)
     if as_json:
-        show_json(found.document)
+        show_json(difference.document)
     else:
-        show(*found.lines())
+        show(*difference.lines())
         if output is not None:
             show(f"wrote {output}")
-    warn(*found.faults)
-    show_diagnostics(found.missing)
-    code = ExitCode.SATISFIED if found.is_empty else ExitCode.VIOLATED
-    return most_severe([code, ExitCode.DAMAGED]) if found.faults else code
+    warn(*difference.faults)
+    show_diagnostics(difference.missing)
+    code = ExitCode.SATISFIED if difference.is_empty else ExitCode.VIOLATED
+    return most_severe([code, ExitCode.DAMAGED]) if difference.faults else code
 
 
 def _of_specifications(
@@ -116,11 +116,11 @@ def _of_specifications(
         files.insert(0, recorded.files[0])
     options = inputs.options(semantics)
     with progress("samples") as advance:
-        found = diff_over_source(inputs.source, files[0], files[-1], options, advance=advance)
+        difference = diff_over_source(inputs.source, files[0], files[-1], options, advance=advance)
         if output is not None:
             sides = (inputs.source, files[:1], options), (inputs.source, files[-1:], options)
-            write_comparison(found, sides, output, inputs=request.inputs, advance=advance)
-    return found
+            write_comparison(difference, sides, output, inputs=request.inputs, advance=advance)
+    return difference
 
 
 def _of_logs(
@@ -134,11 +134,11 @@ def _of_logs(
     sources, files = (first.source, second.source), first.files or second.files
     options = first.options(semantics), second.options(semantics)
     with progress("samples") as advance:
-        found = diff_sources(sources, files, options, align=align, advance=advance)
+        difference = diff_sources(sources, files, options, align=align, advance=advance)
         if output is not None:
             sides = (sources[0], files, options[0]), (sources[1], files, options[1])
-            write_comparison(found, sides, output, inputs=_inputs(request, other), advance=advance)
-    return found
+            write_comparison(difference, sides, output, inputs=_inputs(request, other), advance=advance)
+    return difference
 
 
 def _inputs(request: EvaluationArguments, other: LogFile | None) -> Sequence[Path]:

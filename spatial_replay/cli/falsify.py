@@ -95,11 +95,11 @@ def falsify(
     options = [word for spec in specs for word in ("--spec", str(spec))]
     options += [word for name, value in constants.items() for word in ("--const", f"{name}={value}")]
     simulation, parameters = scenario_simulation(scenario, files, vary, options, is_planned=planned)
-    found = search_failures(
+    failures = search_failures(
         simulation, parameters, folder, workers_of(jobs), budget=budget, seed=seed, progress=progress
     )
     if as_json:
-        show_json(found.document)
+        show_json(failures.document)
     else:
-        show(*found.lines())
-    return exit_code_from_verdicts([str(found.verdict)])
+        show(*failures.lines())
+    return exit_code_from_verdicts([str(failures.verdict)])

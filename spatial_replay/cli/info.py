@@ -104,7 +104,7 @@ def info(
       spatial-replay info annotated.mcap --layout --panels -o layout.json
       spatial-replay info --panel
     """
-    given = {
+    contents = {
         "--suggest-mapping": suggest_mapping,
         "--fit": fit,
         "--decisions": decisions,
@@ -112,11 +112,11 @@ def info(
         "--layout": layout,
         "--panel": panel,
     }
-    wanted = [name for name, is_given in given.items() if is_given]
-    if len(wanted) > 1:
-        raise UsageError(f"{' and '.join(wanted)} print different things; give one of them")
-    if as_json and wanted and not decisions:
-        raise UsageError(f"{wanted[0]} prints no JSON; remove --json")
+    names = [name for name, is_given in contents.items() if is_given]
+    if len(names) > 1:
+        raise UsageError(f"{' and '.join(names)} print different things; give one of them")
+    if as_json and names and not decisions:
+        raise UsageError(f"{names[0]} prints no JSON; remove --json")
     if panels and not layout:
         raise UsageError("--panels chooses a layout; add --layout")
     if panel and log is not None:
@@ -197,18 +197,20 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
     from spatial_replay.sources.overview import Regularity, fitness_of
 
     def rows(found: Mapping[str, Regularity]) -> Iterator[str]:
-        for name, each in found.items():
+        for name, regularity in found.items():
             # what comes once, such as a map, has no rate
-            regular = f"rate: {each.rate:g}, max_gap: {each.max_gap:g}s" if each.rate else ""
-            yield f"{name}: {{{regular}}}  # {each.count:,}"
+            rate, max_gap = regularity.rate, regularity.max_gap
+            regular = f"rate: {rate:g}, max_gap: {max_gap:g}s" if rate else ""
+            yield f"{name}: {{{regular}}}  # {regularity.count:,}"
 
     with progress("messages"):
-        found = fitness_of(log, open_source(log, **reading))
-    topics = {json.dumps(name, ensure_ascii=False): each for name, each in found.topics.items()}
-    lines = ["requires:", *(f"  {row}" for row in rows({"samples": found.samples}))]
+        fitness = fitness_of(log, open_source(log, **reading))
+    topics = {json.dumps(name, ensure_ascii=False): regularity for name, regularity in fitness.topics.items()}
+    lines = ["requires:", *(f"  {row}" for row in rows({"samples": fitness.samples}))]
     lines += ["  topics:"] * bool(topics) + [f"    {row}" for row in rows(topics)]
-    lines += ["  objects:  # the share of samples in which each is known"] * bool(found.objects)
-    lines += [f"    {json.dumps(name, ensure_ascii=False)}: {each:g}" for name, each in found.objects.items()]
+    lines += ["  objects:  # the share of samples in which each is known"] * bool(fitness.objects)
+    for name, share in fitness.objects.items():
+        lines.append(f"    {json.dumps(name, ensure_ascii=False)}: {share:g}")
     show(*lines)
     return ExitCode.SATISFIED
 
@@ -242,16 +244,16 @@ def _print_specification(log: LogFile, name: str) -> int:
             f"{source.name} holds no specification; logs written by spatial-replay record --spec or "
             "replay -o have them"
         )
-    chosen = [each for each in texts if name in ("", each.filename, Path(each.filename).stem)]
-    chosen = chosen or [each for each in texts if name in _names_of(each)]
-    if not chosen:
-        files = ", ".join(each.filename for each in texts)
-        specs = ", ".join(dict.fromkeys(own for each in texts for own in _names_of(each)))
+    matches = [text for text in texts if name in ("", text.filename, Path(text.filename).stem)]
+    matches = matches or [text for text in texts if name in _names_of(text)]
+    if not matches:
+        files = ", ".join(text.filename for text in texts)
+        specs = ", ".join(dict.fromkeys(name for text in texts for name in _names_of(text)))
         raise UsageError(f"{source.name} has no specification {name!r}; files: {files}; specs: {specs}")
-    for each in chosen:
-        if len(chosen) > 1:
-            show(f"# {each.filename}")
-        show_file(each.text)
+    for text in matches:
+        if len(matches) > 1:
+            show(f"# {text.filename}")
+        show_file(text.text)
     return ExitCode.SATISFIED
 
 
@@ -266,14 +268,14 @@ def _requirements(source: Source) -> dict[str, NamedSpec]:
 
     files = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
     names = [spec.name for _, specs in files for spec in specs]
-    found: dict[str, NamedSpec] = {}
+    specs_by_result: dict[str, NamedSpec] = {}
     for stem, specs in files:
         for spec in specs:
             if spec.id or spec.title:
                 name = f"{stem}.{spec.name}" if names.count(spec.name) > 1 else spec.name
                 # logs of a recorder have the id before the name
-                found |= {name: spec, f"{spec.id} {name}": spec}
-    return found
+                specs_by_result |= {name: spec, f"{spec.id} {name}": spec}
+    return specs_by_result
 
 
 def _verdicts(container: LogSummary, about: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
@@ -324,20 +326,20 @@ def _document(
         **json_fields(overview, "name", "kind", "samples", "start_ns", "end_ns", "objects", "signals"),
         "damaged": bool(faults),
         "faults": faults,
-        "axes": {"y": "up", "source": _declared(json_fields(overview.axes))},
+        "axes": {"y": "up", "source": _declarations(json_fields(overview.axes))},
     }
     if survey is not None:
         document["messages"] = {"count": survey.messages, **json_fields(survey, "start_ns", "end_ns")}
         document["topics"] = [
             {
-                "topic": each.topic.name,
-                "schema": each.topic.type,
-                "encoding": each.topic.encoding,
-                "messages": each.messages,
-                "mapping": each.entry or None,
-                "unreadable": each.topic.unreadable,
+                "topic": topic.topic.name,
+                "schema": topic.topic.type,
+                "encoding": topic.topic.encoding,
+                "messages": topic.messages,
+                "mapping": topic.entry or None,
+                "unreadable": topic.topic.unreadable,
             }
-            for each in survey.topics
+            for topic in survey.topics
         ]
     elif container is not None:
         document["topics"] = [
@@ -357,18 +359,19 @@ def _document(
     return document
 
 
-def _declared(axes: dict[str, object]) -> dict[str, object]:
+def _declarations(axes: dict[str, object]) -> dict[str, object]:
     """Return axes as JSON, without units where none are declared."""
     return {name: value for name, value in axes.items() if value or name not in ("unit", "signals")}
 
 
 def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:
     """Return how many messages each channel of a topic has: each publisher may have one of its own."""
-    found: dict[tuple[str, str, str], list[int]] = {}
-    for each in container.channels:
-        schema = each.channel.schema.name if each.channel.schema is not None else ""
-        found.setdefault((each.channel.topic, schema, each.channel.encoding), []).append(each.messages)
-    return found
+    counts: dict[tuple[str, str, str], list[int]] = {}
+    for summary in container.channels:
+        channel = summary.channel
+        schema = channel.schema.name if channel.schema is not None else ""
+        counts.setdefault((channel.topic, schema, channel.encoding), []).append(summary.messages)
+    return counts
 
 
 def _lines(
@@ -393,12 +396,12 @@ def _lines(
         yield "objects"
         yield from _table(
             (
-                each.name,
-                ", ".join(each.classes),
-                counted(each.samples, "sample"),
-                f"{each.unreadable:,} unknown" if each.unreadable else "",
+                tracked.name,
+                ", ".join(tracked.classes),
+                counted(tracked.samples, "sample"),
+                f"{tracked.unreadable:,} unknown" if tracked.unreadable else "",
             )
-            for each in overview.objects
+            for tracked in overview.objects
         )
     if overview.signals:
         yield f"signals  {', '.join(overview.signals)}"
@@ -412,10 +415,10 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
     if survey.topics:
         yield "topics"
         yield from _table(
-            (each.topic.name, each.topic.type, each.topic.encoding, counted(each.messages, "message"))
-            for each in survey.topics
+            (topic.topic.name, topic.topic.type, topic.topic.encoding, counted(topic.messages, "message"))
+            for topic in survey.topics
         )
-    objects = [(f"{each.topic.name}:", each.entry) for each in survey.topics if each.entry]
+    objects = [(f"{topic.topic.name}:", topic.entry) for topic in survey.topics if topic.entry]
     if objects and not mapped:
         yield "could map to objects"
         yield from _table(objects)
@@ -426,7 +429,7 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     from spatial_replay.logs.messages import VERDICTS
 
     if verdicts := list(_verdicts(container, about)):
-        kinds = [(each["verdict"] or "").split(",")[0] for each in verdicts]
+        kinds = [(verdict["verdict"] or "").split(",")[0] for verdict in verdicts]
         is_known = set(kinds) <= set(WORST_FIRST)
         # of those violated, the log has those first that were so first; logs of earlier versions have not
         places = sorted(
@@ -434,14 +437,22 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
         )
         yield f"verdicts: {counts_text(kinds)}" if is_known and len(kinds) > MANY else "verdicts"
         yield from _table(
-            (each["name"] or "", each["verdict"] or "", requirement_text(each["requirement"], each["title"]))
-            for each in (verdicts[place] for place in places)
+            (
+                verdict["name"] or "",
+                verdict["verdict"] or "",
+                requirement_text(verdict["requirement"], verdict["title"]),
+            )
+            for verdict in (verdicts[place] for place in places)
         )
     if topics:
         yield "topics"
         yield from _table(
-            (*names, counted(sum(each), "message"), counted(len(each), "publisher") if len(each) > 1 else "")
-            for names, each in _topics(container).items()
+            (
+                *names,
+                counted(sum(counts), "message"),
+                counted(len(counts), "publisher") if len(counts) > 1 else "",
+            )
+            for names, counts in _topics(container).items()
         )
     for name, data in container.metadata:
         if name != VERDICTS:
@@ -450,7 +461,8 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     if container.attachments:
         yield "attachments"
         yield from _table(
-            (each.name, each.media_type, counted(each.size, "byte")) for each in container.attachments
+            (attachment.name, attachment.media_type, counted(attachment.size, "byte"))
+            for attachment in container.attachments
         )
 
 

@@ -20,8 +20,8 @@ from spatial_replay.cli.options import (
     naming_option,
     output_option,
     overwrite_option,
-    refuse_given,
     refuse_options,
+    refuse_values,
     serving_options,
     specs_option,
 )
@@ -52,9 +52,9 @@ def _seconds(context: click.Context, parameter: click.Parameter, text: str | Non
 
 def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int:
     number, factor = text.strip(), 1
-    for unit, each in _UNITS.items():
+    for unit, multiple in _UNITS.items():
         if number.lower().endswith(unit):
-            number, factor = number[: -len(unit)], each
+            number, factor = number[: -len(unit)], multiple
     with suppress(ValueError, OverflowError):
         return round(float(number) * factor)
     raise UsageError(f"{parameter.opts[0]}: {text!r} is not a size; write it as 256MB or 1.5GB")
@@ -191,17 +191,17 @@ def monitor(
     if not specs:
         raise UsageError("there is nothing to monitor; give --spec FILE")
     if output is None and clips is None:
-        refuse_given({"--topics": topics}, "says which messages are written; add -o FILE or --clips DIR")
+        refuse_values({"--topics": topics}, "says which messages are written; add -o FILE or --clips DIR")
     if clips is None:
-        refuse_given({"--trigger": triggers}, "writes clips; add --clips DIR")
+        refuse_values({"--trigger": triggers}, "writes clips; add --clips DIR")
         context = click.get_current_context()
         refuse_options(context, ("before_s", "after_s", "ring"), "is about clips; add --clips DIR")
-    for option, given in (
+    for option, span_s in (
         ("--for", length_s),
         ("--topic-timeout", topic_timeout_s),
         ("--max-delay", max_delay_s),
     ):
-        if given is not None and given <= 0:
+        if span_s is not None and span_s <= 0:
             raise UsageError(f"{option} is 0; give it a length, as in {option} 2s")
     files = load_spec_options(specs, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
@@ -217,7 +217,7 @@ def monitor(
             open_recorders(files, mapping, output, trigger, clips, overwrite=overwrite)
         )
         writers: list[SampleWriter] = [*recorders]
-        fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
+        fire = next((recorder.trigger for recorder in recorders if trigger and recorder.is_triggered), None)
         if fire is not None:
             by_signal.attach(fire)
         if serves:
@@ -234,7 +234,7 @@ def monitor(
         run = _Run(session, recorders, length_s, until)
         asyncio.run(run.follow())
     run.show_remarks()
-    for clip in (each for recorder in recorders for each in recorder.clips):
+    for clip in (clip for recorder in recorders for clip in recorder.clips):
         lost = f"; {counted(clip.dropped, 'sample')} of its time dropped" if clip.dropped else ""
         show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}{lost}")
     _show_losses(writers, session.status.dropped)
@@ -439,7 +439,7 @@ class _Run:
         if self._session.failure is not None:
             warn(str(self._session.failure))
         endings = self._session.endings()
-        self._verdicts = [str(each.verdict) for each in endings]
+        self._verdicts = [str(ending.verdict) for ending in endings]
         span = "no time" if status.time_ns is None else time_text(status.time_ns, self.first_ns)
         lost = ""
         if status.dropped or status.messages_dropped:

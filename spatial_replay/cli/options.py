@@ -98,7 +98,7 @@ class JsonCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         pairs = pairwise(["", *args])
-        return super().parse_args(ctx, [each for before, each in pairs if (before, each) != ("--json", "-")])
+        return super().parse_args(ctx, [last for first, last in pairs if (first, last) != ("--json", "-")])
 
 
 class LogPath(click.Path):
@@ -257,12 +257,12 @@ def gather(name: str, values: Callable[..., Any], command: Callable[..., Any]) -
     """
 
     @wraps(command)
-    def gathered(**arguments: Any) -> Any:
-        own = [field.name for field in fields(values)] if is_dataclass(values) else values.__annotations__
-        taken = {name: arguments.pop(name) for name in own}
-        return command(**{name: values(**taken)}, **arguments)
+    def gathering(**arguments: Any) -> Any:
+        names = [field.name for field in fields(values)] if is_dataclass(values) else values.__annotations__
+        values_by_name = {name: arguments.pop(name) for name in names}
+        return command(**{name: values(**values_by_name)}, **arguments)
 
-    return gathered
+    return gathering
 
 
 def add_options(options: Sequence[_Option], command: Callable[..., Any]) -> Callable[..., Any]:
@@ -330,12 +330,12 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say how to read a log; the command takes the given ones as `reading`."""
 
     @wraps(command)
-    def gathered(*, read: dict[str, object], **arguments: Any) -> Any:
-        given = {name: arguments.pop(name) for name in ("mapping", "max_lateness", "max_gap")}
-        reading = {name: value for name, value in given.items() if value is not None} | read
+    def gathering(*, read: dict[str, object], **arguments: Any) -> Any:
+        options = {name: arguments.pop(name) for name in ("mapping", "max_lateness", "max_gap")}
+        reading = {name: value for name, value in options.items() if value is not None} | read
         return command(reading=reading, **arguments)
 
-    return add_options(_READING, gathered)
+    return add_options(_READING, gathering)
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,15 +404,15 @@ def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add LOG and the options that say what to evaluate; the command takes them as `request`."""
     log = click.argument("log", type=LogPath())
     specs = specs_option("Specification; repeat for several.  [default: those in the log]")
-    gathered = reading_options(gather("request", EvaluationArguments, command))
-    return add_options((log, specs, *_CONDITIONS), gathered)
+    gathering = reading_options(gather("request", EvaluationArguments, command))
+    return add_options((log, specs, *_CONDITIONS), gathering)
 
 
 def condition_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say what to evaluate over many logs; the command takes them as `conditions`."""
     specs = specs_option("Specification file; repeat for several.")
-    gathered = reading_options(gather("conditions", ConditionArguments, command))
-    return add_options((specs, *_CONDITIONS), gathered)
+    gathering = reading_options(gather("conditions", ConditionArguments, command))
+    return add_options((specs, *_CONDITIONS), gathering)
 
 
 @dataclass(frozen=True, slots=True)
@@ -453,11 +453,11 @@ def open_inputs(
     files = list(known)
     is_bare = can_do_without and not (request.specs or request.constants or recorded_texts(source))
     if not files and not is_bare:
-        specs = [local_copy(each) for each in request.specs]
+        specs = [local_copy(spec) for spec in request.specs]
         files = load_files(specs, source, constants=request.constants)
         show_diagnostics(warning for file in files for warning in file.warnings)
-    window, each = _window(source, request), objects_by_parameter(request.choices)
-    return EvaluationInputs(source, files, window, each, request.strict_names)
+    window, objects = _window(source, request), objects_by_parameter(request.choices)
+    return EvaluationInputs(source, files, window, objects, request.strict_names)
 
 
 def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
@@ -466,15 +466,17 @@ def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
     Raises:
         UsageError: an incomplete choice, or two for one parameter.
     """
-    each: dict[str, str] = {}
+    objects_by_name: dict[str, str] = {}
     for choice in choices:
         parameter, equals, objects = choice.partition("=")
         if not equals or not parameter:
             raise UsageError(f"--each {choice!r} is incomplete; write VAR=class:NAME, VAR=OBJECT or VAR=all")
-        if parameter in each:
-            raise UsageError(f"--each gives {parameter!r} twice: {each[parameter]!r} and {objects!r}")
-        each[parameter] = objects
-    return each
+        if parameter in objects_by_name:
+            raise UsageError(
+                f"--each gives {parameter!r} twice: {objects_by_name[parameter]!r} and {objects!r}"
+            )
+        objects_by_name[parameter] = objects
+    return objects_by_name
 
 
 def _window(source: Source, request: EvaluationArguments) -> Window:
@@ -516,12 +518,12 @@ def load_spec_options(
 
     sources: list[Path | SpecificationText] = [*dict.fromkeys(map(local_copy, specs))]
     if constants and not sources and default is not None:
-        own = default()
-        sources = [SpecificationText(own.source, own.filename)]
+        specification = default()
+        sources = [SpecificationText(specification.source, specification.filename)]
     return load_specifications(sources, constants=constants)
 
 
-def refuse_given(options: Mapping[str, object], why: str) -> None:
+def refuse_values(options: Mapping[str, object], why: str) -> None:
     """Refuse options that do not apply.
 
     Args:
@@ -566,7 +568,7 @@ def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Pat
     files = {name: Path(file) for name, file in outputs.items() if file is not None and file != "-"}
     for file in files.values():
         refuse_inputs(file, inputs)
-        same = [name for name, other in files.items() if other.resolve() == file.resolve()]
+        same = [name for name, path in files.items() if path.resolve() == file.resolve()]
         if len(same) > 1:
             raise UsageError(f"{' and '.join(same)} both name {outputs[same[-1]]}; give them different names")
 
@@ -588,11 +590,11 @@ def warn_of_input(result: Replayed | Recorded) -> None:
     show_diagnostics(replace(name, severity="warning") for name in result.missing)
     if result.unreadable:
         count = counted(result.unreadable, "observation")
-        one = result.unreadable == 1
+        is_single = result.unreadable == 1
         if result.remarks:
-            warn(f"{count} {'is' if one else 'are'} unknown: see above, or not finite")
+            warn(f"{count} {'is' if is_single else 'are'} unknown: see above, or not finite")
         else:
-            warn(f"{count} {'holds' if one else 'hold'} a number that is not finite: unknown there")
+            warn(f"{count} {'holds' if is_single else 'hold'} a number that is not finite: unknown there")
 
 
 @contextmanager

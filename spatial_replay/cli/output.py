@@ -41,10 +41,10 @@ def change_line(change: VerdictChange, first_ns: int) -> Line:
 
 def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
     """Yield a line for the result of each spec when a run ends."""
-    width = max((len(escaped(each.spec.name)) for each in endings), default=0)
-    for each in endings:
-        verdict = Coloured(f"{each.verdict:<9}", _CHANGE_COLOURS[str(each.verdict)])
-        yield f"  {escaped(each.spec.name):<{width}}  ", verdict, f"  {_ending_numbers(each)}"
+    width = max((len(escaped(ending.spec.name)) for ending in endings), default=0)
+    for ending in endings:
+        verdict = Coloured(f"{ending.verdict:<9}", _CHANGE_COLOURS[str(ending.verdict)])
+        yield f"  {escaped(ending.spec.name):<{width}}  ", verdict, f"  {_ending_numbers(ending)}"
 
 
 def _ending_numbers(ending: Ending) -> str:
@@ -60,14 +60,16 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     """Print one line for each result, and another one for a sliding window."""
     span = time_text(replayed.end_ns, replayed.start_ns)
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
-    counts = (
-        f": {counts_text(each.verdict for each in replayed.results)}" if len(replayed.results) > MANY else ""
-    )
+    verdicts = [result.verdict for result in replayed.results]
+    counts = f": {counts_text(verdicts)}" if len(verdicts) > MANY else ""
     damaged += f"; {replayed.dropped.text}" if replayed.dropped.count else ""
     show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
     results, others = worst_of(replayed.results)
     # escaped here, so that what is printed is as wide as what is measured
-    titles = [escaped(f"{each.title} [{each.spec.id}]" if each.spec.id else each.title) for each in results]
+    titles = [
+        escaped(f"{result.title} [{result.spec.id}]" if result.spec.id else result.title)
+        for result in results
+    ]
     width = max(map(len, titles), default=0)
     titled: set[str] = set()
     for title, result in zip(titles, results, strict=True):
@@ -111,8 +113,8 @@ def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Seque
     from spatial_replay.monitor.result import worst_first
 
     results = [results[place] for place in worst_first(results)]
-    shown = _SHOWN if len(results) > _MOST_SHOWN else len(results)
-    return results[:shown], results[shown:]
+    count = _SHOWN if len(results) > _MOST_SHOWN else len(results)
+    return results[:count], results[count:]
 
 
 def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = None) -> str:
@@ -121,17 +123,17 @@ def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = N
     Args:
         verdicts: theirs, where these are not the final ones.
     """
-    one = ", --each VAR=OBJECT shows one" if any(each.object is not None for each in others) else ""
-    counts = counts_text([each.verdict for each in others] if verdicts is None else verdicts)
-    return f"… and {len(others):,} more: {counts}; --json has all{one}"
+    hint = ", --each VAR=OBJECT shows one" if any(result.object is not None for result in others) else ""
+    counts = counts_text([result.verdict for result in others] if verdicts is None else verdicts)
+    return f"… and {len(others):,} more: {counts}; --json has all{hint}"
 
 
 def _numbers(result: SpecResult, first_ns: int) -> str:
     robustness, lower, upper = result.robustness, result.lower, result.upper
     parts = ["tested by nothing"] if result.tested == "nothing" else []
-    parts.append(f"robustness {_shown(robustness, result.unit)}")
+    parts.append(f"robustness {_number_text(robustness, result.unit)}")
     if not (lower == upper == robustness or math.isnan(lower)):
-        parts.append(f"between {_shown(lower, result.unit)} and {_shown(upper, result.unit)}")
+        parts.append(f"between {_number_text(lower, result.unit)} and {_number_text(upper, result.unit)}")
     if robustness == 0.0:
         parts.append("marginal")
     certain_ns = result.certain_ns()
@@ -164,7 +166,7 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
         if cause.witness is not None:
             yield f"{label}{cause_reason(cause, first_ns)}"
         elif label:
-            yield f"{label}{cause.verdict}, robustness {_shown(cause.robustness)}"
+            yield f"{label}{cause.verdict}, robustness {_number_text(cause.robustness)}"
     witness = result.worst
     for gap in () if witness is None else witness.gaps:
         if gap.missing < gap.samples:
@@ -183,7 +185,7 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     values, times_ns = result.window_signal(window_ns)[0], result.times_ns
     over = f"over the last {time_text(window_ns)}"
     failing = (values < 0.0).nonzero()[0]
-    at_end = _shown(float(values[-1]), result.unit)
+    at_end = _number_text(float(values[-1]), result.unit)
     if not len(failing):
         return f"{over} never violated; robustness at the end {at_end}"
     first = time_text(int(times_ns[failing[0]]), first_ns)
@@ -191,5 +193,5 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     return f"{over} violated at {count}, first at {first}; robustness at the end {at_end}"
 
 
-def _shown(number: float, unit: str = "") -> str:
+def _number_text(number: float, unit: str = "") -> str:
     return "not determined" if math.isnan(number) else with_unit(number, unit)

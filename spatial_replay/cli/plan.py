@@ -18,8 +18,8 @@ from spatial_replay.cli.options import (
     durability_option,
     load_spec_options,
     log_output_option,
-    refuse_given,
     refuse_options,
+    refuse_values,
     require_choice,
 )
 from spatial_replay.cli.record import (
@@ -201,7 +201,7 @@ def plan(
         context.fail(f"Missing a scenario ({', '.join(SCENARIOS)}), or --redo LOG.")
     if output is None:
         raise UsageError("there is no log to write; give -o FILE")
-    refuse_given({"--json": as_json}, "is for --redo LOG; a run has `info LOG --decisions --json`")
+    refuse_values({"--json": as_json}, "is for --redo LOG; a run has `info LOG --decisions --json`")
     return _plan(scenario, output, spec, of, constants, changes, **options)
 
 

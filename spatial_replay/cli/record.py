@@ -22,7 +22,7 @@ from spatial_replay.cli.options import (
     naming_option,
     overwrite_option,
     reading_options,
-    refuse_given,
+    refuse_values,
     specs_option,
     warn_of_input,
 )
@@ -155,17 +155,17 @@ def video(
     files = load_spec_options(specs, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     tags = load_tags(tags_file)
-    names = [each.name for each in tags.objects]
-    unknown = [each for file in files for each in check_names(file, names, (), where="tags file")]
-    show_diagnostics(replace(each, severity="warning") for each in unknown)
-    cameras = _opened(sources, camera, topics, rate, length_ns)
+    names = [tagged.name for tagged in tags.objects]
+    unknown = [diagnosis for file in files for diagnosis in check_names(file, names, (), where="tags file")]
+    show_diagnostics(replace(diagnosis, severity="warning") for diagnosis in unknown)
+    cameras = _open_cameras(sources, camera, topics, rate, length_ns)
     offsets_ns = _offsets_ns(offsets, camera_names(cameras))
     first_ns: list[int] = []
 
     def show_change(change: VerdictChange) -> None:
         show(change_line(change, first_ns[0] if first_ns else change.time_ns))
 
-    given = [*sources, tags_file, *specs]
+    inputs = [*sources, tags_file, *specs]
     with progress("frames") as advance:
         seen = record_seen(
             cameras,
@@ -175,7 +175,7 @@ def video(
             offsets_ns=offsets_ns,
             hold_ns=hold_ns,
             keep=keep,
-            inputs=local_files(given),
+            inputs=local_files(inputs),
             begin=first_ns.append,
             show=show_change,
             advance=advance,
@@ -190,11 +190,11 @@ def video(
             fits = f"reference tags fit within {fit.rms:.2f} pixels{where}"
             show(f"{fits}; tag {number} is off most, by {off:.2f}")
     show(*ending_lines(seen.endings))
-    verdicts = [str(each.verdict) for each in seen.endings]
+    verdicts = [str(ending.verdict) for ending in seen.endings]
     return exit_code_from_verdicts(verdicts or ["satisfied"], damaged=bool(seen.faults))
 
 
-def _opened(
+def _open_cameras(
     sources: Sequence[LogFile],
     camera: int | None,
     topics: Sequence[str],
@@ -210,13 +210,13 @@ def _opened(
             )
         if len(set(topics)) < len(topics) or len({str(source) for source in sources}) < len(sources):
             raise UsageError("a video or topic is given twice; each camera counts once")
-        wanted: list[str | None] = [*topics] or [None] * len(sources)
+        topic_names: list[str | None] = [*topics] or [None] * len(sources)
         each_source = [*sources] * len(topics) if topics else sources
         return [
             open_frames(source, topic=topic, rate=rate)
-            for source, topic in zip(each_source, wanted, strict=True)
+            for source, topic in zip(each_source, topic_names, strict=True)
         ]
-    refuse_given({"--topic": topics, "--rate": rate is not None}, "does not apply to a camera; leave it out")
+    refuse_values({"--topic": topics, "--rate": rate is not None}, "does not apply to a camera; leave it out")
     return [CameraFrames(camera, length_ns=length_ns)]
 
 
@@ -225,12 +225,12 @@ def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
     offsets = [0] * len(names)
     for text in texts:
         name, _, value = text.rpartition("=")
-        places = [place for place, each in enumerate(names, 1) if name in (each, str(place))]
+        places = [place for place, camera_name in enumerate(names, 1) if name in (camera_name, str(place))]
         if len(places) != 1:
-            listed = ", ".join(f"{place} ({each})" for place, each in enumerate(names, 1))
+            numbered = ", ".join(f"{place} ({camera_name})" for place, camera_name in enumerate(names, 1))
             what = "is no camera" if not places else "is the name of several cameras"
             raise UsageError(
-                f"--offset {text}: {name or text!r} {what}; write the number and a time: {listed}"
+                f"--offset {text}: {name or text!r} {what}; write the number and a time: {numbered}"
             )
         with naming_option("--offset"):
             duration_ns = duration_ns_from_text(value.removeprefix("-"))
@@ -328,9 +328,9 @@ def show_film(videos: Sequence[Path]) -> None:
     if videos:
         from spatial_replay.runs.virtual_camera import tags_of_film
 
-        listed = " ".join(str(video) for video in videos)
+        names = " ".join(str(video) for video in videos)
         tags = tags_of_film(videos)
-        show(f"filmed {listed}: spatial-replay record video {listed} --tags {tags} -o seen.mcap")
+        show(f"filmed {names}: spatial-replay record video {names} --tags {tags} -o seen.mcap")
 
 
 class RecordGroup(click.Group):

@@ -31,7 +31,7 @@ from spatial_replay.cli.options import (
     open_inputs,
     output_option,
     plugin_option,
-    refuse_given,
+    refuse_values,
     semantics_option,
     serving_options,
     warn_of_input,
@@ -95,7 +95,7 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     # imported here so that --help stays fast
     from spatial_replay.replay.specification_files import SpecificationFiles
 
-    specs = [local_copy(each) for each in request.specs]
+    specs = [local_copy(spec) for spec in request.specs]
     files = SpecificationFiles(specs, constants=request.constants)
     try:
         files.load()
@@ -152,9 +152,9 @@ def watch_log(request: EvaluationArguments, semantics: Semantics) -> ExitCode:
 
     def evaluate(saved: Sequence[Specification]) -> Evaluated:
         nonlocal loaded
-        other = loaded.with_files(saved)
-        evaluated = other.evaluate()
-        loaded = other
+        next_log = loaded.with_files(saved)
+        evaluated = next_log.evaluate()
+        loaded = next_log
         return evaluated
 
     return follow_saves(files, evaluate, files.write)
@@ -186,12 +186,12 @@ def follow_saves(
                 check()
                 try:
                     if "w" in keys():
-                        _show_written(write(), names)
+                        _show_constants(write(), names)
                     if isinstance(saved, SpatialReplayError):
                         refuse(saved)
                         raise saved
                     if saved is not None:
-                        _print_saved(saved, evaluate(saved), names)
+                        _print_evaluation(saved, evaluate(saved), names)
                 except SpatialReplayError as error:
                     report_error(error)
                     show("the evaluation before stays", err=True)
@@ -201,7 +201,7 @@ def follow_saves(
     return ExitCode.SATISFIED
 
 
-def _print_saved(saved: Sequence[Specification], evaluated: Evaluated, names: str) -> None:
+def _print_evaluation(saved: Sequence[Specification], evaluated: Evaluated, names: str) -> None:
     if sys.stdout.isatty():
         click.clear()
     show_diagnostics(warning for file in saved for warning in file.warnings)
@@ -211,7 +211,7 @@ def _print_saved(saved: Sequence[Specification], evaluated: Evaluated, names: st
     sys.stdout.flush()
 
 
-def _show_written(written: Mapping[str, Any], names: str) -> None:
+def _show_constants(written: Mapping[str, Any], names: str) -> None:
     values = ", ".join(
         f"{name} = {value:.12g}" if isinstance(value, float) else f"{name} = {value}"
         for name, value in written.items()
@@ -385,22 +385,22 @@ def replay(
 
     if json_file is None:
         why = "adds to the JSON object; add --json FILE or --json -"
-        refuse_given({"--series": series, "--to-end": signal}, why)
+        refuse_values({"--series": series, "--to-end": signal}, why)
     if output is None:
         why = "applies to the annotated log; add -o FILE"
-        refuse_given({"--layer": layer, "--topics": keep, "--arrow": arrow}, why)
+        refuse_values({"--layer": layer, "--topics": keep, "--arrow": arrow}, why)
     if keep and layer:
         raise UsageError("--layer copies no messages; remove --topics or --layer")
     window_ns = None if width is None else _width_ns(width)
     if semantics != "ltlf":
         why = f"is not defined under --semantics {semantics}; remove one of them"
-        refuse_given({"--to-end": signal, "--window": width}, why)
-    written = {"-o": output, "--json": json_file}
+        refuse_values({"--to-end": signal, "--window": width}, why)
+    outputs = {"-o": output, "--json": json_file}
     if watch:
-        others = {**written, "--window": width, "--fail-on": fail_on, "--allow": allow}
-        refuse_given(others, "is not for --watch, which prints verdicts only; remove it")
+        others = {**outputs, "--window": width, "--fail-on": fail_on, "--allow": allow}
+        refuse_values(others, "is not for --watch, which prints verdicts only; remove it")
         return watch_log(request, semantics)
-    check_outputs(written, request.inputs)
+    check_outputs(outputs, request.inputs)
     inputs = open_inputs(request)
     with progress("samples") as advance:
         replayed = run_replay(
@@ -447,7 +447,7 @@ def _failures(replayed: Replayed, kinds: frozenset[str], allow: frozenset[str]) 
         yield "violated"
     if "left" in kinds and replayed.left:
         yield "violated"
-    if "vacuous" not in allow and (replayed.vacuous or any(each.tested == "nothing" for each in results)):
+    if "vacuous" not in allow and (replayed.vacuous or any(result.tested == "nothing" for result in results)):
         yield "unknown"
     if "dropped" not in allow and replayed.dropped.count:
         yield "unknown"
@@ -616,31 +616,33 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     others: Sequence[SpecResult] = ()
     counts = ""
     if not as_json and object_name is None:
-        fitting = [each for each in replayed.results if verdict_of(each, node, goes_on=goes_on) is not None]
+        fitting = [
+            result for result in replayed.results if verdict_of(result, node, goes_on=goes_on) is not None
+        ]
         # where none fits, the nearest name is looked for among all
-        shown, others = worst_of(fitting) if fitting else (replayed.results, ())
+        worst, others = worst_of(fitting) if fitting else (replayed.results, ())
         if len(fitting) > MANY:
-            verdicts_of_all = [verdict_of(each, node, goes_on=goes_on) for each in fitting]
+            verdicts_of_all = [verdict_of(result, node, goes_on=goes_on) for result in fitting]
             counts = f"{len(fitting):,} results: {counts_text(map(str, verdicts_of_all))}"
-        replayed = replace(replayed, results=tuple(shown))
-    verdicts_of_others = [str(verdict_of(each, node, goes_on=goes_on)) for each in others]
+        replayed = replace(replayed, results=tuple(worst))
+    verdicts_of_others = [str(verdict_of(result, node, goes_on=goes_on)) for result in others]
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     idle = replayed.vacuous if node is None and object_name is None else ()
     if as_json:
-        show_json([*(each.document for each in results), *map(idle_document, idle)])
+        show_json([*(explanation.document for explanation in results), *map(idle_document, idle)])
     else:
         texts = [*([[counts]] if counts else []), *_texts(results)]
         if idle:
-            texts.append([each.message for each in idle])
+            texts.append([part.message for part in idle])
         if others:
             texts.append([others_text(others, verdicts_of_others)])
         for number, lines in enumerate(texts):
-            show(*([""] if number else []), *map(_coloured, lines))
-    verdicts = [*(each.verdict for each in results), *verdicts_of_others]
+            show(*([""] if number else []), *map(_colour_verdicts, lines))
+    verdicts = [*(explanation.verdict for explanation in results), *verdicts_of_others]
     return exit_code_from_verdicts(verdicts, bool(replayed.faults))
 
 
-def _coloured(line: str) -> Line:
+def _colour_verdicts(line: str) -> Line:
     """Return a line with verdicts in their colours."""
     pieces = enumerate(re.split(_VERDICT, line))
     return tuple(Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece for number, piece in pieces)
@@ -652,11 +654,11 @@ _VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")
 def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
     """Yield each explanation below the requirement that it is about, which several in a row share."""
     before = None
-    for each in explanations:
-        spec = each.document["specification"], each.document["node"]
-        requirement = requirement_text(each.document["requirement"], each.document["title"])
+    for explanation in explanations:
+        spec = explanation.document["specification"], explanation.document["node"]
+        requirement = requirement_text(explanation.document["requirement"], explanation.document["title"])
         heading = [requirement] if requirement and spec != before else []
-        yield [*heading, *each.sentences]
+        yield [*heading, *explanation.sentences]
         before = spec
 
 

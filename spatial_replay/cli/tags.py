@@ -157,9 +157,9 @@ def calibrate(
         references = TagSheet(family, ids, size, paper).references()
     frames = open_frames(source, topic=topic)
     with progress("frames") as advance:
-        found = calibrate_camera(source.name, _counting(frames, advance), family, references)
-    warn(*found.remarks, *frames.faults)
-    text = camera_text(found.calibration.camera)
+        result = calibrate_camera(source.name, _counting(frames, advance), family, references)
+    warn(*result.remarks, *frames.faults)
+    text = camera_text(result.calibration.camera)
     if output is None:
         show_file(text)
     else:
@@ -167,9 +167,10 @@ def calibrate(
             output.write_text(text, encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{output}: {(error.strerror or str(error)).lower()}") from None
-    fx, fy, *_ = found.calibration.deviations
+    fx, fy, *_ = result.calibration.deviations
+    rms = result.calibration.rms
     show(
-        f"{counted(found.views, 'view')}, corners within {found.calibration.rms:.2f} pixels; focal lengths to"
+        f"{counted(result.views, 'view')}, corners within {rms:.2f} pixels; focal lengths to"
         f" {2 * fx:.1f} and {2 * fy:.1f} pixels",
         err=output is None,
     )

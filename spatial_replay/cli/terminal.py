@@ -61,15 +61,15 @@ def show(*lines: Line, err: bool = False) -> None:
     """
     for line in lines:
         pieces = (line,) if isinstance(line, (str, Coloured)) else line
-        whole = "".join(escaped(each.text if isinstance(each, Coloured) else each) for each in pieces)
+        whole = "".join(escaped(piece.text if isinstance(piece, Coloured) else piece) for piece in pieces)
         first, *rest = [whole]
         if (sys.stderr if err else sys.stdout).isatty():
-            first, *rest = _fitted(whole)
-        styled = "\n".join([_styled(pieces, len(first)), *rest])
+            first, *rest = _fit_lines(whole)
+        styled = "\n".join([_style(pieces, len(first)), *rest])
         click.echo(styled, err=err, color=False if os.environ.get("NO_COLOR") else None)
 
 
-def _styled(pieces: Iterable[str | Coloured], most: int) -> str:
+def _style(pieces: Iterable[str | Coloured], most: int) -> str:
     """Return the first characters of a line, in colours."""
     styled = ""
     for piece in pieces:
@@ -105,7 +105,7 @@ def terminal_width() -> int:
     return shutil.get_terminal_size((100, 24)).columns
 
 
-def _fitted(line: str) -> list[str]:
+def _fit_lines(line: str) -> list[str]:
     """Return a line cut at spaces, so that it fits into the terminal; the rest is indented."""
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
     width = max(terminal_width(), _LEAST_WIDTH)
@@ -118,7 +118,7 @@ def show_json(value: Any, indent: int | None = 2) -> None:
     """Print a value as JSON, with JSON's escapes in place of what is not printable."""
     text = json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
     click.echo(
-        "".join(each if each == "\n" or each.isprintable() else json.dumps(each)[1:-1] for each in text)
+        "".join(sign if sign == "\n" or sign.isprintable() else json.dumps(sign)[1:-1] for sign in text)
     )
 
 
@@ -237,7 +237,7 @@ class _Bar:
 
     def _appear(self) -> None:
         # there is one bar at a time: that of the work as a whole
-        self._shown = _started(self._description, self._total, self._done)
+        self._shown = _start_bar(self._description, self._total, self._done)
         # the work went on while the bar was made
         self._update()
 
@@ -249,7 +249,7 @@ class _Bar:
             self._shown.stop()
 
 
-def _started(label: str, total: int | None, done: int) -> Progress | None:
+def _start_bar(label: str, total: int | None, done: int) -> Progress | None:
     # importing rich would take a quarter of the time of `--help`
     from rich.console import Console
     from rich.errors import LiveError
@@ -262,10 +262,10 @@ def _started(label: str, total: int | None, done: int) -> Progress | None:
         TaskProgressColumn(text_format_no_percentage="{task.completed:,.0f}"),
         TimeRemainingColumn(),
     )
-    shown = Progress(*columns, console=Console(stderr=True), transient=True)
-    shown.add_task(label, total=total, completed=done)
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    bar.add_task(label, total=total, completed=done)
     try:
-        shown.start()
+        bar.start()
     except LiveError:
         return None
-    return shown
+    return bar

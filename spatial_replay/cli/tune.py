@@ -186,7 +186,7 @@ def _lines(tuning: Tuning) -> Iterator[str]:
         return
     kind = ("widest margin" if tuning.is_widest else "margin") if count[False] else "tightest values"
     yield f"{kind} for {runs}: {tuning.margin + 0.0:.6g}" if count[False] else f"{kind} for {runs}"
-    undecided = [each.name for each in tuning.constants if not each.is_decided]
+    undecided = [constant.name for constant in tuning.constants if not constant.is_decided]
     if undecided:
         names = ", ".join(undecided)
         yield f"  no run decides {names}: no bad run fails by it, so it stays as written, or as near as fits"

@@ -113,7 +113,7 @@ def _evaluate_as_the_paper() -> None:
 
 def _compare() -> None:
     samples = _samples()
-    runs = [MemorySource(Trace.from_samples(each)) for each in (samples, samples[1:])]
+    runs = [MemorySource(Trace.from_samples(run)) for run in (samples, samples[1:])]
     diff_sources((runs[0], runs[1]))
 
 
