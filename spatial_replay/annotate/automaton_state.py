@@ -160,7 +160,7 @@ class AutomatonRun:
         """Return (P, T): whether each proposition is true in each sample, or unknown."""
         now = block.series[list(self.propositions), _NOW]
         values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)
-        unclear = np.isnan(now) | ~np.array(self._is_node)[:, None]
+        unclear = np.isnan(now) | ~np.array(self._is_node, dtype=np.bool_)[:, None]
         for number in np.flatnonzero(unclear.any(axis=1)).tolist():
             # a number that is not determined can still have a determined sign
             formula = self._automaton.propositions[number].formula
