@@ -667,7 +667,7 @@ def _dead_end(step: WitnessStep, first_ns: int) -> Sentence:
     if step.operator in ("true", "false"):
         return Sentence(f"What decides is the constant `{text}`.")
     why = _DEAD_ENDS.get(step.operator, "no sample lies in its window")
-    if step.has_rates:
+    if step.leaves_out:
         within = "object in its group" if step.operator in ("forall", "exists") else "sample in its window"
         why = f"no {within} has a rate"
     return Sentence(f"What decides is `{text}` at ", Instant(step.time_ns, first_ns), f": {why}.")

@@ -47,6 +47,7 @@ from spatial_replay.spec.walks import (
     iter_parts,
     iter_terms,
     leaf_key,
+    leaves_out,
     nodes_of,
     nodes_with_operands,
     standing,
@@ -64,7 +65,13 @@ from spatial_replay.text import (
 Tested: TypeAlias = Literal["full", "cut", "nothing"]
 """By how much of the log a verdict was tested; see `SpecResult.tested`."""
 Reason: TypeAlias = Literal[
-    "empty window", "antecedent never held", "no members", "past the end", "no instances", "cut window"
+    "empty window",
+    "antecedent never held",
+    "no members",
+    "past the end",
+    "no rate",
+    "no instances",
+    "cut window",
 ]
 _Samples: TypeAlias = NDArray[np.bool_]
 _NEXT = {"X": "next sample", "WX": "next sample", "Y": "sample before"}
@@ -80,6 +87,7 @@ class UntestedPart:
         reason: "empty window": no sample lies in the window of an operator, wherever it counts. "antecedent
             never held": of an implication, in any of its spellings. "no members": an open group is empty.
             "past the end": the result is infinite, because its deciding part looks past an end of the log.
+            "no rate": it is infinite, because its deciding part leaves all samples or members out.
             "no instances": no object fits a template. "cut window": it decides at a sample whose window ends
             after the log.
         message: a sentence.
@@ -443,7 +451,11 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
 
 def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
     """Yield why a result is infinite, from the node that its number is of."""
-    if isinstance(node, Temporal):
+    if leaves_out(node):
+        within = "object in its group" if isinstance(node, Quantified) else "sample in its window"
+        what = ("decides at ", when, f", where no {within} has a rate.")
+        yield _Idle(identifier, "no rate", what, when.time_ns)
+    elif isinstance(node, Temporal):
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
         what = ("decides at ", when, f", where it looks {side} of the log.")
         yield _Idle(identifier, "past the end", what, when.time_ns)

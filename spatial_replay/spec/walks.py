@@ -48,6 +48,7 @@ from spatial_replay.spec.formula import (
     Truth,
     Variable,
     iter_nodes,
+    judged_operands,
     operands_of,
     operator_of,
 )
@@ -142,6 +143,12 @@ def rates_of(formula: Formula) -> list[Rate]:
 def has_rate(formula: Formula) -> bool:
     """Return whether a formula is about rates of change."""
     return bool(rates_of(formula))
+
+
+def leaves_out(formula: Formula) -> bool:
+    """Return whether an operator leaves samples or members out in which a rate has no value."""
+    operands = (formula.body,) if isinstance(formula, Quantified) else operands_of(formula)
+    return judged_operands(operator_of(formula), operands) is not operands
 
 
 def is_about_having_rates(leaf: Formula) -> bool:

@@ -144,6 +144,7 @@ def test_samples_without_rates_test_nothing_and_are_not_what_decides(
     assert "no sample in its window has a rate" in capsys.readouterr().out
     for body in ("speed(a) <= 5", "(speed(a) <= 5) -> (a dist b >= 9)"):
         assert run(["replay", "run.mcap", "--spec", f"G[0, 0] ({body})"]) == 4
+    assert "where no sample in its window has a rate" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,6 @@ from spatial_replay.spec.formula import (
     Quantified,
     TrackedName,
     Variable,
-    judged_operands,
     operands_of,
     operator_of,
 )
@@ -41,6 +40,7 @@ from spatial_replay.spec.walks import (
     base_of,
     declared_unit,
     iter_terms,
+    leaves_out,
     nodes_of,
     presence_of,
     with_operands,
@@ -57,7 +57,7 @@ class WitnessStep:
         name: the name of the spec that it is the root of, or None.
         text: its canonical text.
         time_ns: of the sample.
-        has_rates: whether its operator leaves samples or members out in which a rate has no value.
+        leaves_out: whether its operator leaves samples or members out in which a rate has no value.
     """
 
     node: int
@@ -65,7 +65,7 @@ class WitnessStep:
     name: str | None
     text: str
     time_ns: int
-    has_rates: bool = False
+    leaves_out: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,8 +313,5 @@ def time_of_least(
 
 
 def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:
-    operator, operands = operator_of(formula), operands_of(formula)
-    if isinstance(formula, Quantified):
-        operands = (formula.body,)
-    has_rates = judged_operands(operator, operands) is not operands
-    return WitnessStep(node, operator, formula.name, format_formula(formula), time_ns, has_rates)
+    text = format_formula(formula)
+    return WitnessStep(node, operator_of(formula), formula.name, text, time_ns, leaves_out(formula))
