@@ -177,7 +177,7 @@ class NewestSamples:
             now_ns: the time of the sample from which the number is looked back at.
         """
         sample = self.sample(found.time_ns, now_ns)
-        if sample is None or look_back([leaf]) != (0, 0):
+        if sample is None or look_back([leaf]):
             return None
         decided = deciding_atom(TraceScene(sample, regions), leaf, found.end)
         if decided is None:

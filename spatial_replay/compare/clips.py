@@ -144,11 +144,14 @@ class _Part:
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
         """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
         leaves = np.ascontiguousarray(self._leaves[:, :, begin:end])
-        samples, duration_ns = self._reach
-        if self._trace is None or (samples, duration_ns) == (0, 0):
+        samples, duration_ns, to_reports = self._reach
+        if self._trace is None or not self._reach:
             return leaves
         times_ns = self._times_ns[begin:end]
-        count = max(samples, int(np.searchsorted(times_ns, first_ns + duration_ns)))
+        count = max(samples, to_reports, int(np.searchsorted(times_ns, first_ns + duration_ns)))
+        if to_reports and (self._trace.reported_ns is not None or self._trace.signals_reported_ns):
+            # which report comes before the window may matter as long as its second one is shown
+            count = len(times_ns)
         from_, to = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
         head = self._trace.slice(from_, min(from_ + count, to))
         if not len(head):
@@ -201,9 +204,7 @@ class ClipSearch:
         around_ns: int,
     ) -> None:
         results = [each.result for each in kept]
-        needs_samples = any(
-            result.object is not None or look_back([result.formula]) != (0, 0) for result in results
-        )
+        needs_samples = any(result.object is not None or look_back([result.formula]) for result in results)
         trace = Selection(source, files, options).trace() if needs_samples else None
         self._parts = []
         for each in kept:

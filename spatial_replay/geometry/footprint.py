@@ -538,6 +538,12 @@ def radius_of(tracked: TrackedObject) -> float:
     return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)
 
 
+def shifted(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
+    """Return the rows of a batch, each moved in the plane by its shift (R, 2)."""
+    counts = np.diff(batch.vertex_start[batch.part_start])
+    return replace(batch, vertices=batch.vertices + np.repeat(shifts, counts, axis=0))
+
+
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
     """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
     placed = with_poses(FootprintBatch.unknown(0), tracked, np.array([[x, y]]), np.array([turn]))

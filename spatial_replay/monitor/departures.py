@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from spatial_replay.monitor.atoms.measurements import measured
-from spatial_replay.monitor.atoms.terms import TraceScene, tail
+from spatial_replay.monitor.atoms.terms import Reach, TraceScene, tail
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.spec.format import format_term
 from spatial_replay.spec.formula import (
@@ -97,7 +97,7 @@ class Departures:
         scene = TraceScene(trace, self._regions)
         for group in self._watches:
             self._follow(group, scene)
-        self._past = tail(trace, 1, _APPROACH_NS)
+        self._past = tail(trace, Reach(1, _APPROACH_NS))
 
     def _follow(self, group: Group, scene: TraceScene) -> None:
         trace, first = scene.trace, 0 if self._past is None else len(self._past)

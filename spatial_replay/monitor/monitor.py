@@ -487,7 +487,7 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
             where = f"too close to {second}" if needs_more else f"too far from {second}"
             return f"{first} is {amount} {where}"
         if measured.quantity == "signal" and not isfinite(_settling(atom)):
-            return what_was_measured(atom, {})
+            return what_was_measured(atom, {}, 0)
         if isinstance(part, Signal):
             return f"{part.name} is {amount} too {'low' if needs_more else 'high'}"
     return f"`{spec}` is violated"
@@ -559,9 +559,11 @@ class Settled:
         yield self.start
 
     def _witness_from(self, begin: int) -> Witness:
-        samples, duration_ns = look_back([self.spec.formula])
+        samples, duration_ns, to_reports = look_back([self.spec.formula])
         start_ns = self.samples[begin].time_ns
-        first = max(begin - samples, 0)
+        first = max(begin - max(samples, to_reports), 0)
+        if to_reports and any(sample.reported_ns for sample in self.samples):
+            first = 0
         while duration_ns and first > 0 and self.samples[first].time_ns > start_ns - duration_ns:
             first -= 1
         trace = Trace.from_samples(self.samples[first:])

@@ -16,7 +16,7 @@ import numpy as np
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Empty, Flags, Floats, Integers
-from spatial_replay.monitor.atoms.terms import iter_delays
+from spatial_replay.monitor.atoms.terms import TO_REPORTS, iter_delays
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.program import Program
@@ -628,10 +628,11 @@ def left_out(
     is_before = np.zeros(values.shape[1:], np.bool_)
     numbers = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
     for row, leaf in zip(is_before, leaves, strict=True):
-        for samples, duration_ns in set(iter_delays([leaf])):
-            row |= positions < (samples or 0)
-            if duration_ns is not None:
-                row |= times_ns - duration_ns < first_ns
+        for delay in set(iter_delays([leaf])):
+            # no report comes before those of the first sample
+            row |= positions < (1 if delay == TO_REPORTS else delay.samples or 0)
+            if delay.duration_ns is not None:
+                row |= times_ns - delay.duration_ns < first_ns
         for condition in rate_conditions(leaf):
             if (number := numbers.get(leaf_key(condition))) is not None:
                 row |= (values[:, number] == -np.inf).all(axis=0)

@@ -243,11 +243,9 @@ def sentences_of(
     if witness.missed is not None and not is_open:
         # how well a condition held is not how badly its response failed
         is_measured = witness.missed.is_condition and is_decided
-        measured = (
-            f": {what_was_measured(witness.deciding, witness.units)}"
-            if is_measured and witness.deciding
-            else ""
-        )
+        measured = Sentence("")
+        if is_measured and witness.deciding:
+            measured = Sentence(": ", what_was_measured(witness.deciding, witness.units, first_ns))
         sentences.append(Sentence(missed_text(witness.missed, first_ns), f"{measured}."))
         if witness.closest is not None:
             sentences.append(_closest(*witness.closest, first_ns, witness.units))
@@ -392,7 +390,7 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
         return Sentence(missed, ". ", reason) if missed else reason
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
-        said = Sentence(missed, f": {what_was_measured(deciding, witness.units)}.")
+        said = Sentence(missed, ": ", what_was_measured(deciding, witness.units, first_ns), ".")
         if witness.closest is None:
             return said
         return Sentence(said, " ", _closest(*witness.closest, first_ns, witness.units))
@@ -429,8 +427,9 @@ def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:
 
 def _closest(best: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
     """Return a sentence on what a missed response came to at best."""
-    what = f": {what_was_measured(best, units)}."
-    return Sentence(f"The nearest that it came to `{best.text}` was at ", Instant(time_ns, first_ns), what)
+    what = what_was_measured(best, units, first_ns)
+    when = Instant(time_ns, first_ns)
+    return Sentence(f"The nearest that it came to `{best.text}` was at ", when, ": ", what, ".")
 
 
 def _how_it_decides(
@@ -447,16 +446,37 @@ def _how_it_decides(
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
-    what = what_was_measured(deciding, witness.units)
-    return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: {what}.")
+    what = what_was_measured(deciding, witness.units, first_ns)
+    return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: ", what, ".")
 
 
-def what_was_measured(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
+def what_was_measured(deciding: DecidingAtom, units: Mapping[str, str], first_ns: int) -> Sentence:
+    """Return a clause on what decided an atom, without a full stop."""
     if any(is_text_number(each.value) for each in deciding.measured):
         signal, sign, text = deciding.atom.parameters
         is_equal = (deciding.value > 0.0) == (sign == "==")
-        return f"{signal} is {text if is_equal else 'another text'}"
-    return " and ".join(_measured(each, units) for each in deciding.measured)
+        return Sentence(f"{signal} is {text if is_equal else 'another text'}")
+    clauses: list[str | Instant] = []
+    for measured in deciding.measured:
+        is_rate = measured.reports_ns is not None and measured.value != 0.0
+        clause = _change(measured, units, first_ns) if is_rate else _measured(measured, units)
+        clauses += [" and ", clause]
+    return Sentence(*clauses[1:])
+
+
+def _change(measured: Measured, units: Mapping[str, str], first_ns: int) -> Sentence:
+    """Return by how much something changed between two reports, and at which rate."""
+    before_ns, now_ns = measured.reports_ns or (0, 0)
+    names, of = measured.names, measured.names[0] if measured.quantity == "rate" else ""
+    change = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(of, ""))
+    rate = with_unit(abs(measured.value), per_second(units.get(of, "")))
+    how = f"{names[0]} moved"
+    if of:
+        how = f"{of} {'rose' if measured.value > 0.0 else 'fell'}"
+    elif len(names) == 2:
+        how = f"{names[0]} and {names[1]} {'approached' if measured.value > 0.0 else 'parted'}"
+    times = Instant(before_ns, first_ns), " to ", Instant(now_ns, first_ns)
+    return Sentence(f"{how} by {change} from ", *times, f", {'by' if of else 'at'} {rate}")
 
 
 def _end(deciding: DecidingAtom) -> float:

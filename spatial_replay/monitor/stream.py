@@ -317,8 +317,8 @@ class EvaluationStream:
                 raise TraceError(
                     f"a sample at {at} follows one at {last}; give samples in the order of their times"
                 )
-            if self._reach != (0, 0):
-                recent = tail(self._before, *self._reach)
+            if self._reach:
+                recent = tail(self._before, self._reach)
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
         self._before = trace

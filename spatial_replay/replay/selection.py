@@ -167,7 +167,7 @@ _FIRST_NS = 10**8
 
 def look_before(files: Sequence[Specification]) -> bool:
     """Say whether specifications look back at samples before a window."""
-    return any(look_back([spec.formula for spec in file.specs]) != (0, 0) for file in files)
+    return any(look_back([spec.formula for spec in file.specs]) for file in files)
 
 
 def first_sample_ns(source: Source) -> int:

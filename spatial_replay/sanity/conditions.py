@@ -269,7 +269,7 @@ def members(term: Term) -> tuple[Term, ...]:
     if not names:
         return (term,)
     if isinstance(term, Earlier):
-        return tuple(Earlier(name, term.samples, term.duration_ns) for name in names)
+        return tuple(Earlier(name, term.samples, term.duration_ns, term.rate) for name in names)
     return tuple(names)
 
 

@@ -101,14 +101,17 @@ ANY_CLASS = "*"
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """A term as it was earlier: exactly one of `samples` and `duration_ns` is given (`a[-3]`, `a[-2.5s]`).
+    """A term as it was earlier; exactly one of `samples`, `duration_ns` and `rate` is given.
 
-    With a duration it is the last sample at or before that much earlier.
+    `a[-3]` is that of 3 samples before, `a[-2.5s]` that of the last sample at or before that much earlier.
+    A rate moves a term back by its own velocity between the last two reports, over the shortest time between
+    two reports of any of the terms in `rate`.
     """
 
     term: TrackedName | Variable | RegionName | Group
     samples: int | None = None
     duration_ns: int | None = None
+    rate: tuple[TrackedName | Variable | Group, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,14 +230,14 @@ class ComputedSignal(Signal):
 
 @dataclass(frozen=True, slots=True)
 class PreviousSignal(Signal):
-    """A signal in the sample before."""
+    """A signal at its last report but the one that the sample shows."""
 
-    of: Signal
+    signal: Signal
 
 
 @dataclass(frozen=True, slots=True)
 class Rate(Signal):
-    """A rate of change since the sample before, per second: `speed(a)`, `speed(a, b)`, `rate(signal)`.
+    """A rate of change between reports, per second: `speed(a)`, `speed(a, b)`, `rate(signal)`.
 
     To sentences and rules it is a signal; its numbers are computed (see `walks.change_of`).
 
@@ -248,8 +251,17 @@ class Rate(Signal):
     signal: Signal | None = None
 
 
-STEP: Final = Rate("", ())
-"""The seconds since the sample before."""
+@dataclass(frozen=True, slots=True)
+class ReportStep(Signal):
+    """The seconds between the two reports that a rate compares; of several terms, the shortest time.
+
+    Attributes:
+        terms: those of a speed that move.
+        signal: that of `rate`, else None.
+    """
+
+    terms: tuple[TrackedName | Variable | Group, ...]
+    signal: Signal | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,7 @@ from spatial_replay.spec.formula import (
     Quantified,
     Rate,
     RegionName,
+    ReportStep,
     Scale,
     Scaled,
     Signal,
@@ -157,30 +158,43 @@ def is_about_having_rates(leaf: Formula) -> bool:
 
 
 def change_of(rate: Rate) -> Sum | SignedDistance:
-    """Return what a rate is per second: the difference between this sample and the one before."""
+    """Return what a rate is per second: the difference between two reports."""
     match rate.terms:
         case (one, other):
-            return SignedDistance(_before(one), _before(other)) - SignedDistance(one, other)
+            before = (_moved_back(term, _moving(rate)) for term in rate.terms)
+            return SignedDistance(*before) - SignedDistance(one, other)
         case (one,):
-            alone: Any = standing(one)
-            return SignedDistance(Centre(alone), Centre(Earlier(alone, samples=1)))
+            alone: Any = base_of(one)
+            return SignedDistance(Centre(alone), _moved_back(Centre(alone), _moving(rate)))
     signal = rate.signal or Signal("")
     return signal - PreviousSignal(signal.name, signal)
 
 
-def _before(term: Term) -> Term:
+def step_of(rate: Rate) -> ReportStep:
+    """Return the seconds between the reports that a rate compares."""
+    return ReportStep("", _moving(rate), rate.signal)
+
+
+def _moving(rate: Rate) -> tuple[TrackedName | Variable | Group, ...]:
+    bases = map(base_of, rate.terms)
+    return tuple(base for base in bases if not isinstance(base, RegionName))
+
+
+def _moved_back(term: Term, rate: tuple[TrackedName | Variable | Group, ...]) -> Term:
+    if isinstance(term, RegionName):
+        return term
     inner: Any = term
     if isinstance(term, Enlarged | Centre):
-        inner = _before(term.term)
+        inner = _moved_back(term.term, rate)
         return replace(term, term=inner)
-    return Earlier(inner, samples=1)
+    return Earlier(inner, rate=rate)
 
 
 def logged_signals(expression: Expression) -> Iterator[str]:
     """Yield the names of the signals that an expression needs in the log."""
     for part in iter_expressions(expression):
         signal = part.signal if isinstance(part, Rate) else part
-        signal = signal.of if isinstance(signal, PreviousSignal) else signal
+        signal = signal.signal if isinstance(signal, PreviousSignal) else signal
         if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal | HasRate | Present):
             yield signal.name
 
@@ -379,6 +393,10 @@ def substitute_term(term: Term, names: Names) -> Term:
             return names.get(term.name, term)
         case Group():
             return replace(term, excluded=tuple(_object(each, names) for each in term.excluded))
+        case Earlier(rate=(_, *_)):
+            moved: Any = substitute_term(term.term, names)
+            rate: Any = tuple(substitute_term(moving, names) for moving in term.rate)
+            return replace(term, term=moved, rate=rate)
         case Earlier() | Enlarged() | Centre():
             inner: Any = substitute_term(term.term, names)
             return replace(term, term=inner)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import permutations
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -300,7 +301,9 @@ Bindings = Mapping[str, str]
 class Observed:
     """A recording, and the regions of a specification: what atoms are in each sample.
 
-    `unreadable` holds the observations, (t, name), whose numbers are not finite.
+    `unreadable` holds the observations, (t, name), whose numbers are not finite; `reported_ns` the times of
+    reports by (t, name), where they are not those of samples; `lasting` the objects that stand
+    without a rate.
     """
 
     def __init__(
@@ -310,8 +313,12 @@ class Observed:
         unreadable: frozenset[tuple[int, str]],
         signals: Sequence[Mapping[str, float]],
         regions: Mapping[str, Outline],
+        reported_ns: Mapping[tuple[int, str], int] = MappingProxyType({}),
+        lasting: frozenset[str] = frozenset(),
     ) -> None:
         self.times_ns = times_ns
+        self.reported_ns = reported_ns
+        self.lasting = lasting
         self.objects = objects
         self.unreadable = unreadable
         self.signals = signals
@@ -373,7 +380,8 @@ class Observed:
                 (name,) = _names([term], bindings)
                 return TRUE if name in self.objects[t] else FALSE
             case Equality(HasRate(rate=rate)):
-                if self._changing(rate, t, bindings, uncertain) is None:
+                current = [self.members(each, t, bindings) for each in rate.terms]
+                if None in (current or [self._expression(rate.signal or Signal(""), t, bindings, uncertain)]):
                     return None
                 return FALSE if self._rate(rate, t, bindings, uncertain) is None else TRUE
             case Equality():
@@ -397,30 +405,81 @@ class Observed:
         return self._measurement(expression, t, bindings, uncertain)
 
     def _rate(self, rate: Rate, t: int, bindings: Bindings, uncertain: bool) -> Interval | None:
-        """What changed since the sample before, per second."""
-        if t == 0:
+        """What changed between two reports, per second."""
+        if not rate.terms:
+            name = (rate.signal or Signal("")).name
+            reports = self._reports(name, t, lambda u: self.signals[u].get(name))
+            if reports is None:
+                return None
+            before, step = reports
+            change = self.signals[t][name] - self.signals[before][name]
+            return Interval(change / step, change / step)
+        step = self._step(rate.terms, t, bindings)
+        if step is None:
             return None
-        now, before = (self._changing(rate, at, bindings, uncertain) for at in (t, t - 1))
-        if now is None or before is None:
+        terms = rate.terms if len(rate.terms) == 2 else [Centre(_base(rate.terms[0]))]
+        now, before = [[self.members(each, t, bindings, back) for each in terms] for back in (0.0, step)]
+        if any(each is None for each in (*now, *before)):
             return None
-        step = (self.times_ns[t] - self.times_ns[t - 1]) / 1e9
-        if isinstance(now, Interval) and isinstance(before, Interval):
-            return Interval((now.low - before.high) / step, (now.high - before.low) / step)
-        moved = _measured(SignedDistance(*rate.terms, *rate.terms), [now], [before])
-        spread = now.uncertainty + before.uncertainty if uncertain else 0.0
-        return Interval((moved - spread) / step, (moved + spread) / step)
+        pairs: Any = [before, now] if len(terms) == 2 else [[now[0], before[0]]]
+        distances = [_measured(SignedDistance(*rate.terms[:1] * 2), *pair) for pair in pairs]
+        spreads = [
+            sum(max((one.uncertainty for one in union), default=0.0) for union in pair) if uncertain else 0.0
+            for pair in pairs
+        ]
+        change = distances[0] - (distances[1] if len(terms) == 2 else 0.0)
+        low, high = (change - sum(spreads)) / step, (change + sum(spreads)) / step
+        return None if math.isnan(low) or math.isnan(high) else Interval(low, high)
 
-    def _changing(
-        self, rate: Rate, t: int, bindings: Bindings, uncertain: bool
-    ) -> Interval | TrackedObject | None:
-        """A signal, minus a distance, or the centre of an object."""
-        match rate.terms:
-            case (one, other):
-                return self._expression(Negative(SignedDistance(one, other)), t, bindings, uncertain)
-            case (one,):
-                members = self.members(one, t, bindings)
-                return None if members is None else _centre(members[0])
-        return self._expression(rate.signal or Signal(""), t, bindings, uncertain)
+    def _reports(self, name: str, t: int, shown: Callable[[int], object]) -> tuple[int, float] | None:
+        """The last sample that showed another report, and the seconds between both; None after a hole."""
+        times = [self.reported_ns.get((u, name), self.times_ns[u]) for u in range(t + 1)]
+        for u in range(t, -1, -1):
+            if shown(u) is None or (isinstance(shown(u), float) and not math.isfinite(shown(u))):
+                return None
+            if times[u] != times[t]:
+                return (u, (times[t] - times[u]) / 1e9) if times[u] < times[t] else None
+        return None
+
+    def _reports_of(self, name: str, t: int) -> tuple[int, float] | None:
+        return self._reports(
+            name, t, lambda u: None if (u, name) in self.unreadable else self.objects[u].get(name)
+        )
+
+    def _step(self, terms: Sequence[Term], t: int, bindings: Bindings) -> float | None:
+        """The shortest time between two reports of what moves."""
+        steps = []
+        for base in map(_base, terms):
+            if isinstance(base, RegionName):
+                continue
+            names = _names([base], bindings)
+            if isinstance(base, Group):
+                left_out = _names(base.excluded, bindings)
+                names = [name for name in base.members or () if name not in left_out]
+                if base.members is None:
+                    names = self._member_names(base, t, bindings) or []
+            for name in names:
+                reports = self._reports_of(name, t)
+                if reports is not None:
+                    steps.append(reports[1])
+                elif name not in self.lasting:
+                    return None
+        return min(steps, default=None)
+
+    def _moved_back(self, name: str, t: int, step: float) -> TrackedObject | None:
+        """An object as it was so many seconds ago by its velocity between two reports."""
+        now, reports = self.objects[t][name], self._reports_of(name, t)
+        if reports is None:
+            return now if name in self.lasting else None
+        before, seconds = reports
+        then = self.objects[before][name]
+        if seconds == step:
+            return then
+        ends = [_centre(each).footprint.parts[0].vertices for each in (now, then)]
+        shift = (ends[1] - ends[0]) * step / seconds
+        parts = [ConvexPart(part.vertices + shift, part.radius) for part in now.footprint.parts]
+        uncertainty = max(now.uncertainty, then.uncertainty)
+        return TrackedObject(Footprint(tuple(parts)), now.class_name, now.yaw, now.height, uncertainty)
 
     def _measurement(
         self, measurement: Expression, t: int, bindings: Bindings, uncertain: bool
@@ -438,14 +497,16 @@ class Observed:
             spread = 0.0
         return Interval(value - spread, value + spread)
 
-    def members(self, term: Term, t: int, bindings: Bindings) -> list[TrackedObject] | None:
-        """The objects whose union a term is; None where one of them is unknown."""
+    def members(
+        self, term: Term, t: int, bindings: Bindings, back: float = 0.0
+    ) -> list[TrackedObject] | None:
+        """The objects whose union a term is, moved back by some seconds; None where one is unknown."""
         match term:
             case Enlarged():
-                inner = self.members(term.term, t, bindings)
+                inner = self.members(term.term, t, bindings, back)
                 return None if inner is None else [_enlarged(each, term.radius) for each in inner]
             case Centre():
-                inner = self.members(term.term, t, bindings)
+                inner = self.members(term.term, t, bindings, back)
                 return None if inner is None else [_centre(each) for each in inner]
             case RegionName():
                 return [self.regions[term.name]]
@@ -460,6 +521,8 @@ class Observed:
             case _:
                 names = _names([term], bindings)
         found = [None if (t, name) in self.unreadable else self.objects[t].get(name) for name in names]
+        if back and None not in found:
+            found = [self._moved_back(name, t, back) for name in names]
         return None if None in found else [each for each in found if each is not None]
 
     def _member_names(self, group: Group | Earlier, t: int, bindings: Bindings) -> list[str] | None:
@@ -482,6 +545,12 @@ class Observed:
             return t - term.samples if t >= term.samples else None
         limit = self.times_ns[t] - (term.duration_ns or 0)
         return max((u for u in range(t + 1) if self.times_ns[u] <= limit), default=None)
+
+
+def _base(term: Term) -> Any:
+    while isinstance(term, Enlarged | Centre):
+        term = term.term
+    return term
 
 
 def _names(terms: Sequence[Term], bindings: Bindings) -> list[str]:

@@ -379,7 +379,8 @@ def recordings(draw, max_size=5):
     size = draw(st.integers(1, max_size))
     certain = draw(st.booleans())
     shapes = draw(st.lists(tracked_objects(certain=certain), min_size=2, max_size=4))
-    complete = draw(st.booleans())
+    complete, slow = draw(st.booleans()), draw(st.booleans())
+    lasting, reported = draw(st.sets(st.sampled_from(NAMES), max_size=1)), {}
     time, samples, unreadable = draw(st.integers(0, 10**9)), [], set()
     for t in range(size):
         objects = {
@@ -388,7 +389,15 @@ def recordings(draw, max_size=5):
             if complete or draw(st.integers(0, 3)) > 0
         }  # fmt: skip
         battery = draw(st.sampled_from([0.5, 1.0, 3.25, float("nan")]))
-        samples.append(Sample(time, objects, {"battery": battery} if draw(st.booleans()) else {}))
+        signals = {"battery": battery} if draw(st.booleans()) else {}
+        if slow:
+            # some reports are held, some go back
+            shown = {
+                name: draw(st.sampled_from([reported.get(name, time), time, time, 0]))
+                for name in (*NAMES, "battery")
+            }
+            reported = {name: shown[name] for name in (*objects, *signals)}
+        samples.append(Sample(time, objects, signals, reported_ns=reported, lasting=lasting))
         if not complete:
             unreadable |= {(t, name) for name in objects if draw(st.integers(0, 6)) == 0}
         time += draw(st.sampled_from([50, 100, 250, 400, 500])) * 10**6

@@ -222,6 +222,8 @@ def observed_in(recording, specification):
         recording.unreadable,
         [sample.signals for sample in samples],
         specification.regions,
+        {(t, name): ns for t, sample in enumerate(samples) for name, ns in sample.reported_ns.items()},
+        frozenset().union(*(sample.lasting for sample in samples)),
     )
 
 

@@ -201,10 +201,10 @@ def test_commands_say_rates_in_the_unit_of_the_log_per_second(
     assert run(["explain", "run.mcap", "--spec", "s.spatial"]) == 1
     said = capsys.readouterr().out
     assert "robustness -0.5 m/s" in said
-    assert "robot moves at 2 m/s" in said
-    assert "robot and cart approach at 2 m/s" in said
+    assert "robot moved by 1 m from 0.000 s to 0.500 s, at 2 m/s" in said
+    assert "robot and cart approached by 1 m from 0.000 s to 0.500 s, at 2 m/s" in said
     assert "fails by 1 V/s at 0.500 s" in said
-    assert "battery falls by 2 V/s" in said
+    assert "battery fell by 1 V from 0.000 s to 0.500 s, by 2 V/s" in said
     assert "or more instead of 1.5 in `speed(robot) <= 1.5`" in said
     assert run(["check", "s.spatial", "--log", "run.mcap"]) == 0
     assert "speed(robot) <= 1.5: goes from 0.5 to 2" in capsys.readouterr().out

@@ -24,7 +24,6 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.spec.formula import (
-    STEP,
     Atom,
     Boolean,
     Earlier,
@@ -55,7 +54,14 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import change_of, map_leaves, map_terms, presence_of, substitute_term
+from spatial_replay.spec.walks import (
+    change_of,
+    map_leaves,
+    map_terms,
+    presence_of,
+    step_of,
+    substitute_term,
+)
 from spatial_replay.text import TEXTS
 
 
@@ -353,9 +359,10 @@ class LeafCode:
             case Number():
                 return self._constant(expression.value)
             case Rate():
-                change = self._expression(change_of(expression), bindings)
-                step = self._row(SIGNAL, self.signals.setdefault(STEP, len(self.signals)))
-                return self._row(QUOTIENT, change, step)
+                terms = tuple(substitute_term(term, bindings) for term in expression.terms)
+                bound = replace(expression, terms=terms)
+                step = self._expression(step_of(bound), {})
+                return self._row(QUOTIENT, self._expression(change_of(bound), {}), step)
             case Signal():
                 return self._row(SIGNAL, self.signals.setdefault(expression, len(self.signals)))
             case Sum():

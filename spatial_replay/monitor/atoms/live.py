@@ -41,8 +41,8 @@ from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_
 from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.terms import (
     NO_DELAY,
-    PREVIOUS,
     Delay,
+    RecentReports,
     RecentSamples,
     footprint_from_outline,
     iter_delays,
@@ -51,12 +51,12 @@ from spatial_replay.monitor.atoms.terms import (
 )
 from spatial_replay.spec.formula import (
     ANY_CLASS,
-    STEP,
     Atom,
     Centre,
     ComputedSignal,
     Earlier,
     Enlarged,
+    Formula,
     Group,
     Misalignment,
     Outline,
@@ -64,12 +64,22 @@ from spatial_replay.spec.formula import (
     PreviousSignal,
     Quantified,
     RegionName,
+    ReportStep,
     Signal,
     Term,
     TrackedName,
+    Variable,
 )
 from spatial_replay.spec.relations import computed_signal
-from spatial_replay.spec.walks import base_of, is_centre, iter_terms, measured_terms, named_members, standing
+from spatial_replay.spec.walks import (
+    base_of,
+    is_centre,
+    iter_terms,
+    measured_terms,
+    named_members,
+    rates_of,
+    standing,
+)
 from spatial_replay.text import TEXTS
 from spatial_replay.trace.trace import Sample
 
@@ -476,11 +486,16 @@ class PlanContext:
 
 
 class Place(NamedTuple):
-    """An object in one of the samples looked at, or the point at its centre."""
+    """An object in one of the samples looked at, or the point at its centre.
+
+    Attributes:
+        rate: the terms of the rate that moves it back, if any does.
+    """
 
     sample: int
     name: str
     is_centre: bool
+    rate: tuple[Term, ...] = ()
 
 
 class Row(NamedTuple):
@@ -519,16 +534,17 @@ class PlanRows:
     def of_term(self, term: Term) -> list[Row]:
         """Return the rows whose union a term is."""
         is_point, term = is_centre(term), standing(term)
-        sample = self._sample_of(term)
         base = term.term if isinstance(term, Earlier) else term
+        rate = term.rate if isinstance(term, Earlier) else ()
+        place = partial(self._place, self._sample_of(term), is_centre=is_point, rate=rate)
         if isinstance(base, RegionName):
             return [Row(self._region[Centre(base) if is_point else base])]
         if not isinstance(base, Group):
-            return [Row(self._place(sample, base.name, is_point))]
+            return [Row(place(base.name))]
         if base.members is None:
             wanted = self._class_wanted(base)
-            return [Row(self._place(sample, name, is_point), wanted) for name in self.candidates(base)]
-        return [Row(self._place(sample, name, is_point)) for name in named_members(base)]
+            return [Row(place(name), wanted) for name in self.candidates(base)]
+        return [Row(place(name)) for name in named_members(base)]
 
     def required(self, term: Term) -> list[Row]:
         """Return the rows, its sample's among them, without which a term is unknown."""
@@ -546,9 +562,9 @@ class PlanRows:
             return ANY
         return self._frame.classes[(group.class_name or "").casefold()]
 
-    def _place(self, sample: int, name: str, is_centre: bool = False) -> int:
+    def _place(self, sample: int, name: str, *, is_centre: bool = False, rate: tuple[Term, ...] = ()) -> int:
         first = len(self._sample) + len(self._region)
-        return self.places.setdefault(Place(sample, name, is_centre), first + len(self.places))
+        return self.places.setdefault(Place(sample, name, is_centre, rate), first + len(self.places))
 
 
 class LeafPlan:
@@ -573,7 +589,6 @@ class LeafPlan:
         self.placeholders = placeholders
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
-        self._previous = frame.delays.index(PREVIOUS) if PREVIOUS in frame.delays else 0
         self._has_classes = bool(frame.classes)
         count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
         self._pack = Struct(f"={count}d").pack
@@ -583,6 +598,7 @@ class LeafPlan:
         samples: Sequence[Sample | None],
         stands_for: Mapping[str, str],
         code_of: Callable[[str | None], int],
+        reports: RecentReports,
     ) -> bytes:
         """Flatten samples for `measure_sample`, as the bytes of doubles.
 
@@ -590,6 +606,7 @@ class LeafPlan:
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
             code_of: returns that of a class.
+            reports: those that the newest sample shows.
         """
         newest: Any = samples[0]
         numbers = [0.0]
@@ -600,16 +617,24 @@ class LeafPlan:
                 name = stands_for.get(signal.term.name, signal.term.name)
                 numbers.append(name in newest.objects or name in newest.unknown)
             else:
-                numbers.append(_signal(signal, newest, samples[self._previous]))
+                numbers.append(_signal(signal, newest, reports, stands_for))
         if not self._places:
             return self._pack(*numbers)
         packed = [b""]
         lookups = [newest.objects.get]
         if len(samples) > 1:
             lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
-        for place, name, is_point in self._places:
+        for place, name, is_point, rate in self._places:
             name = stands_for.get(name, name) if stands_for else name
             tracked: Any = lookups[place](name)
+            if rate and tracked is not None:
+                class_name = tracked.class_name
+                tracked = reports.moved_back(name, newest, _step(rate, newest, reports, stands_for))
+                if tracked is None:
+                    packed.append(_HIDDEN)
+                    if self._has_classes:
+                        numbers.append(code_of(class_name))
+                    continue
             if tracked is not None:
                 packed += (centre_object(tracked) if is_point else tracked).packed
                 if self._has_classes:
@@ -623,15 +648,28 @@ class LeafPlan:
         return b"".join(packed)
 
 
-def _signal(signal: Signal, sample: Sample, previous: Sample | None) -> float:
+def _signal(signal: Signal, sample: Sample, reports: RecentReports, stands_for: Mapping[str, str]) -> float:
     """Return what `TraceScene.signal` does of one sample."""
-    if signal == STEP:
-        return nan if previous is None else (sample.time_ns - previous.time_ns) / 1e9
-    if isinstance(signal, PreviousSignal):
-        return nan if previous is None else _signal(signal.of, previous, None)
+    if isinstance(signal, ReportStep) and signal.signal is None:
+        return _step(signal.terms, sample, reports, stands_for)
+    if isinstance(signal, ReportStep | PreviousSignal):
+        latest = reports.of.get(signal.signal or signal)
+        if latest is None or latest.before is None:
+            return nan
+        return latest.seconds if isinstance(signal, ReportStep) else float(latest.before.shown)
     if isinstance(signal, ComputedSignal):
         return computed_signal(signal, sample)
     return sample.signals.get(signal.name, nan)
+
+
+def _step(
+    terms: Sequence[Term], sample: Sample, reports: RecentReports, stands_for: Mapping[str, str]
+) -> float:
+    """Return the shortest time between two reports of what moves in some terms."""
+    if stands_for:
+        names = {name: TrackedName(other) for name, other in stands_for.items()}
+        terms = [names.get(term.name, term) if isinstance(term, TrackedName) else term for term in terms]
+    return reports.step(terms, sample)
 
 
 _NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get
@@ -746,6 +784,7 @@ class SampleLeaves:
         )
         self._regions = regions
         self._recent = RecentSamples(self._frame.delays)
+        self._reports = _reports_needed(formulas)
         self._takes_any = ANY_CLASS in open_classes
         self._own_names = _names(bases)
         self._prefix = "?"
@@ -758,6 +797,7 @@ class SampleLeaves:
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
         """Add the next sample; return it and those that it looks back at."""
+        self._reports.add(sample)
         return self._recent.add(sample)
 
     def values(self, samples: Sequence[Sample | None]) -> Floats:
@@ -772,7 +812,7 @@ class SampleLeaves:
         plan, stands_for = self._only_plan, _NOTHING
         if plan is None:
             plan, stands_for = self._fitting_plan(samples)
-        return leaves_of_sample(plan.packed, plan.numbers(samples, stands_for, self._code_of))
+        return leaves_of_sample(plan.packed, plan.numbers(samples, stands_for, self._code_of, self._reports))
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in some samples, and their names in it."""
@@ -824,6 +864,15 @@ class SampleLeaves:
                 del plans[next(iter(plans))]
         plans[key] = plan
         return plan
+
+
+def _reports_needed(formulas: Sequence[Formula]) -> RecentReports:
+    """Return an empty memory of the reports that the rates in some formulas compare."""
+    rates = [rate for formula in formulas for rate in rates_of(formula)]
+    bases = [base_of(term) for rate in rates for term in rate.terms]
+    is_any = any(isinstance(base, Variable) or (isinstance(base, Group) and base.is_open) for base in bases)
+    signals = dict.fromkeys(rate.signal for rate in rates if rate.signal is not None)
+    return RecentReports(None if is_any else _names(bases), signals)
 
 
 def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], counts: _Counts) -> LeafPlan:

@@ -78,7 +78,7 @@ class Evidence:
             trace = scene.trace
             at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
             if at < end:
-                past = tail(trace.slice(0, at), *self._reach) if at else trace.slice(0, 0)
+                past = tail(trace.slice(0, at), self._reach) if at else trace.slice(0, 0)
                 return TraceScene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
         raise LookupError(f"there is no sample at {time_ns} ns any more")
 
@@ -145,8 +145,8 @@ class Evidence:
                 # an object of a template is there for a part of the log only
                 return
             skip = 0
-            if past is not None and self._reach != (0, 0):
-                recent = tail(past, *self._reach)
+            if past is not None and self._reach:
+                recent = tail(past, self._reach)
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
             past = trace if len(trace) else past

@@ -43,7 +43,6 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Present,
-    PreviousSignal,
     Projection,
     Protrusion,
     Quantified,
@@ -62,7 +61,6 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.walks import (
     base_of,
-    change_of,
     iter_expressions,
     logged_signals,
     measured_terms,
@@ -382,16 +380,21 @@ def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
 def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
         case Rate():
-            for inner in iter_expressions(change_of(part)):
-                yield from _reasons(scene, inner)
+            known = scene.compared_ns(part) is not None
+            for inner in (part.signal,) if part.signal else map(_position, part.terms):
+                reasons = tuple(_reasons(scene, inner))
+                known = known or bool(reasons)
+                yield from reasons
+            if not known:
+                of = part.signal.name if part.signal else " and ".join(map(format_term, part.terms))
+                yield f"{of} has no report to compare with, or none of an earlier time"
         case Signal() | Equality():
             signal, compared = (part, 0.0) if isinstance(part, Signal) else (part.signal, part.value)
             name, value = signal.name, scene.signal(signal)[0]
             if any(each not in scene.trace.signals for each in logged_signals(signal)):
                 yield f"there is no signal {name!r}"
             elif not np.isfinite(value):
-                before = " before" if isinstance(part, PreviousSignal) else ""
-                yield f"signal {name!r} has no finite value in the sample{before}"
+                yield f"signal {name!r} has no finite value in the sample"
             elif is_text_number(compared) != is_text_number(value):
                 kinds = "a text, not a number; `names` of its mapping give texts numbers"
                 if is_text_number(compared):
@@ -402,6 +405,11 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
         case _:
             for term in terms_of(part):
                 yield from _reasons_of_term(scene, part, term)
+
+
+def _position(term: Term) -> Projection:
+    """Return a number that is unknown where the position of a term is."""
+    return Projection(term, "x", "min")
 
 
 def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterator[str]:
@@ -461,6 +469,7 @@ class Measured:
         value: the number.
         spread: its uncertainty, from that of the objects.
         contact: for distances, where they are attained; otherwise None.
+        reports_ns: for rates, the times of the two reports that they compare; otherwise None.
     """
 
     quantity: str
@@ -468,6 +477,7 @@ class Measured:
     value: float
     spread: float = 0.0
     contact: Contact | None = None
+    reports_ns: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -634,7 +644,8 @@ def _measured(scene: TraceScene, part: Expression) -> Measured:
         case Rate():
             low, high = _intervals(scene, [_as_atom(part)])[0]
             names = tuple(map(format_term, part.terms)) or ((part.signal or part).name,)
-            return Measured("speed" if part.terms else "rate", names, (low + high) / 2, (high - low) / 2)
+            quantity, reports_ns = "speed" if part.terms else "rate", scene.compared_ns(part)
+            return Measured(quantity, names, (low + high) / 2, (high - low) / 2, reports_ns=reports_ns)
         case Present():
             return Measured("present", (part.term.name,), float(scene.signal(part)[0]))
         case Signal():
