@@ -288,14 +288,35 @@ def test_an_antecedent_that_never_held_fails_a_gate_under_the_semantics_of_the_p
     assert _document(folder, "polite.spatial", *paper, "--allow", "vacuous")[0] == 0
 
 
+def _without_plate(*stretches: slice, with_class: bool = False) -> list[str]:
+    """The lines of the log, of which some lack the plate."""
+    samples = [json.loads(line) for line in LOG.read_text().splitlines()]
+    for sample in samples:
+        for item in sample["objects"]:
+            if item["name"] == "plate" and not with_class:
+                del item["class"]
+    for stretch in stretches:
+        for sample in samples[stretch]:
+            sample["objects"] = [item for item in sample["objects"] if item["name"] != "plate"]
+    return list(map(json.dumps, samples))
+
+
+def test_a_member_of_a_class_that_comes_later_drops_no_samples(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "near.spatial").write_text("spec near = G (cup dist plate >= 0)\n")
+    (folder / "later.jsonl").write_text("\n".join(_without_plate(slice(0, 30), with_class=True)))
+    assert run(["explain", str(folder / "later.jsonl"), "--spec", "near.spatial"]) == 4
+    said = capsys.readouterr().out
+    assert "plate is missing in 30 of 300 samples, all from 0.000 s to 1.000 s" in said
+    assert "--from" not in said
+
+
 def test_replay_names_the_option_that_leaves_out_what_is_missing_at_the_start(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "near.spatial").write_text("spec near = G (cup dist plate >= 0)\n")
-    lines = LOG.read_text().splitlines()
-    first = json.loads(lines[0])
-    first["objects"] = [each for each in first["objects"] if each["name"] != "plate"]
-    (folder / "late.jsonl").write_text("\n".join([json.dumps(first), *lines[1:]]))
+    (folder / "late.jsonl").write_text("\n".join(_without_plate(slice(0, 1))))
     log = str(folder / "late.jsonl")
     assert run(["replay", log, "--spec", "near.spatial"]) == 4
     said = capsys.readouterr().out
@@ -307,10 +328,7 @@ def test_replay_names_the_options_that_leave_out_what_is_missing_at_both_ends(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "near.spatial").write_text("spec near = G (cup dist plate >= 0)\n")
-    samples = [json.loads(line) for line in LOG.read_text().splitlines()]
-    for sample in (samples[0], *samples[-2:]):
-        sample["objects"] = [each for each in sample["objects"] if each["name"] != "plate"]
-    (folder / "both.jsonl").write_text("\n".join(map(json.dumps, samples)))
+    (folder / "both.jsonl").write_text("\n".join(_without_plate(slice(0, 1), slice(-2, None))))
     log = str(folder / "both.jsonl")
     assert run(["replay", log, "--spec", "near.spatial"]) == 4
     remedy = "--from 0.033s --to 9.933s"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.spec.formula import Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
 from spatial_replay.spec.walks import base_of, iter_atoms, logged_signals, named_members, substitute
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.trace import ABSENT, Trace, window_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Gap:
         missing, samples: in how many of how many samples it is missing.
         first_ns, last_ns: the first and the last of these.
         window: the start, and the end (not included), of the samples between missing ones at the ends of a
-            log; None if others are missing.
+            log; None if others are missing, and for a member of a class that comes later, or leaves.
         longest_ns: the first sample of the longest stretch without it, and the first one after, if any.
     """
 
@@ -112,16 +112,23 @@ class Evidence:
         """
         kinds = named_parts(formula)
         parts: list[NDArray[np.bool_]] = []
+        members, absent = set[NamedPart](), set[NamedPart]()
         for scene in self._scenes():
             trace = scene.trace.slice(scene.skip, len(scene.trace))
-            columns = [trace.filling, *(is_missing(trace, each) for each in kinds)]
+            columns = [trace.filling, *(is_missing(trace, part) for part in kinds)]
             parts.append(np.stack(columns)[:, self._inside(scene)])
+            members.update(part for part in kinds if _is_classified(trace, part))
+            absent.update(part for part in kinds if _is_absent(trace, part)[self._inside(scene)].any())
         times_ns = self.times_ns()
         filling, *columns = np.concatenate(parts, axis=1)
         own = ~filling
-        pauses = [_gap(None, filling, times_ns, time_ns)] if filling.any() else []
-        found = [(part.shown, each[own]) for part, each in zip(kinds, columns, strict=True)]
-        return (*pauses, *(_gap(name, each, times_ns[own]) for name, each in found if each.any()))
+        gaps = [_gap(None, filling, times_ns, time_ns)] if filling.any() else []
+        for part, missing in zip(kinds, columns, strict=True):
+            if missing[own].any():
+                gap = _gap(part.shown, missing[own], times_ns[own])
+                comes_and_goes = part in members and part in absent
+                gaps.append(replace(gap, window=None) if comes_and_goes else gap)
+        return tuple(gaps)
 
     def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
         """Return (G, T), in which samples each open group has a member, or may have had one."""
@@ -191,6 +198,23 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
     if name not in trace.names:
         return np.ones(len(trace), np.bool_)
     return np.asarray(trace.rows[:, trace.names.index(name)] < 0)
+
+
+def _is_absent(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
+    """Return (T,), in which samples an object does not exist, instead of being unknown."""
+    if part.is_signal or part.name not in trace.names:
+        return np.full(len(trace), not part.is_signal)
+    return np.asarray(trace.rows[:, trace.names.index(part.name)] == ABSENT)
+
+
+def _is_classified(trace: Trace, part: NamedPart) -> bool:
+    """Return whether an object has a class in some sample."""
+    if part.is_signal or part.name not in trace.names:
+        return False
+    rows = trace.rows[:, trace.names.index(part.name)]
+    rows = rows[rows != ABSENT]
+    codes = trace.class_code[np.where(rows < 0, -2 - rows, rows)]
+    return any(trace.classes[code] is not None for code in np.unique(codes).tolist())
 
 
 def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_ns: int = -1) -> Gap:
