@@ -29,7 +29,7 @@ from spatial_replay.monitor.result import RESULT_COLUMNS, SpecResult
 from spatial_replay.monitor.vacuity import Tested, UntestedPart
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed
-from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns
+from spatial_replay.replay.selection import ReplayOptions, Window, window_from_points
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.sources.overview import fitness_of
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
@@ -184,14 +184,10 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
 
 
 def _window(source: Source, conditions: Conditions) -> Window:
-    if conditions.start is None and conditions.end is None:
-        return Window(every=conditions.every)
-    first_ns, whole = first_sample_ns(source), Window()
-    ends = [
-        unbounded if text is None else time_point_from_text(text).absolute_ns(first_ns)
-        for text, unbounded in ((conditions.start, whole.start_ns), (conditions.end, whole.end_ns))
-    ]
-    return Window(ends[0], ends[1], conditions.every)
+    start, end = (
+        None if text is None else time_point_from_text(text) for text in (conditions.start, conditions.end)
+    )
+    return window_from_points(source, start, end, conditions.every)
 
 
 @lru_cache(maxsize=64)

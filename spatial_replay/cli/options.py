@@ -385,8 +385,15 @@ choices_option = click.option(
 )
 
 _CONDITIONS = (
-    click.option("--from", "start", metavar="T", help="Start at the first sample at or after T, such as 2s."),
-    click.option("--to", "end", metavar="T", help="End with the last sample before T."),
+    click.option(
+        "--from",
+        "start",
+        metavar="T",
+        help="Start at the first sample at or after T: 2s, or -5s before the end.",
+    ),
+    click.option(
+        "--to", "end", metavar="T", help="End with the last sample before T: 60s, or -200ms before the end."
+    ),
     click.option(
         "--every",
         metavar="N",
@@ -480,23 +487,18 @@ def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
 
 
 def _window(source: Source, request: EvaluationArguments) -> Window:
-    from spatial_replay.replay.selection import Window, first_sample_ns
+    from spatial_replay.replay.selection import window_from_points
 
-    if request.start is None and request.end is None:
-        return Window(every=request.every)
     with naming_option("--from"):
-        start_point = None if request.start is None else time_point_from_text(request.start)
+        start = None if request.start is None else time_point_from_text(request.start)
     with naming_option("--to"):
-        end_point = None if request.end is None else time_point_from_text(request.end)
-    first_ns = first_sample_ns(source)
-    whole = Window()
-    start_ns = whole.start_ns if start_point is None else start_point.absolute_ns(first_ns)
-    end_ns = whole.end_ns if end_point is None else end_point.absolute_ns(first_ns)
-    if end_ns <= start_ns:
+        end = None if request.end is None else time_point_from_text(request.end)
+    try:
+        return window_from_points(source, start, end, request.every)
+    except UsageError:
         named = (("--from", request.start), ("--to", request.end))
         window = " ".join(f"{name} {text}" for name, text in named if text)
-        raise UsageError(f"the window {window} is empty; --to is the time after its last sample")
-    return Window(start_ns, end_ns, request.every)
+        raise UsageError(f"the window {window} is empty; --to is the time after its last sample") from None
 
 
 def load_spec_options(

@@ -664,12 +664,12 @@ def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:
     """Return the same inputs with a window that ends with the samples at a time."""
-    from spatial_replay.replay.selection import first_sample_ns
+    from spatial_replay.replay.selection import absolute_ns
 
     if at is None:
         return inputs
     with naming_option("--at"):
-        at_ns = time_point_from_text(at).absolute_ns(first_sample_ns(inputs.source))
+        at_ns = absolute_ns(time_point_from_text(at), inputs.source)
     if at_ns < inputs.window.start_ns:
         raise UsageError(f"--at {at} is before --from; no sample is left")
     return replace(inputs, window=replace(inputs.window, end_ns=at_ns + 1))

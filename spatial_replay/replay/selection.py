@@ -47,7 +47,7 @@ from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import Sentence, listed, time_text
-from spatial_replay.trace.trace import FOREVER, Trace, within
+from spatial_replay.trace.trace import FOREVER, TimePoint, Trace, within
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
@@ -184,6 +184,44 @@ def first_sample_ns(source: Source) -> int:
             if len(block.trace):
                 return int(block.trace.times_ns[0])
     raise LogError(f"{source.name} has no sample")
+
+
+def last_sample_ns(source: Source) -> int:
+    """Return the time of a log's last sample; the whole log is read for it.
+
+    Raises:
+        LogError: it has none.
+    """
+    times_ns = [int(block.trace.times_ns[-1]) for block in read_blocks(source.keeping()) if len(block.trace)]
+    if not times_ns:
+        raise LogError(f"{source.name} has no sample")
+    return times_ns[-1]
+
+
+def absolute_ns(point: TimePoint, source: Source) -> int:
+    """Return a time on the clock of a log.
+
+    Raises:
+        LogError: it counts from a sample, and the log has none.
+    """
+    if point.origin == "last sample":
+        return point.absolute_ns(last_ns=last_sample_ns(source))
+    return point.absolute_ns(first_sample_ns(source) if point.origin == "first sample" else 0)
+
+
+def window_from_points(
+    source: Source, start: TimePoint | None, end: TimePoint | None, every: int = 1
+) -> Window:
+    """Return the window from one time to before another; without them, to the ends of the log.
+
+    Raises:
+        UsageError: it is empty.
+        LogError: a time counts from a sample, and the log has none.
+    """
+    whole = Window()
+    start_ns = whole.start_ns if start is None else absolute_ns(start, source)
+    end_ns = whole.end_ns if end is None else absolute_ns(end, source)
+    return Window(start_ns, end_ns, every)
 
 
 def known_start_ns(source: Source) -> int:

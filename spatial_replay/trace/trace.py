@@ -249,20 +249,21 @@ class TimePoint:
     """A time in a log, as people write it.
 
     Attributes:
-        nanoseconds: since the first sample, or since the log's own zero.
-        origin: which of the two.
+        nanoseconds: since the first sample, since the last one (at most 0), or since the log's own zero.
+        origin: which of the three.
     """
 
     nanoseconds: int
-    origin: Literal["first sample", "zero"]
+    origin: Literal["first sample", "last sample", "zero"]
 
-    def absolute_ns(self, first_ns: int) -> int:
-        """Return this time on the clock of a log whose first sample has time `first_ns`."""
-        return first_ns + self.nanoseconds if self.origin == "first sample" else self.nanoseconds
+    def absolute_ns(self, first_ns: int = 0, last_ns: int = 0) -> int:
+        """Return this time on the clock of a log, by the times of its first and last sample."""
+        origins_ns = {"first sample": first_ns, "last sample": last_ns, "zero": 0}
+        return max(0, origins_ns[self.origin] + self.nanoseconds)
 
 
 def time_point_from_text(text: str) -> TimePoint:
-    """Read `12.5s` or `1500ms` after the first sample, `5250000000ns` on the log's clock, or RFC 3339.
+    """Read `12.5s` after the first sample, `-1s` before the last, `5250000000ns` on the clock, or RFC 3339.
 
     The unit of nanoseconds can be left out from 10^12 on.
 
@@ -272,6 +273,8 @@ def time_point_from_text(text: str) -> TimePoint:
     """
     if _DURATION.fullmatch(text):
         return TimePoint(duration_ns_from_text(text), "first sample")
+    if text.startswith("-") and _DURATION.fullmatch(text[1:]):
+        return TimePoint(-duration_ns_from_text(text[1:]), "last sample")
     if absolute := _ABSOLUTE.fullmatch(text):
         if absolute["unit"] is None and int(text) < _LEAST_WITHOUT_UNIT_NS:
             raise UsageError(
@@ -283,7 +286,7 @@ def time_point_from_text(text: str) -> TimePoint:
         return TimePoint(_checked_ns(_ns_from_calendar(calendar, text), text), "zero")
     raise UsageError(
         f"{text!r} is not a time; write 12.5s or 1500ms after the log's first sample, "
-        "5250000000ns on its own clock, or 2026-01-31T12:00:00Z"
+        "-200ms before its last, 5250000000ns on its own clock, or 2026-01-31T12:00:00Z"
     )
 
 

@@ -257,3 +257,23 @@ def test_an_object_that_is_not_in_view_yet_is_unknown(
     document, said = replay(capsys, code=0)
     assert document["log"]["samples"] == 80
     assert "left out" not in said
+
+
+def test_times_may_count_from_the_last_sample(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(
+        folder,
+        PAIR,
+        positions("/robot", range(0, 2_001, 100)),
+        positions("/cart", range(0, 2_001, 100), 0, 6.0),
+    )
+    for window, samples in (
+        (("--to", "-500ms"), 15),
+        (("--from", "-0.5s"), 6),
+        (("--from", "-1s", "--to", "-200ms"), 8),
+    ):
+        assert replay(capsys, *window, code=0)[0]["log"]["samples"] == samples
+    assert run(["explain", "log.mcap", "--mapping", "m.yaml", "--spec", "s.spatial", "--at", "-1s"]) == 4
+    arguments = ["--mapping", "m.yaml", "--spec", "s.spatial", "--to", "-500ms", "-o", "results"]
+    assert run(["batch", "log.mcap", *arguments]) == 0
+    assert run(["replay", "log.mcap", "--mapping", "m.yaml", "--spec", "s.spatial", "--to", "-3h"]) == 2
+    assert "-200ms before its last" in capsys.readouterr().err

@@ -77,7 +77,7 @@ def test_z_means_utc_and_a_blank_can_replace_t() -> None:
         "",
         "soon",
         "12.5",
-        "-1s",
+        "-1",
         "1 s",
         "1e999s",
         "1m",
