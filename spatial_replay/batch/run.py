@@ -8,7 +8,6 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from glob import glob, has_magic
 from os import PathLike
@@ -40,6 +39,7 @@ from spatial_replay.errors import Diagnosis, SpatialReplayError, SpecificationEr
 from spatial_replay.logs.remote import (
     BAG_METADATA,
     RemoteFile,
+    each_ahead,
     is_address,
     local_copy,
     log_file,
@@ -72,6 +72,7 @@ class SpecFile:
         hash: of its meaning, with ids and titles: layout and comments do not count.
         lines: the line of each spec.
         warnings: what `check` warns of.
+        has_plugins: whether its results depend on code, which may import and read any other file.
     """
 
     name: str
@@ -79,6 +80,7 @@ class SpecFile:
     hash: str
     lines: tuple[tuple[str, int], ...]
     warnings: tuple[Diagnostic, ...] = ()
+    has_plugins: bool = False
 
 
 def read_specification_text(path: Path | str) -> SpecificationText:
@@ -97,7 +99,8 @@ def read_specification_text(path: Path | str) -> SpecificationText:
 def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, folder: Path) -> SpecFile:
     """Return a specification file that was read and parsed; paths are shown relative to a folder."""
     lines = tuple(spec_lines(parsed).items())
-    return SpecFile(_shown(path, folder), text, meaning_hash(parsed), lines, parsed.warnings)
+    shown = _shown(path, folder)
+    return SpecFile(shown, text, meaning_hash(parsed), lines, parsed.warnings, bool(parsed.plugins))
 
 
 def meaning_hash(file: Specification) -> str:
@@ -194,12 +197,14 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
         path = folder / text
         if path.is_dir():
             yield from _logs_in(path, folder)
-        elif path.is_file():
+        elif path.exists():
+            # opening what is no regular file is the error of its row
             yield _found(path, folder)
         elif has_magic(text):
             for name in sorted(glob(text, root_dir=folder, recursive=True)):  # noqa: PTH207 - absolute ones, too
-                if (folder / name).is_file() or (folder / name / BAG_METADATA).is_file():
-                    yield _found(folder / name, folder)
+                log = folder / name
+                if (log.exists() and not log.is_dir()) or (log / BAG_METADATA).is_file():
+                    yield _found(log, folder)
     except (OSError, ValueError):
         # a name that cannot be one, such as one with a null character
         return
@@ -288,9 +293,10 @@ def identify(
 
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
     """Return the identity of each log; None if it cannot be read."""
-    at_once = _TOGETHER if any(map(is_address, paths)) else 1
-    with ThreadPoolExecutor(at_once, "identities") as pool:
-        return dict(zip(paths, pool.map(_identity, paths), strict=True))
+    if not any(map(is_address, paths)):
+        # in this thread, which a signal interrupts
+        return {path: _identity(path) for path in paths}
+    return dict(zip(paths, each_ahead(_identity, paths, _TOGETHER), strict=True))
 
 
 def _identity(path: str) -> str | None:
@@ -329,8 +335,10 @@ def _state(path: str) -> str | None:
 
 def _hash_of_log(path: str) -> str:
     files = _files_of(path)
-    if len(files) == 1 and Path(path).is_file():
+    if Path(path).is_file():
         return _hash_of(files[0])
+    if not Path(path).is_dir():
+        raise OSError(f"{path} is no regular file")
     total = hashlib.sha256()
     for each in files:
         total.update(f"{each.name}\0{_hash_of(each)}\0".encode("utf-8", "surrogatepass"))
@@ -553,7 +561,8 @@ def run_batch(
         wanted = _wanted(cases, identities)
         by_state = {states[path] or "": each for path, each in identities.items() if each and states[path]}
         folder.write_identities(by_state)
-        stored, damaged = folder.rows({each.key for each in wanted if each.key is not None})
+        lasting = {each.key for each in wanted if each.key is not None and not each.file.has_plugins}
+        stored, damaged = folder.rows(lasting)
         tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
@@ -564,7 +573,7 @@ def run_batch(
                 is_same = is_address(task.log) or _state(task.log) == states[task.log]
                 for key, rows in zip(tasks[task], result, strict=True):
                     # errors may pass
-                    if is_same and all(row.error is None for row in rows):
+                    if is_same and key in lasting and all(row.error is None for row in rows):
                         new_rows.add(key, rows)
                     else:
                         unstored[key] = rows

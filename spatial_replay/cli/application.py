@@ -10,6 +10,8 @@ import gc
 import os
 import signal
 import sys
+import threading
+import time
 import traceback
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
@@ -158,7 +160,28 @@ def main() -> NoReturn:
     sys.unraisablehook = _interrupt_again
     # little of a short run is garbage, and looking for it a hundred times takes a twentieth of the run
     gc.set_threshold(50_000, 20, 20)
-    sys.exit(run())
+    code = run()
+    if code == ExitCode.INTERRUPTED:
+        _end_waiting_threads(code)
+    sys.exit(code)
+
+
+_PATIENCE_S = 0.5
+"""How long an interrupted program waits for its threads."""
+
+
+def _end_waiting_threads(code: int) -> None:
+    """End the process if a thread waits for something that may never come, such as the data of a pipe."""
+    until_s = time.monotonic() + _PATIENCE_S
+    main_thread = threading.main_thread()
+    threads = [thread for thread in threading.enumerate() if thread is not main_thread and not thread.daemon]
+    for thread in threads:
+        thread.join(max(until_s - time.monotonic(), 0.0))
+    if any(thread.is_alive() for thread in threads):
+        # exiting would wait for it
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 _AGAIN_S = 0.05

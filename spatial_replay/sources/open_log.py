@@ -16,6 +16,7 @@ from functools import partial
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
+from stat import S_ISDIR, S_ISREG
 from typing import NamedTuple, Unpack
 from urllib.parse import quote
 
@@ -124,14 +125,14 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
     Raises:
         UsageError: an address that names no file, or obstore is not installed.
         MissingFileError, RemoteError: the address cannot be read.
-        LogError: the file is too large to be downloaded.
+        LogError: the file is too large to be downloaded, or a named pipe or another that may never end.
     """
     file = log_file(path)
     if isinstance(file, RemoteFile) and (metadata := bag_metadata_at(file)) is not None:
         return downloaded_bag(metadata)
     if not isinstance(file, RemoteFile):
         try:
-            file.stat()
+            _refuse_endless(file)
         except (OSError, ValueError) as error:
             raise MissingFileError.of(path, error) from None
         if file.name == BAG_METADATA and is_bag_folder(file.absolute().parent):
@@ -154,6 +155,22 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
         if not has_summary(stream):
             return downloaded(file, "it has no index, so all of it is read")
     return file
+
+
+def _refuse_endless(path: Path) -> None:
+    """Refuse pipes, sockets and devices: to read one may wait for ever.
+
+    Raises:
+        LogError: it is one, or a folder of a bag holds one.
+        OSError: there is no such file.
+    """
+    mode = path.stat().st_mode
+    inside = [each for each in path.iterdir() if _BAG_FILE.search(each.name)] if S_ISDIR(mode) else []
+    if not (S_ISREG(mode) or S_ISDIR(mode)):
+        raise LogError(f"{path.name} is no regular file but a pipe, a socket or a device; give a file")
+    for file in inside:
+        if file.exists() and not file.is_dir():
+            _refuse_endless(file)
 
 
 def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:

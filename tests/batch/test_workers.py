@@ -18,6 +18,7 @@ import pytest
 import spatial_replay as sr
 from batch.dying import work
 from batch.fleet import command, write_fleet
+from cli.interruptions import interrupted
 from cli.program import PROGRAM, environment
 from spatial_replay.batch.workers import LocalProcesses, WorkerLost
 
@@ -131,6 +132,32 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(fleet: Path, processes: 
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in said) == (130, False), said
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_sigterm_ends_a_batch_whose_workers_wait_for_ever(fleet: Path, jobs: str) -> None:
+    os.mkfifo("never")
+    Path("cell.py").write_text(
+        "from pathlib import Path\n"
+        "def crowd(sample):\n"
+        "    Path('at_work').touch()\n"
+        "    return float(Path('never').read_text())\n"
+        "SIGNALS = {'crowd': crowd}\n"
+    )
+    Path("few.spatial").write_text("use cell\nspec few = G (crowd <= 3)\n")
+    arguments = ["batch", "logs", "--spec", "few.spatial", "--plugin", "cell.py", "--jobs", jobs]
+    code, said = interrupted([*PROGRAM, *arguments], signal.SIGTERM, fleet, Path("at_work").exists)
+    assert (code, "the same command goes on from there" in said) == (130, True), said
+
+
+def test_a_pipe_is_the_error_of_its_log(fleet: Path) -> None:
+    os.mkfifo("logs/pipe.jsonl")
+    whole = command("batch", "logs", "--spec", "gate.spatial", "--jobs", "1")
+    assert (whole.code, "not to be read: logs/pipe.jsonl" in whole.err) == (3, True), whole.err
+    single = command("batch", "logs/pipe.jsonl", "--spec", "gate.spatial", "--jobs", "1")
+    assert (single.code, "pipe.jsonl is no regular file" in single.out) == (3, True), single.err
+    replayed = command("replay", "logs/pipe.jsonl", "--spec", "gate.spatial")
+    assert (replayed.code, "pipe.jsonl is no regular file" in replayed.err) == (3, True)
 
 
 def keys_of_files(folder: Path) -> list[int]:
