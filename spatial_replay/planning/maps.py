@@ -40,7 +40,14 @@ from spatial_replay.spec.formula import (
     TrackedName,
     expand,
 )
-from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, looks_back, terms_of
+from spatial_replay.spec.walks import (
+    base_of,
+    is_about_having_rates,
+    iter_expressions,
+    iter_formulas,
+    looks_back,
+    terms_of,
+)
 from spatial_replay.trace.trace import Sample, Trace
 
 Cube: TypeAlias = tuple[tuple[int, bool], ...]
@@ -336,6 +343,9 @@ def refuse_delays(propositions: Sequence[Formula]) -> None:
     """
     for proposition in propositions:
         for each in iter_formulas(proposition):
+            if is_about_having_rates(each):
+                # the rate itself comes after it
+                continue
             terms = list(terms_of(each.expression)) if isinstance(each, Atom) else []
             terms += [each.group] if isinstance(each, Quantified) else []
             if any(map(looks_back, terms)):

@@ -41,7 +41,7 @@ _bodies = st.sampled_from(
 @examples(80)
 @given(body=_bodies, recording=recordings(max_size=7))
 def test_members_are_judged_as_instances_of_a_template_are_while_they_are_present(body, recording):
-    """New members are left out at their first sample, whoever comes first."""
+    """New members are left out at their first sample."""
     specification = parse_specification(
         f"spec every = G (forall p in all: {body})\nspec own(p) = G (present(p) -> ({body}))\n"
     )

@@ -320,6 +320,8 @@ def test_a_reason_names_a_few_edges_of_many():
 def test_formulas_that_cannot_be_planned_are_refused():
     with pytest.raises(UsageError, match="looks at earlier samples"):
         planner("F (cup moved[1] cup[-3])")
+    with pytest.raises(UsageError, match=r"^speed\(cup\) <= 1 looks at earlier samples"):
+        planner("G (speed(cup) <= 1)")
     with pytest.raises(UsageError, match=r"t\(o\) in <text> is a template"):
         planner("spec t(o) = F (o leftof plate)")
     with pytest.raises(UsageError, match=r"t\(o\) in <text> is a template"):

@@ -70,7 +70,7 @@ class WitnessStep:
 
 @dataclass(frozen=True, slots=True)
 class WhilePresent:
-    """What an unknown formula is if it is asked for only while its objects are in the samples.
+    """The verdict of an unknown formula if it is asked for only while its objects are in the samples.
 
     Attributes:
         names: of these objects.
@@ -250,7 +250,7 @@ def find_witness(
 def _while_present(
     evidence: Evidence, leaves: Floats, times_ns: Integers, node: int, path: DecidingPath
 ) -> WhilePresent | None:
-    """Return what a node is while its objects are present, by the innermost operator on the path to a leaf.
+    """Return the verdict of a node while its objects are present, by the innermost operator of a path.
 
     None where that is unknown, too, or the leaf's objects are in all samples.
     """
