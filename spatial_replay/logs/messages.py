@@ -317,6 +317,7 @@ OWN_PREFIX = "/spatial/"
 """Topics of ours; a log has them in chunks of their own."""
 
 OBJECTS = "/spatial/objects"
+OBJECTS_TYPE = "spatial_replay.ObjectStates"
 SCENE = "/spatial/scene"
 SPECIFICATION = "/spatial/specification"
 FRAME = "/spatial/frame"
@@ -327,10 +328,49 @@ EVENTS = "/spatial/events"
 EVENT_LOG = "/spatial/log"
 RECENT_EVENTS = "/spatial/recent_events"
 
-DERIVED = frozenset(
-    {SCENE, FRAME, SPECIFICATION, STANDING, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG, RECENT_EVENTS}
+_DERIVED_TYPES: Final = MappingProxyType(
+    {
+        SCENE: "foxglove.SceneUpdate",
+        FRAME: "foxglove.FrameTransform",
+        SPECIFICATION: "spatial_replay.Specification",
+        STANDING: "spatial_replay.StandingUpdate",
+        ROBUSTNESS: "spatial_replay.Robustness",
+        AUTOMATON: "spatial_replay.AutomatonState",
+        EVENTS: "foxglove.Event",
+        EVENT_LOG: "foxglove.Log",
+        RECENT_EVENTS: "spatial_replay.RecentEvents",
+    }
 )
+DERIVED = frozenset(_DERIVED_TYPES)
 """Topics computed from the samples and a specification: a replay replaces them."""
+
+
+def has_our_type(channel: Channel) -> bool:
+    """Return whether a channel has the messages that we write on its topic, one of `OBJECTS` or `DERIVED`."""
+    type_name = OBJECTS_TYPE if channel.topic == OBJECTS else _DERIVED_TYPES.get(channel.topic)
+    schema = channel.schema.name if channel.schema else ""
+    return (channel.encoding, schema) == ("protobuf", type_name)
+
+
+ORIGINAL_PREFIX = "/original"
+"""Begins the topic on which a copy has the messages that others wrote on one of our topics."""
+
+
+def copied_channel(channel: Channel) -> Channel:
+    """Return the channel on which a copy has messages that others wrote: not on a topic of ours."""
+    is_ours = channel.topic == OBJECTS or channel.topic in DERIVED
+    return replace(channel, topic=ORIGINAL_PREFIX + channel.topic) if is_ours else channel
+
+
+def remarks_on_copies(name: str, channels: Iterable[Channel]) -> list[str]:
+    """Return remarks on channels of a log that a copy has on another topic."""
+    topics = {channel.topic for channel in channels if copied_channel(channel) != channel}
+    return [
+        f"{name}: a copy has its messages on {topic} on {ORIGINAL_PREFIX}{topic},"
+        " because a replay writes that topic"
+        for topic in sorted(topics)
+    ]
+
 
 CURVES_TOPIC = "/spatial/curves"
 """Curves of the whole log, published by a live server; no file has this topic."""

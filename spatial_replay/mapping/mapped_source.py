@@ -21,16 +21,18 @@ from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, i
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import concatenated, select
 from spatial_replay.logs.messages import (
-    DERIVED,
     MAPPED,
-    OBJECTS,
+    METADATA,
     Attachment,
     Block,
     Channel,
     FileSource,
     Messages,
+    copied_channel,
+    has_our_type,
     is_kept,
     noting_pauses,
+    remarks_on_copies,
 )
 from spatial_replay.logs.read_options import FaultList, late_ns
 from spatial_replay.logs.remote import RemoteFile
@@ -98,7 +100,8 @@ class MappedSource(FileSource):
         plan = self._plan(reader, topics)
         mapped = frozenset(plan.topics)
         kept = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
-        copied = _CopiedMessages(reader.channels(kept))
+        channels = _foreign_channels(reader, kept)
+        copied = _CopiedMessages(channels)
         read = mapped | copied.topics
         first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
         assembler = Assembler(
@@ -118,6 +121,7 @@ class MappedSource(FileSource):
         )
         blocks.remarks.extend(f"{self.name}: {remark}" for remark in plan.remarks)
         blocks.remarks.extend(_unread(self.name, topics, plan))
+        blocks.remarks.extend(remarks_on_copies(self.name, channels.values()))
         files = files_of_bag_around(self.path) if isinstance(self.path, Path) else ()
         if len(files) > 1:
             what = f"one of the {len(files)} files of a bag; give its folder for all of them"
@@ -225,15 +229,16 @@ class _CopiedMessages:
     """Holds raw messages until the samples made of them are ready, and returns them in the order of time."""
 
     def __init__(self, channels: Mapping[int, Channel]) -> None:
+        """Hold nothing yet.
+
+        Args:
+            channels: as the log has them, by the numbers of its columns.
+        """
+        self.topics = frozenset(channel.topic for channel in channels.values())
+        self._numbers = list(channels)
         self._channels = MappingProxyType(
-            {
-                number: channel
-                for number, channel in channels.items()
-                # the topics of our own names are written from the samples
-                if channel.topic != OBJECTS and channel.topic not in DERIVED
-            }
+            {number: copied_channel(channel) for number, channel in channels.items()}
         )
-        self.topics = frozenset(channel.topic for channel in self._channels.values())
         self._waiting: list[MessageColumns] = []
         self._waiting_bytes = 0
 
@@ -243,6 +248,8 @@ class _CopiedMessages:
         Beyond a number of bytes all are returned, because log times and header stamps may be far apart.
         """
         messages = messages.of_topics(self.topics)
+        # a topic may have a channel of ours, too
+        messages = select(messages, np.flatnonzero(np.isin(messages.channel, self._numbers)))
         self._waiting.append(messages)
         self._waiting_bytes += sum(map(len, messages.payloads))
         is_all = last or self._waiting_bytes > _WAITING_BYTES
@@ -266,6 +273,16 @@ def _first_ns(
     named = [topic for topic in topics if topic is not None]
     messages = opened().iter_messages(named, log_ns) if named else ()
     return next((message.log_time_ns for message in messages), None)
+
+
+def _foreign_channels(reader: MessageReader, topics: Collection[str]) -> Mapping[int, Channel]:
+    """Return the channels of some topics, without those that a replay writes from the samples."""
+    channels = reader.channels(topics)
+    ours = [number for number, channel in channels.items() if has_our_type(channel)]
+    # in a log that we did not write, others may have used our topics with our types
+    if ours and METADATA in dict(reader.metadata()):
+        return {number: channel for number, channel in channels.items() if number not in ours}
+    return channels
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:

@@ -17,7 +17,7 @@ from annotate.layouts import layout_of
 from bags.bag_files import SECOND, write_json_mcap
 from spatial_replay import read_trace
 from spatial_replay.cli import run
-from spatial_replay.logs.messages import EVENTS, SCENE, STANDING
+from spatial_replay.logs.messages import EVENT_LOG, EVENTS, OBJECTS, SCENE, STANDING, protobuf_channel
 from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
 
@@ -135,6 +135,45 @@ def test_drone_annotations_are_replayed(
     assert len(kept["specifications"]) > len(dropped["specifications"]) > 0
     assert run(["replay", str(log), "--spec", "turtles.spatial", "--mapping", "turtles.yaml"]) == 2
     assert "--mapping turtles.yaml (mapping='turtles.yaml') does not apply to" in capsys.readouterr().err
+
+
+def test_messages_of_others_on_our_topics_stay_in_every_copy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Topics below /spatial with another encoding than ours, and with the same type."""
+    log, mapping, copy = tmp_path / "drive.mcap", tmp_path / "m.yaml", tmp_path / "copy.mcap"
+    scene = protobuf_channel(SCENE, SceneUpdate)
+    assert scene.schema is not None
+    with log.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(scene.schema.name, "protobuf", scene.schema.data)
+        channels = {topic: writer.register_channel(topic, "json", 0) for topic in (OBJECTS, EVENT_LOG, "/x")}
+        channels[SCENE] = writer.register_channel(SCENE, "protobuf", schema)
+        for n in range(5):
+            for topic, channel in channels.items():
+                payload = b"" if topic == SCENE else json.dumps({"x": n, "y": 0}).encode()
+                writer.add_message(channel, n * 10**8, payload, n * 10**8)
+        writer.finish()
+    mapping.write_text("topics:\n  /spatial/objects: {name: cart, position: [x, y], shape: {disc: 0.2}}\n")
+    specification = "region w = box(9, 0, 10, 1)\nspec clear = G (cart dist w >= 0.5)"
+    assert run(["replay", str(log), "--mapping", str(mapping), "--spec", specification, "-o", str(copy)]) == 0
+    warnings = capsys.readouterr().err
+    for topic in (OBJECTS, EVENT_LOG, SCENE):
+        assert f"on {topic} on /original{topic}" in warnings
+    again = tmp_path / "again.mcap"
+    assert run(["replay", str(copy), "--spec", specification, "-o", str(again)]) == 0
+    for path in (copy, again):
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None and summary.statistics is not None
+        counts = summary.statistics.channel_message_counts
+        originals = {
+            channel.topic: counts[number]
+            for number, channel in summary.channels.items()
+            if channel.topic.startswith("/original")
+        }
+        assert originals == {f"/original{topic}": 5 for topic in (OBJECTS, EVENT_LOG, SCENE)}
 
 
 def test_a_commonroad_scenario_is_replayed(

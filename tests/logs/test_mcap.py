@@ -53,6 +53,7 @@ from spatial_replay.logs.messages import (
 )
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.sources import open_source
 
 SAMPLES = protobuf_channel(OBJECTS, ObjectStates)
@@ -388,7 +389,7 @@ def test_blocks_may_end_within_chunks_of_samples_that_others_overlap(tmp_path):
 def test_all_messages_but_derived_ones_are_copied_as_they_are(log):
     trace = moving_cup(3)
     camera = Channel("/camera", "json", None)
-    derived = Channel(ROBUSTNESS, "json", None)
+    derived = protobuf_channel(ROBUSTNESS, Robustness)
     times = [400_000_000, 0, 800_000_000]
     content = log_of(
         trace, messages(camera, times, [b"{}", b"[]", b"1"]), messages(derived, times, [b""] * 3)
@@ -400,6 +401,15 @@ def test_all_messages_but_derived_ones_are_copied_as_they_are(log):
     assert block.messages.log_time_ns.tolist() == sorted(times * 2)
     assert ROBUSTNESS not in {channel.topic for channel in block.messages.channels.values()}
     assert list(block.messages.payloads[::2]) == encode_objects(trace)
+
+
+def test_messages_of_others_on_our_topics_are_copied_to_other_topics(log):
+    trace = moving_cup(3)
+    theirs = messages(Channel(ROBUSTNESS, "json", None), trace.times_ns, [b"{}", b"[]", b"1"])
+    *blocks, last = open_source(log(log_of(trace, theirs))).iter_blocks()
+    copies = [topic for block in blocks for topic in block.messages.topics]
+    assert sorted(copies) == [*["/original/spatial/robustness"] * 3, *[OBJECTS] * 3]
+    assert "/spatial/robustness on /original/spatial/robustness" in last.remarks[0]
 
 
 def test_samples_of_other_writers_are_read(log):

@@ -50,6 +50,8 @@ from spatial_replay.logs.messages import (
     DERIVED,
     METADATA,
     OBJECTS,
+    OBJECTS_TYPE,
+    ORIGINAL_PREFIX,
     RECOVERY,
     Attachment,
     Block,
@@ -57,8 +59,11 @@ from spatial_replay.logs.messages import (
     FileSource,
     Messages,
     Schema,
+    copied_channel,
+    has_our_type,
     is_kept,
     noting_pauses,
+    remarks_on_copies,
 )
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList
@@ -76,7 +81,6 @@ _AHEAD_BYTES: Final = 2**24
 BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
-_SAMPLES = "spatial_replay.ObjectStates"
 _LEAST_BOUND: Final = 2**20
 """Bytes that a chunk may hold whatever the index says: some writers leave the size out."""
 _LONGEST_HEAD: Final = 80
@@ -223,7 +227,20 @@ def split_records(content: bytes, passed_over: Collection[int] = ()) -> Records:
 class ChunkWalk:
     """The messages of a log by chunk, with the channels that have been declared so far."""
 
-    def __init__(self, stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
+    def __init__(
+        self,
+        stream: BinaryIO,
+        directory: Directory,
+        faults: FaultList,
+        name: str,
+        renamed: Callable[[Channel], Channel] = lambda channel: channel,
+    ) -> None:
+        """Begin with the channels that the directory declares.
+
+        Args:
+            renamed: returns the channel on which to hand out the messages of one.
+        """
+        self._renamed = renamed
         self.stream = stream
         self.faults = faults
         self.name = name
@@ -301,12 +318,13 @@ class ChunkWalk:
     def _declare(self, channel: records.Channel) -> None:
         schema = self._schemas.get(channel.schema_id)
         self._is_declared[channel.id], self._is_objects[channel.id] = True, channel.topic == OBJECTS
-        self.channels[channel.id] = Channel(
+        declared = Channel(
             channel.topic,
             channel.message_encoding,
             Schema(schema.name, schema.encoding, schema.data) if schema else None,
             MappingProxyType(channel.metadata),
         )
+        self.channels[channel.id] = self._renamed(declared)
 
     def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
         """Report what happened to the messages in a place, in words before and after their times."""
@@ -342,7 +360,8 @@ class McapSource(FileSource):
 
         Only chunks that reach into the window are read, if the log has an index.
         """
-        with self.open_walk() as walk:
+        renamed = set[Channel]()
+        with self.open_walk(lambda channel: self._copied(channel, renamed)) as walk:
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
             for messages in _blocks(walk, window, self.is_wanted):
@@ -357,6 +376,7 @@ class McapSource(FileSource):
             if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
                 raise LogError(f"{self.name} holds no sample: {fault}")
             remarks = directory_remarks(self.name, walk.directory, self.metadata())
+            remarks = (*remarks, *remarks_on_copies(self.name, renamed))
             if rest or remarks:
                 yield Block(replace(Trace.from_samples(()), faults=rest), remarks=remarks)
 
@@ -395,14 +415,19 @@ class McapSource(FileSource):
 
     def is_wanted(self, topic: str) -> bool:
         """Return whether the blocks hold messages of a topic."""
-        return topic == OBJECTS or (topic not in DERIVED and is_kept(topic, self.keep, ()))
+        names = {topic, topic.removeprefix(ORIGINAL_PREFIX)}
+        return topic == OBJECTS or (
+            topic not in DERIVED and any(is_kept(name, self.keep, ()) for name in names)
+        )
 
     @contextmanager
-    def open_walk(self) -> Iterator[ChunkWalk]:
+    def open_walk(
+        self, renamed: Callable[[Channel], Channel] = lambda channel: channel
+    ) -> Iterator[ChunkWalk]:
         """Open the file for a walk over its chunks, whose faults begin with those of the index."""
         directory, faults = self._index
         with open_file(self.path) as stream:
-            yield ChunkWalk(stream, directory, deepcopy(faults), self.name)
+            yield ChunkWalk(stream, directory, deepcopy(faults), self.name, renamed)
 
     @cached_property
     def _index(self) -> tuple[Directory, FaultList]:
@@ -419,6 +444,16 @@ class McapSource(FileSource):
             plan_reads(stream, ((offset, offset + length) for offset, length in beside))
             attachments = tuple(iter_attachments(stream, directory, FaultList(), self.name))
             return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
+
+    def _copied(self, channel: Channel, renamed: set[Channel]) -> Channel:
+        """Return the channel that a copy has; collect it if that is on another topic."""
+        copied = copied_channel(channel)
+        # in a log that we did not write, others may have used our topics with our types
+        is_ours = has_our_type(channel) and METADATA in dict(self.metadata())
+        if is_ours or channel.topic == OBJECTS or copied == channel:
+            return channel
+        renamed.add(channel)
+        return copied
 
     def _without_objects(self, walk: ChunkWalk, fault: str | None) -> LogError | UsageError:
         topics = sorted({channel.topic for channel in walk.channels.values()})
@@ -437,8 +472,7 @@ class McapSource(FileSource):
 
 def is_samples(channel: Channel) -> bool:
     """Return whether the messages of a channel are samples of ours."""
-    schema = channel.schema.name if channel.schema else ""
-    return (channel.topic, channel.encoding, schema) == (OBJECTS, "protobuf", _SAMPLES)
+    return channel.topic == OBJECTS and has_our_type(channel)
 
 
 def directory_remarks(
@@ -566,7 +600,7 @@ class _BlockDecoder:
         schema = channel.schema.name if channel.schema else "none"
         raise LogError(
             f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
-            f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
+            f" {channel.encoding!r}; give {OBJECTS_TYPE} in protobuf"
         )
 
     def _fault(self, what: str) -> None:
