@@ -34,6 +34,8 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 
 _LONGEST_TEXT: Final = 60
 """Characters of a node's text in a title."""
+_FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
+"""Beginnings of a cell that spreadsheets evaluate."""
 _Result: TypeAlias = tuple[str, str | None]
 """Name and object of a result."""
 _Node: TypeAlias = tuple[_Result, int]
@@ -241,13 +243,18 @@ def _iter_tables(
         yield TableRows(times_ns, (times_ns - first_ns) / 1e9, numbers, cells)
 
 
+def _text_cell(text: str) -> str:
+    """Return a text with an apostrophe before it if a spreadsheet would take it for a formula."""
+    return f"'{text}" if text.startswith(_FORMULAS) else text
+
+
 @contextmanager
 def _csv_writer(
     stream: Any, titles: Sequence[str], automata: Sequence[str]
 ) -> Iterator[Callable[[TableRows], None]]:
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     rows = csv.writer(text)
-    rows.writerow([*titles, *automata])
+    rows.writerow(map(_text_cell, [*titles, *automata]))
 
     def write(table: TableRows) -> None:
         columns = [table.times_ns.tolist(), table.seconds.tolist(), table.numbers.tolist()]

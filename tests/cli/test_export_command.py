@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import gc
 import sys
 from pathlib import Path
@@ -44,6 +45,16 @@ def test_the_quantity_can_be_chosen(folder: Path) -> None:
     assert run_in_process(["export", "annotated.mcap", "-o", "value.csv"]) == 0
     assert run_in_process(["export", "annotated.mcap", "-o", "upper.csv", "--quantity", "upper"]) == 0
     assert (folder / "upper.csv").read_text() != (folder / "value.csv").read_text()
+
+
+def test_a_title_that_is_a_formula_for_spreadsheets_is_quoted(folder: Path) -> None:
+    spec = 'region goal = box(4, -1, 9, 2)\nspec "=HYPERLINK(1)" = F (cube dist goal >= 99)\n'
+    (folder / "names.spatial").write_text(spec)
+    assert run_in_process(["export", "annotated.mcap", "--spec", "names.spatial", "-o", "run.csv"]) == 0
+    with (folder / "run.csv").open(newline="") as stream:
+        titles, first, *_ = csv.reader(stream)
+    assert {title[:2] for title in titles[2:]} == {"'="}
+    assert float(first[2]) < 0.0
 
 
 @pytest.mark.parametrize(
