@@ -45,6 +45,8 @@ def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
     for ending in endings:
         verdict = Coloured(f"{ending.verdict:<9}", _CHANGE_COLOURS[str(ending.verdict)])
         yield f"  {escaped(ending.spec.name):<{width}}  ", verdict, f"  {_ending_numbers(ending)}"
+        if ending.reason:
+            yield f"  {'':<{width}}  {ending.reason}"
 
 
 def _ending_numbers(ending: Ending) -> str:

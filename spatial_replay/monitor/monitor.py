@@ -25,6 +25,7 @@ from spatial_replay.monitor.sentences import (
     divisor_of,
     how_text,
     missed_text,
+    reason_sentence,
     sentences_of,
     what_was_measured,
     without_residue,
@@ -187,6 +188,7 @@ class Ending(NamedTuple):
         robustness: the value of the root on the samples so far; NaN if it is not determined.
         lower, upper: the ends of the value's interval over the finished log.
         unit: the declared one of these, or "".
+        reason: why it is unknown, as `explain` has it; "" if it is not, or if that was not noted.
     """
 
     spec: NamedSpec
@@ -195,6 +197,7 @@ class Ending(NamedTuple):
     lower: float
     upper: float
     unit: str = ""
+    reason: str = ""
 
 
 @named_arguments
@@ -257,11 +260,26 @@ class Monitor:
         self._awaited = _AwaitedNames(specification, missing_after, strict=strict_names)
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
+        self._unknown: dict[int, Settled] = {}
+
+    def note_unknown(self) -> None:
+        """Note the samples with which results became unknown, for the reasons in `endings`."""
+        if self._violations is None:
+            return
+        for index, final in enumerate(self._live.finals):
+            if final is None or final_verdict(*final[0]) is not Verdict.UNKNOWN:
+                self._unknown.pop(index, None)
+            elif index not in self._unknown:
+                self._unknown[index] = self._violations.unknown(self._specs[index])
 
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends here; unknown before the first sample."""
         known = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
-        return tuple(_ending(spec, final, last, unit) for spec, final, last, unit in known)
+        endings = (_ending(spec, final, last, unit) for spec, final, last, unit in known)
+        return tuple(
+            each._replace(reason=self._unknown[index].reason) if index in self._unknown else each
+            for index, each in enumerate(endings)
+        )
 
     @property
     def names(self) -> Collection[str]:
@@ -498,7 +516,7 @@ class Settled:
     """A verdict that a monitor has seen, with the samples to find its atom in.
 
     Attributes:
-        verdict: permanently satisfied or violated.
+        verdict: permanently satisfied or violated; or unknown, if the run ends there.
         number: the end of the interval that settles it: the lower one of what is satisfied.
         samples: the newest; from `start` on they count, and they are all of them if `is_whole`.
     """
@@ -532,6 +550,8 @@ class Settled:
     def reason(self) -> str:
         """The atom that settled it and by how much, in words; "" if it was not found."""
         found = self.witness
+        if found is not None and self.verdict is Verdict.UNKNOWN:
+            return str(reason_sentence(found, first_ns=self.first_ns))
         if found is None or found.deciding is None:
             return ""
         return _deciding_words(found.deciding, found, self.first_ns)
@@ -542,7 +562,8 @@ class Settled:
         for begin in self._begins():
             found = self._witness_from(begin)
             number = found.upper if self.verdict is Verdict.VIOLATED else found.lower
-            if found.verdict is self.verdict and number == self.number:
+            is_same = self.verdict is Verdict.UNKNOWN or number == self.number
+            if found.verdict is self.verdict and is_same:
                 return found
         return None
 
@@ -570,7 +591,8 @@ class Settled:
         instance = Instance(self.spec, None, self.program, {}, start_ns, FOREVER)
         evidence = Evidence(instance, self.specification.regions, lambda: [trace], self.units)
         leaves = evidence.columns(self.program.leaves)
-        return find_witness(evidence, leaves, evidence.times_ns(), self.conjunct.node, goes_on=True)
+        goes_on = self.verdict is not Verdict.UNKNOWN
+        return find_witness(evidence, leaves, evidence.times_ns(), self.conjunct.node, goes_on=goes_on)
 
 
 def rehearse(specification: Specification) -> None:
@@ -630,6 +652,11 @@ class ViolationLog:
                 whole = Conjunct(0, spec.name, spec.formula)
                 found = self._settled(spec, whole, Verdict.SATISFIED, float(after[0, 2]))
                 self.satisfied = (*self.satisfied, found)
+
+    def unknown(self, spec: NamedSpec) -> Settled:
+        """Return a result that is unknown since the newest sample, if the run ends there."""
+        whole = Conjunct(0, spec.name, spec.formula)
+        return self._settled(spec, whole, Verdict.UNKNOWN, float("nan"))
 
     def _settle(self, spec: NamedSpec, conjuncts: list[Conjunct], numbers: Floats) -> None:
         for conjunct in tuple(conjuncts):
