@@ -621,7 +621,12 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     if gap.name is None:
         place = (Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length)
         others = "" if (gap.first_ns, gap.last_ns) == (begin_ns, end_ns - 1) else ", and at other times"
-        return Sentence("The samples pause from ", *place, f"{others}: `max_gap` makes that unknown.")
+        why = (
+            "`max_gap` makes that unknown"
+            if gap.is_filled
+            else "the connection was lost, or topics were silent"
+        )
+        return Sentence("The samples pause from ", *place, f"{others}: {why}.")
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")
     many = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"

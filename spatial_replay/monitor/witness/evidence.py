@@ -22,7 +22,7 @@ from spatial_replay.trace.trace import ABSENT, Trace, window_of
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """An object or a signal that some samples lack, or a pause of all samples (`max_gap`).
+    """An object or a signal that some samples lack, or a pause of all samples.
 
     Attributes:
         name: of the object, or the signal in quotes; None for a pause, whose samples only fill it.
@@ -31,6 +31,7 @@ class Gap:
         window: the start, and the end (not included), of the samples between missing ones at the ends of a
             log; None if others are missing, and for a member of a class that comes later, or leaves.
         longest_ns: the first sample of the longest stretch without it, and the first one after, if any.
+        is_filled: whether samples fill that stretch to its end, as `max_gap` does: a lost connection has one.
     """
 
     name: str | None
@@ -40,6 +41,7 @@ class Gap:
     last_ns: int
     window: tuple[int | None, int | None] | None
     longest_ns: tuple[int, int]
+    is_filled: bool = False
 
 
 class Evidence:
@@ -236,4 +238,5 @@ def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_
         int(times_ns[ends[-1] - 1]),
         (before, after) if is_at_ends else None,
         (int(longest[0]), int(longest[1])),
+        int(longest[1]) - 1 in times_ns[missing][1:],
     )
