@@ -7,12 +7,14 @@ import gc
 import itertools
 import math
 import time
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
@@ -25,7 +27,7 @@ from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages,
 from spatial_replay.logs.objects import OBJECTS_CHANNEL, decode_objects
 from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.mapping.assemble import LiveAssembler, rehearse
-from spatial_replay.mapping.mapping_file import LogMapping, load_mapping
+from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.mapping.topic_reader import ReadingPlan
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation
@@ -56,7 +58,7 @@ if TYPE_CHECKING:
 class ObjectsAssembler:
     """Decodes samples as they come; what it offers is that of `LiveAssembler`."""
 
-    overdue = 0
+    late = overdue = 0
     jump = None
     topics = (OBJECTS,)
 
@@ -91,6 +93,10 @@ class ObjectsAssembler:
     def due_s(self) -> None:
         """Nothing waits."""
 
+    def flush(self) -> Trace:
+        """Return the samples that wait: none."""
+        return Trace.empty()
+
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
         """Return a sample right after the newest, in which every object is unknown."""
         if self._newest_ns < 0 or not self._classes:
@@ -123,6 +129,7 @@ class SessionStatus:
         samples, messages: evaluated, and received.
         dropped: samples that were dropped because evaluation fell behind.
         messages_dropped: messages that were dropped before they made samples.
+        late: messages that came after the samples of their time.
         overdue: observations whose transforms did not come within `max_delay`.
         delay_s: of the newest sample, from the arrival of its message to its verdict; NaN before.
         time_ns: of the newest sample; None before the first.
@@ -135,6 +142,7 @@ class SessionStatus:
     messages: int
     dropped: int
     messages_dropped: int
+    late: int
     overdue: int
     delay_s: float
     time_ns: int | None
@@ -204,8 +212,17 @@ _OFFER_S: Final = 5.0
 _SETTLE_S: Final = 0.3
 """How long the topics of the mapping may take to be offered; and further ones, such as transforms."""
 
+_STAMPING_SERVERS: Final = frozenset({"foxglove_bridge"})
+"""Servers that give each message the time at which they send it."""
+
 _PAUSE_S: Final = 0.005
 """How long is waited before a log that is full is asked again."""
+
+_USUAL: Final = 9
+"""Intervals between messages of a topic that show which one is usual."""
+
+_GRACE_TURNS: Final = 5
+"""Turns of the loop in which messages that have arrived reach the inbox."""
 
 _TURN_S: Final = 0.02
 """How long samples are evaluated before what has come is taken in."""
@@ -258,6 +275,9 @@ class LiveSession:
         self._offered_s = self._settled_s = math.inf
         self._last_s: dict[str, float] = {}
         self._silent: set[str] = set()
+        self._heard: set[str] = set()
+        self._rare: set[str] = set()
+        self._intervals_s: dict[str, deque[float]] = {}
         self._notes: list[str] = []
         self._missing: tuple[str, ...] = ()
         self._server: str | None = None
@@ -287,6 +307,7 @@ class LiveSession:
             self._messages,
             self._dropped,
             self._early.dropped + (0 if self._inbox is None else self._inbox.dropped),
+            0 if self._assembler is None else self._assembler.late,
             0 if self._assembler is None else self._assembler.overdue,
             self._delay_s,
             self._time_ns,
@@ -392,6 +413,11 @@ class LiveSession:
         with suppress(TimeoutError):
             async with asyncio.timeout(None if due_s == math.inf else due_s - now_s):
                 await inbox.filled.wait()
+        for _ in range(_GRACE_TURNS):
+            # what arrived in time is not late, even if this process was held up
+            if inbox.filled.is_set():
+                break
+            await asyncio.sleep(0)
 
     async def _turn(self, inbox: Inbox) -> AsyncIterator[LiveUpdate]:
         """Take in what has come, and evaluate the samples that are complete."""
@@ -408,8 +434,7 @@ class LiveSession:
                     continue
                 self._messages += 1
                 arrived_s = min(arrived_s, item.arrived_s)
-                self._last_s[topic] = item.arrived_s
-                self._silent.discard(topic)
+                self._note_return(topic, item.arrived_s)
                 messages.append(Message(topic, item.time_ns, item.time_ns, 0, item.payload))
                 continue
             # what came before is evaluated first: afterwards it may be unknown
@@ -420,6 +445,7 @@ class LiveSession:
                 case Connected(server):
                     if self._server is not None:
                         self._notes.append(f"connected again to {self._address}")
+                        self._last_s = dict.fromkeys(self._last_s, time.monotonic())
                     self._server, self._is_connected = server, True
                     self.connected.set()
                     self._offered_s = time.monotonic() + _OFFER_S
@@ -431,6 +457,12 @@ class LiveSession:
                 case Disconnected(reason, at_s):
                     self._is_connected = False
                     self._offered_s = self._settled_s = math.inf
+                    if self._assembler is None:
+                        # the run begins after the pause, so that no value holds on in it
+                        self._early = Inbox()
+                    else:
+                        async for update in self._evaluated(self._assembler.flush(), at_s):
+                            yield update
                     self._notes.append(
                         f"the connection to {self._address} is lost: {reason}; everything is unknown until"
                         " it is back"
@@ -451,6 +483,27 @@ class LiveSession:
             )
             async for update in self._evaluated(self._lose(silent, f"silence on {listed}"), now_s):
                 yield update
+
+    def _note_return(self, topic: str, arrived_s: float) -> None:
+        """Note when a topic has sent a message, and that it did so after silence."""
+        intervals = self._intervals_s.setdefault(topic, deque(maxlen=_USUAL))
+        since_s = arrived_s - self._last_s.get(topic, arrived_s)
+        if topic in self._heard:
+            intervals.append(since_s)
+        self._heard.add(topic)
+        self._last_s[topic] = arrived_s
+        if topic not in self._silent:
+            return
+        self._silent.discard(topic)
+        self._notes.append(f"a message on {topic} again, after {since_s:.3g} s")
+        usual_s = median(intervals) if len(intervals) > 1 else 0.0
+        timeout_s = self._topic_timeout_s or math.inf
+        if usual_s >= timeout_s and topic not in self._rare:
+            self._rare.add(topic)
+            self._notes.append(
+                f"{topic} usually comes every {usual_s:.3g} s: with a timeout of {timeout_s:g} s, what it"
+                " reports is unknown between its messages; give --topic-timeout (topic_timeout_s) more"
+            )
 
     def _add(self, messages: Sequence[Message]) -> Trace | None:
         if self._assembler is None:
@@ -533,6 +586,7 @@ class LiveSession:
                 lambda topic: decoder_of(by_name[topic]),
                 name=self._address,
                 max_delay_s=self._max_delay_s,
+                in_order=self._server in _STAMPING_SERVERS,
             )
             self._planned = {topic: offered[topic] for topic in plan.topics}
             unheard = [
@@ -549,10 +603,23 @@ class LiveSession:
             f"connected to {self._address}{f' ({self._server})' if self._server else ''}:"
             f" {counted(len(self._planned), 'topic')}"
         )
+        if (sampled := self._sampled_by_default()) is not None:
+            self._notes.append(
+                f"samples are taken at {sampled}, the first topic with objects; a bag is sampled at the most"
+                f" frequent one: `sample: {{topic: {sampled}}}` in the mapping takes the same"
+            )
         self._early, early = Inbox(), self._early
         for item in early.take():
             # it has waited for the beginning, not for evaluation that falls behind
             inbox.put(item._replace(arrived_s=now_s) if isinstance(item, Received) else item)
+
+    def _sampled_by_default(self) -> str | None:
+        """Return the topic that is sampled, if a recording of the same topics may be sampled at another."""
+        if self._mapping is None or self._mapping.sampling != Sampling():
+            return None
+        mapped = [entry for entry in self._mapping.topics if entry.topic in self._planned]
+        topics = [entry.topic for entry in mapped if entry.reads_objects] or [entry.topic for entry in mapped]
+        return topics[0] if len(topics) > 1 else None
 
     # ------------------------------------------------------------------------------ evaluating
 
@@ -579,6 +646,8 @@ class LiveSession:
 
     def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
         updates = tuple(monitor.update(sample) for monitor in self._monitors)
+        for monitor in self._monitors:
+            monitor.note_unknown()
         for each in itertools.chain.from_iterable(update.remarks for update in updates):
             if each not in self._remarked:
                 self._remarked.add(each)

@@ -23,7 +23,7 @@ import numpy as np
 from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.bags.reader import DISORDER_NS, JUMP_REMEDY, Message, MessageColumns
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Integers, select
+from spatial_replay.geometry.arrays import Booleans, Integers, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
@@ -304,11 +304,22 @@ class _Assembling:
             ):
                 self._add_transforms(reader, time_ns, log_ns, message)
         if reader.is_mapped or reader.name == self._plan.sampled_topic:
-            # samples up to here are out already: a late message counts from now on
-            times_ns = np.maximum(stamped.times_ns, self._settled_ns + 1)
+            times_ns, counts = self._counting(reader, stamped.times_ns, log_times_ns)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
             sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
-            reader.pending.add((times_ns, sequences, log_times_ns, recorded), stamped.contents)
+            columns = times_ns, sequences, log_times_ns, recorded
+            if counts.all():
+                reader.pending.add(columns, stamped.contents)
+            else:
+                contents = list(compress(stamped.contents, counts.tolist()))
+                reader.pending.add(tuple(column[counts] for column in columns), contents)
+
+    def _counting(
+        self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
+    ) -> tuple[Integers, Booleans]:
+        """Return from when on messages count, and which of them count at all."""
+        # samples up to here are out already: a late message counts from now on
+        return np.maximum(times_ns, self._settled_ns + 1), np.ones(len(times_ns), np.bool_)
 
     def _comes_again(self, last_ns: int) -> bool | None:
         """Return whether the sampled topic goes on after a silence; None if that is not known."""
@@ -328,6 +339,7 @@ class _Assembling:
         if upto_ns <= self._settled_ns:
             return Trace.empty()
         start_ns, end_ns = self._window_ns
+        start_ns = max(start_ns, self._settled_ns + 1)
         # logs contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
             sampled_ns, others_ns = self._tracker.advance(upto_ns)
@@ -661,7 +673,7 @@ class _SampledEnds:
 
 
 _MOMENT_S: Final = 0.001
-"""How long messages of the same time may come one after the other."""
+"""How long messages of the same time may come one after the other, if all come in the order of time."""
 
 _MOST_HELD: Final = 4_096
 """Observations that may wait for transforms at once; beyond that, none does."""
@@ -721,7 +733,16 @@ class _Held(NamedTuple):
 class LiveAssembler(_Assembling):
     """Assembles the samples of a running system; callers pass the time of their clock, `now_s`, in seconds.
 
+    A sample is final when each topic has come as far as its time, or `max_delay_s` after the first message of
+    that time or a later one. So the samples are those of a log of the same messages, however topics
+    interleave within that delay.
+
+    Args:
+        in_order: whether the server gives a message its log time when it sends it, so that messages of all
+            topics arrive in the order of time.
+
     Attributes:
+        late: messages that came after the samples of their time.
         overdue: observations whose transforms did not come in time, so that they are unknown.
         overdue_frame: the topic and the frame of the last of them.
     """
@@ -735,30 +756,32 @@ class LiveAssembler(_Assembling):
         *,
         name: str,
         max_delay_s: float,
+        in_order: bool = False,
         concave: Concave = "decompose",
     ) -> None:
         super().__init__(plan, decoder, name=name, on_time_jump="split", concave=concave)
         self._max_delay_s = max_delay_s
-        self._patience_s = _MOMENT_S if plan.by_log_time else max_delay_s
+        self._is_in_order = in_order and plan.by_log_time
         moving = (each.name for each in plan.planned if each.is_transforms and not each.is_static)
         self._moving = frozenset(moving)
-        # what is sent once and stays is not waited for
+        # a log has the static transforms of all its time
         self._in_step = [
             each.name
             for each in plan.planned
-            if not (each.is_lasting or each.is_latched)
-            and (each.mapping is not None or each.name == plan.sampled_topic)
+            if not each.is_static and (each.mapping is not None or each.name == plan.sampled_topic)
         ]
         self._follows_frames = bool(self._moving) and any(
             each.is_static and each.mapping is not None for each in plan.planned
         )
         self._latest_of = dict.fromkeys((each.name for each in plan.planned), -1)
+        self._back_ns = {name: int(reader.repeats_times) for name, reader in self._readers.items()}
         self._silent: deque[tuple[float, int]] = deque()
         self._patient_ns = -1
         self._held: list[_Held] = []
         self._are_transforms_new = False
         self._lost: set[str] = set()
         self._now_s = 0.0
+        self.late = 0
         self.overdue = 0
         self.overdue_frame: tuple[str, str] | None = None
 
@@ -778,8 +801,10 @@ class LiveAssembler(_Assembling):
         self._lost.difference_update(message.topic for message in messages)
         if messages and not self.is_finished:
             self._add_step(self._columns(messages))
-        if messages and (not self._silent or self._silent[-1][1] < self._newest_ns):
-            self._silent.append((now_s + self._patience_s, self._newest_ns))
+        waited_ns = self._silent[-1][1] if self._silent else max(self._settled_ns, self._patient_ns)
+        if waited_ns < self._newest_ns:
+            patience_s = _MOMENT_S if self._is_in_order else self._max_delay_s
+            self._silent.append((now_s + patience_s, self._newest_ns))
         return self._settle(self._upto_ns(now_s))
 
     def due_s(self) -> float | None:
@@ -790,11 +815,16 @@ class LiveAssembler(_Assembling):
             times.append(self._silent[0][0])
         return min(times, default=None)
 
+    def flush(self) -> Trace:
+        """Return the samples that wait, since no message comes for them any more."""
+        self._held = []
+        return self._settle(self._newest_ns, is_last=True)
+
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
         """Return the samples so far and one right after them, in which what some topics reported is unknown.
 
         Nothing of what they reported holds on: not while a connection is lost, nor after silence. It stays
-        unknown until they report it again.
+        unknown until they report it again. Messages of other topics wait as before.
         """
         gone = set(topics) & set(self._latest_of) - self._lost
         if not gone:
@@ -802,12 +832,12 @@ class LiveAssembler(_Assembling):
         self._now_s = now_s
         self._lost |= gone
         self._held = [each for each in self._held if each.topic not in gone]
-        self._patient_ns = self._newest_ns
-        self._silent.clear()
-        so_far = self._settle(self._newest_ns, is_last=True)
+        gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in gone))
+        so_far = self._settle(max(self._upto_ns(now_s), gone_ns), is_last=True)
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return so_far
+        self._tracker.advance(lost_ns)
         self._tracker.lose(lost_ns, gone)
         if any(self._readers[topic].transforms is not None for topic in gone):
             self._tree.forget_moving()
@@ -819,9 +849,36 @@ class LiveAssembler(_Assembling):
     def _comes_again(self, last_ns: int) -> bool | None:
         return False
 
+    def _counting(
+        self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
+    ) -> tuple[Integers, Booleans]:
+        is_late = times_ns <= self._settled_ns
+        if not is_late.any():
+            return times_ns, ~is_late
+        # the next sample shows it, as in a log, unless a later message of the topic replaces it
+        counts = ~is_late | (times_ns > reader.pending.taken_ns) | reader.repeats_times
+        for time_ns, log_ns, is_shown in zip(
+            times_ns[is_late].tolist(), log_times_ns[is_late].tolist(), counts[is_late].tolist(), strict=True
+        ):
+            self.late += 1
+            remedy = (
+                "the next sample has it" if is_shown else "it is left out, since a later message came before"
+            )
+            behind = (self._settled_ns - time_ns) / 1e9
+            what = f"it came after the samples up to {behind:.3f} s later; {remedy}"
+            self._add_fault(reader.name, log_ns, what)
+            if behind <= self._max_delay_s:
+                self._is_in_order = False
+        return times_ns, counts
+
     def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         name = reader.name
-        self._latest_of[name] = max(self._latest_of[name], int(times_ns.max()))
+        newest_ns = np.maximum.accumulate(np.append(self._latest_of[name], times_ns))
+        self._latest_of[name] = int(newest_ns[-1])
+        back_ns = newest_ns[:-1] - times_ns
+        # what steps back farther comes too late in any case
+        back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
+        self._back_ns[name] = max(self._back_ns[name], int(back_ns.max(initial=-1)) + 1)
         if name in self._moving:
             self._are_transforms_new = True
         if not self._moving or len(self._held) >= _MOST_HELD:
@@ -849,10 +906,10 @@ class LiveAssembler(_Assembling):
     def _upto_ns(self, now_s: float) -> int:
         """Return the time up to which nothing is waited for any more."""
         newest_ns = self._newest_ns
-        # several programs send transforms, often at the same time; another topic has one message at a time
-        reached = (self._latest_of[topic] - (topic in self._moving) for topic in self._in_step)
+        # messages of a topic that has stepped back before may do so again
+        reached = (self._latest_of[topic] - self._back_ns[topic] for topic in self._in_step)
         upto_ns = min(reached, default=newest_ns)
-        if self._plan.by_log_time:
+        if self._is_in_order:
             upto_ns = max(upto_ns, newest_ns - 1)
         while self._silent and self._silent[0][0] <= now_s:
             self._patient_ns = self._silent.popleft()[1]

@@ -88,6 +88,11 @@ class Namer:
         self._is_prepared = False
 
     @property
+    def is_constant(self) -> bool:
+        """Whether all objects get the same name."""
+        return self._template.is_constant or self._template.text == "{topic}"
+
+    @property
     def needs_messages(self) -> bool:
         """Whether names depend on fields of the messages, and not of the objects alone."""
         parts = (path for part in self._template.parts if not isinstance(part, str) for path in part)
@@ -109,7 +114,7 @@ class Namer:
         Raises:
             FieldError: a field of the template is missing, or the name is empty or too long.
         """
-        if self._template.is_constant or self._template.text == "{topic}":
+        if self.is_constant:
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
             return [self._codes[_checked(name or self._topic)]] * len(objects)
         if objects and not self._is_prepared:

@@ -674,6 +674,13 @@ class TopicReader:
         return self.planned.mapping is not None
 
     @property
+    def repeats_times(self) -> bool:
+        """Whether several messages may have one time, as each has objects of its own."""
+        if self.extractor is None or self.planned.layout is None:
+            return self.transforms is not None
+        return not (self.planned.layout.complete or self.extractor.namer.is_constant)
+
+    @property
     def advances_time(self) -> bool:
         """Whether its times show how far the log has come.
 
@@ -709,7 +716,7 @@ class TopicReader:
         if not self._is_stamped and good.any():
             self._is_stamped = True
             first = int(good.argmax())
-            unit = _unit_of_stamp(times[first] or 0, log_times_ns[first])
+            unit = unit_of_stamp(times[first] or 0, log_times_ns[first])
             if unit != "ns":
                 raise self._misfit_error(
                     f"stamps in {unit} are read as ns; write `stamp: {{field: PATH, unit: {unit}}}`"
@@ -897,7 +904,7 @@ class TopicReader:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {reason}")
 
 
-def _unit_of_stamp(stamp: int, log_time_ns: int) -> str:
+def unit_of_stamp(stamp: int, log_time_ns: int) -> str:
     """Return the unit in which a stamp is within an hour of when its message was recorded, else ns."""
     near = (unit for unit, ns in UNITS_NS.items() if abs(stamp * ns - log_time_ns) < 3600 * 10**9)
     return next(near, "ns")
@@ -920,10 +927,12 @@ class PendingMessages:
 
     Attributes:
         first_step: where times step back the first time.
+        taken_ns: the latest time of a message that no longer waits.
     """
 
     def __init__(self, *, has_own_clock: bool) -> None:
         self.first_step: ClockStep | None = None
+        self.taken_ns = -1
         self._has_own_clock = has_own_clock
         self._columns: list[tuple[Integers, Integers, Integers, Integers]] = []
         self._contents: list[Any] = []
@@ -970,6 +979,7 @@ class PendingMessages:
         count = int(np.searchsorted(times, upto_ns, "right"))
         self._columns = [(times[count:], sequences[count:], log_times[count:], recorded[count:])]
         self._contents = contents[count:]
+        self.taken_ns = max(self.taken_ns, int(times[:count].max(initial=-1)))
         return times[:count], log_times[:count], contents[:count]
 
     def _without_steps(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,13 @@ from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, footprints_from_solids
 from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping
 from spatial_replay.mapping.message_types import name_pattern, possible_classes
-from spatial_replay.mapping.topic_reader import PlannedTopic, ReadingPlan, ReportFault, TopicReader
+from spatial_replay.mapping.topic_reader import (
+    PlannedTopic,
+    ReadingPlan,
+    ReportFault,
+    TopicReader,
+    unit_of_stamp,
+)
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.observations import Observations, check_observations
@@ -65,7 +72,8 @@ class Events:
     def after(self, before: Events) -> Events:
         """Join earlier events of the same topic and these."""
         joined = concatenated([before, self])
-        return select(joined, np.argsort(joined.name, kind="stable"))
+        # those of a system that runs may come late
+        return select(joined, np.lexsort((joined.time_ns, joined.name)))
 
     def state(self, times_ns: Integers, max_age_ns: int) -> States:
         """Return the state of all N objects at T times."""
@@ -288,6 +296,9 @@ _OLD_ADVANCES, _OLD_ROWS = 32, 256
 """After so many stretches, or with so many observations, those that no sample needs any more are dropped: not
 after each, for a stretch may be a single message."""
 
+_FAR_NS = 366 * 86_400 * 10**9
+"""A stamp so far from when its message was recorded is of another clock, or in another unit."""
+
 _MOST_NAMES = 8
 """Names listed in one remark."""
 
@@ -328,6 +339,7 @@ class Tracker:
         self._placed_messages: dict[str, Booleans] = {}
         self._begun_ns: dict[str, int] = {}
         self._unplaced_at: dict[str, list[Integers]] = defaultdict(list)
+        self._lost: set[str] = set()
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
@@ -352,6 +364,7 @@ class Tracker:
             is_placed = np.ones(len(times_ns), np.bool_)
             if reader.is_mapped:
                 columns = reader.read(log_times_ns, contents)
+                self._lost.discard(name)
                 times_ns, log_times_ns = times_ns[columns.good], log_times_ns[columns.good]
                 is_placed = np.ones(len(times_ns), np.bool_)
                 if columns.detections is not None and len(times_ns):
@@ -507,6 +520,9 @@ class Tracker:
             at = np.full(len(rows), time_ns, np.int64)
             forever = np.full(len(rows), FOREVER_NS, np.int64)
             self._events[topic] = Events(last.name, at, rows, forever, last.class_code).after(last)
+            # it does not pause, and did not fall silent by itself
+            self._reported.pop(topic, None)
+        self._lost |= set(topics)
         self._signals = {
             key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
             for key, series in self._signals.items()
@@ -653,6 +669,9 @@ class Tracker:
                 )
                 result.put(chosen, between)
                 missing = clock_ns[chosen[~between.known]]
+                if by_stamp and len(missing):
+                    first = int((~between.known).argmax())
+                    self.remarks.stamps.setdefault(reader.name, (int(at[first]), int(log[first])))
                 # those that may be valid in the window
                 start_ns, end_ns = self.window_ns
                 is_near = (missing < end_ns) & (missing >= start_ns - reader.planned.max_age_ns)
@@ -688,7 +707,8 @@ class Tracker:
             state = events.state(times_ns, self.readers[topic].planned.max_age_ns)
             rows, in_gap = state.rows, self._in_gap(topic, times_ns, newest_ns)
             rows[in_gap[:, None] & (rows >= 0)] = STALE
-            for column in np.flatnonzero((rows == STALE).any(axis=0)).tolist():
+            is_stale = (rows == STALE).any(axis=0) & (topic not in self._lost)
+            for column in np.flatnonzero(is_stale).tolist():
                 name = self.names.by_code[int(state.names[column])]
                 self.remarks.count_stale(topic, name, times_ns, rows[:, column] == STALE, in_gap)
             self._place_following(topic, times_ns, state)
@@ -712,7 +732,8 @@ class Tracker:
             in_gap = self._in_gap(topic, times_ns, newest_ns)
             column = np.where((at < 0) | is_old | in_gap, np.nan, values[at])
             name = planned.mapping.signals[index].name
-            unknown.append((topic, name, (at >= 0) & (is_old | in_gap), in_gap))
+            is_stale = (at >= 0) & (is_old | in_gap) & (topic not in self._lost)
+            unknown.append((topic, name, is_stale, in_gap))
             # several topics may report one signal: the first that has a value counts
             first = columns.get(name, np.full(len(times_ns), np.nan))
             reported[name] = np.where(np.isnan(first), reported_ns[at], reported.get(name, times_ns))
@@ -744,6 +765,7 @@ class Remarks:
             longer than `max_gap`, and name.
         replaced: messages that have the time of a later one, by topic.
         skipped: objects without solids, by topic.
+        stamps: the first stamp without a transform, and when its message was recorded, by topic.
         samples, messages: the intervals between samples, and between messages by topic.
         lasting: topics whose messages stay valid, with the reason.
     """
@@ -754,6 +776,7 @@ class Remarks:
         self._texts: list[str] = []
         self.missing, self.stale, self.replaced = _Counts(), _Counts(), _Counts()
         self.skipped: Counter[str] = Counter()
+        self.stamps: dict[str, tuple[int, int]] = {}
         self._frames: set[str] = set()
         self.samples = Pauses()
         self.messages: dict[str, Pauses] = defaultdict(Pauses)
@@ -838,6 +861,8 @@ class Remarks:
                 reason = "its messages name no frame; give one with `frame`"
             elif not is_known:
                 reason = f"no transform to {fixed!r} names the frame {frame!r}"
+            elif topic in self.stamps:
+                reason += _doubt_of_stamp(*self.stamps[topic])
             are = "observation is" if count == 1 else "observations are"
             yield Sentence(
                 f"{topic}: {count} {are} unknown, the first at ", Instant(first_ns, 0), f": {reason}"
@@ -876,6 +901,15 @@ def _unheard(planned: PlannedTopic) -> TopicSpan:
         first_ns=None,
         last_ns=None,
     )
+
+
+def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
+    """Return what is wrong with a stamp that is years from when its message was recorded; "" otherwise."""
+    if abs(stamp_ns - log_ns) < _FAR_NS:
+        return ""
+    year, unit = datetime.fromtimestamp(stamp_ns / 1e9, UTC).year, unit_of_stamp(stamp_ns, log_ns)
+    remedy = "" if unit == "ns" else f": `stamp: {{field: PATH, unit: {unit}}}` reads it in {unit}"
+    return f"; its stamp is {stamp_ns / 1e9:.3g} s, in {year}{remedy}"
 
 
 def _replaced(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:

@@ -12,6 +12,11 @@ from hypothesis import strategies as st
 from examples import examples
 from laws.strategies_monitor import NAMES, WORDS, specifications, tracked_objects
 from spatial_replay import Footprint, Monitor, Sample, Trace, TrackedObject, evaluate, parse_specification
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.bags.reader import Message
+from spatial_replay.mapping.assemble import Assembler, LiveAssembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 PASSERS_BY = (*(f"p{number}" for number in range(5)), "?", "?(0,) 0", "?(1,) 0")
 ANYONE = st.sets(st.sampled_from((*NAMES, *PASSERS_BY)), max_size=6)
@@ -152,3 +157,83 @@ def test_the_closest_of_many_decide_as_all_pairs_do():
     (quick,), (thorough,) = evaluate(closest, trace), evaluate(pairwise, trace)
     assert quick.series.tobytes() == thorough.series.tobytes()
     assert quick.witness().deciding.objects == thorough.witness().deciding.objects
+
+
+ROBOT = """
+clock: {clock}
+max_age: 100ms
+sample: {sample}
+topics:
+  /robot: {{name: robot, position: [x, y], shape: {{disc: 0.1}}, stamp: {{field: t, unit: ns}}}}
+  /people:
+    objects: "of[*]"
+    name: "p{{id}}"
+    position: [x, y]
+    shape: {{disc: 0.2}}
+    stamp: {{field: $.t, unit: ns}}
+  /marks:
+    name: "m{{id}}"
+    position: [x, y]
+    shape: {{disc: 0.3}}
+    stamp: {{field: t, unit: ns}}
+    max_age: forever
+  /charge: {{signals: {{charge: x}}, stamp: {{field: t, unit: ns}}}}
+"""
+TOPICS = ("/robot", "/people", "/marks", "/charge")
+DELAY_S = 0.2
+
+
+@st.composite
+def arrivals(draw):
+    """Messages of several topics, often at equal times, each with when it arrives: within `DELAY_S`, and in
+    the order of its topic."""
+    messages, arrived_ns = [], dict.fromkeys(TOPICS, 0)
+    time_ns = 10**9
+    for _ in range(draw(st.integers(1, 25))):
+        topic = draw(st.sampled_from(["/robot", *TOPICS]))
+        x = draw(st.integers(0, 9)) / 8
+        content = {"x": x, "y": 0, "t": time_ns, "id": draw(st.integers(0, 2))}
+        if topic == "/people":
+            ids = sorted(draw(st.sets(st.integers(0, 2))))
+            content = {"t": time_ns, "of": [{"id": each, "x": x, "y": each} for each in ids]}
+        # a topic has one message at a time, unless each has an object of its own
+        if topic == "/marks" or all(row[:2] != (topic, time_ns) for row in messages):
+            delay_ns = draw(st.sampled_from([0, 0, 1, 30, 199])) * 10**6
+            arrived_ns[topic] = max(arrived_ns[topic] + 1, time_ns + delay_ns)
+            messages.append((topic, time_ns, arrived_ns[topic], content))
+        time_ns += draw(st.sampled_from([0, 0, 5, 20, 60, 300])) * 10**6
+    return messages
+
+
+@examples(150)
+@given(
+    messages=arrivals(),
+    clock=st.sampled_from(["log", "header"]),
+    sample=st.sampled_from(["{topic: /robot}", "{topic: /people}", "{every: 20ms}"]),
+)
+def test_a_live_run_has_the_samples_of_its_log_however_topics_interleave(messages, clock, sample):
+    mapping = parse_mapping(ROBOT.format(clock=clock, sample=sample))
+    contents = [content for *_, content in messages]
+    plan = ReadingPlan.of(mapping, [Topic(topic, "", "json") for topic in TOPICS])
+
+    def decoder(topic):
+        return lambda payload: contents[int(payload)]
+
+    def message(number):
+        topic, time_ns, arrived_ns, _ = messages[number]
+        log_ns = time_ns if clock == "log" else arrived_ns
+        return Message(topic, log_ns, log_ns, 0, str(number).encode())
+
+    order = sorted(range(len(messages)), key=lambda number: messages[number][2])
+    live = LiveAssembler(plan, decoder, name="robot", max_delay_s=DELAY_S)
+    traces = []
+    for number in order:
+        now_s = messages[number][2] / 1e9
+        while (due_s := live.due_s()) is not None and due_s < now_s:
+            traces.append(live.add([], due_s))
+        traces.append(live.add([message(number)], now_s))
+    traces.append(live.finish())
+    log = Assembler(plan, decoder, name="robot.mcap")
+    logged = sorted(map(message, range(len(messages))), key=lambda each: each.log_time_ns)
+    assert Trace.concatenate(traces) == Trace.concatenate([log.add(logged), log.finish()])
+    assert live.late == 0

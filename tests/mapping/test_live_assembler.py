@@ -26,9 +26,12 @@ topics: {/a: {shape: {disc: 1}}}
 """
 
 
-def live(mapping: str, feed: Feed, *, max_delay_s: float = 0.2) -> tuple[LiveAssembler, Feed]:
+def live(
+    mapping: str, feed: Feed, *, max_delay_s: float = 0.2, in_order: bool = False
+) -> tuple[LiveAssembler, Feed]:
     plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics())
-    return LiveAssembler(plan, feed.decoder, name="robot", max_delay_s=max_delay_s), feed
+    assembler = LiveAssembler(plan, feed.decoder, name="robot", max_delay_s=max_delay_s, in_order=in_order)
+    return assembler, feed
 
 
 @st.composite
@@ -68,11 +71,32 @@ def test_a_sample_is_there_with_the_message_that_completes_it() -> None:
     assert len(assembler.add([first], 1.0)) == 0
     assert len(assembler.add([second], 1.001)) == 0
     assert len(assembler.add([third], 1.0012)) == 1
+    for in_order, most_s in ((True, 1.002), (False, 1.2)):
+        assembler, _ = live(TWO, feed, in_order=in_order)
+        assembler.add([first, second], 1.0)
+        due_s = assembler.due_s()
+        assert due_s is not None and due_s <= most_s
+        assert len(assembler.add([], due_s)) == 1
+
+
+def test_a_message_that_comes_too_late_is_counted_and_makes_no_sample() -> None:
+    feed = Feed().add("/b", SECOND, pose_stamped(0, 0)).add("/a", SECOND, pose_stamped(1, 0))
+    feed.add("/a", SECOND + 100 * MS, pose_stamped(2, 0)).add("/b", SECOND + 100 * MS, pose_stamped(3, 0))
+    first, late, *later = feed.raw()
     assembler, _ = live(TWO, feed)
-    assembler.add([first, second], 1.0)
-    due_s = assembler.due_s()
-    assert due_s is not None and due_s <= 1.002
-    assert len(assembler.add([], due_s)) == 1
+    traces = [assembler.add([first], 1.0), assembler.add([], 1.2), assembler.add([late], 1.201)]
+    traces.append(assembler.add(later, 1.21))
+    whole = make(TWO, feed).trace
+    assert Trace.concatenate(traces) == whole.slice(1, 2) and assembler.late == 1
+    [said] = assembler.take_faults()
+    assert "/a at 1.000 s: it came after" in str(said)
+    # a server that does not keep the order of time is waited for from then on
+    assembler, _ = live(TWO, feed, in_order=True)
+    assembler.add([first], 1.0)
+    assembler.add([], 1.001)
+    assembler.add([late], 1.002)
+    assembler.add(later[:1], 1.1)
+    assert assembler.due_s() == 1.1 + 0.2
 
 
 def test_an_observation_waits_for_its_transform_and_then_is_unknown() -> None:
@@ -126,3 +150,13 @@ def test_a_clock_that_steps_back_gives_the_same_samples_while_it_comes() -> None
     whole = make(FRAMED, feed)
     assert Trace.concatenate([*traces, assembler.finish()]) == whole.trace
     assert whole.states("a") == 30 * "+" + 4 * "?" + 26 * "+"
+
+
+def test_a_stamp_in_another_unit_is_told_by_its_value() -> None:
+    feed = Feed()
+    for tick in range(3):
+        at = 1_790_000_000 * SECOND + tick * SECOND
+        feed.add("/tf", at, tf(transform("map", "cam", (tick, 0, 0), time_ns=at)))
+        feed.add("/a", at + MS, pose_stamped(0, 0, "cam", time_ns=at // 10**9))
+    [remark] = make(FRAMED, feed).remarks
+    assert "its stamp is 1.79 s, in 1970: `stamp: {field: PATH, unit: s}` reads it in s" in remark
