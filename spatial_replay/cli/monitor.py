@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from spatial_replay.spec.formula import Specification
 
 _STATUS_S: Final = 0.5
+_GONE_S: Final = 30.0
+"""With --until, the run ends if the server is away for so long."""
 _UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
 
 
@@ -85,7 +88,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
 @click.option(
     "--until",
     type=click.Choice(["violated", "satisfied", "settled"]),
-    help="End when any is violated, all are satisfied, or each is decided.",
+    help="End when any is violated, all are satisfied, or each is decided; or none can be.",
 )
 @click.option(
     "--topic-timeout",
@@ -205,6 +208,8 @@ def monitor(
             raise UsageError(f"{option} is 0; give it a length, as in {option} 2s")
     files = load_spec_options(specs, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
+    if until == "satisfied":
+        _refuse_endless(files)
     mapping = None if mapping_file is None else load_mapping(mapping_file)
     if layout:
         show_file(layout_of_run(files, mapping))
@@ -241,6 +246,19 @@ def monitor(
     if output is not None:
         show(f"wrote {output}")
     return run.exit_code
+
+
+def _refuse_endless(files: Sequence[Specification]) -> None:
+    """Refuse to wait until specs are satisfied that a run can violate as long as it goes on."""
+    from spatial_replay.spec.walks import can_settle
+
+    specs = [spec for file in files for spec in file.results]
+    endless = [spec.name for spec in specs if not can_settle(spec.formula, satisfied=True)]
+    if endless:
+        raise UsageError(
+            f"--until satisfied: {', '.join(endless)} can be violated as long as the run goes on; give"
+            " --for T, --until violated, or a file without it"
+        )
 
 
 def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
@@ -321,6 +339,11 @@ class _Run:
     ) -> None:
         self._session, self._recorders = session, recorders
         self._length_s, self._until = length_s, until
+        from spatial_replay.spec.walks import horizon_ns
+
+        specs = [spec for file in session.files for spec in file.results]
+        # a spec that is pending after its horizon stays unknown
+        self._horizons_ns = [horizon_ns(spec.formula) for spec in specs]
         self._status = StatusLine()
         self.first_ns = 0
         self._verdicts: list[str] = []
@@ -386,7 +409,7 @@ class _Run:
     async def _tick(self) -> None:
         """Write the status line, and what happens without a sample."""
         before, then_s = self._session.status, time.monotonic()
-        rate = 0.0
+        rate, connected_s = 0.0, math.inf
         while True:
             await asyncio.sleep(_STATUS_S)
             status, now_s = self._session.status, time.monotonic()
@@ -396,6 +419,12 @@ class _Run:
             rate += 0.5 * ((status.samples - before.samples) / (now_s - then_s) - rate)
             before, then_s = status, now_s
             self._status.show(self._status_text(rate))
+            connected_s = now_s if status.is_connected else connected_s
+            if self._until is not None and now_s - connected_s > _GONE_S:
+                self._print(
+                    f"  the server has been away for {_GONE_S:g} s: the run ends before `{self._until}`"
+                )
+                self._session.stop()
 
     def _status_text(self, rate: float) -> str:
         status = self._session.status
@@ -410,6 +439,8 @@ class _Run:
         parts.append(f"dropped {status.dropped}")
         if status.messages_dropped:
             parts.append(f"messages dropped {status.messages_dropped}")
+        if status.late:
+            parts.append(f"late {status.late}")
         if status.overdue:
             parts.append(f"without transforms {status.overdue}")
         return "   ".join(parts)
@@ -422,13 +453,19 @@ class _Run:
 
     def _is_over(self, update: LiveUpdate) -> bool:
         verdicts = {str(spec.verdict) for spec in update.specs}
+        elapsed_ns = update.time_ns - self.first_ns
+        specs = zip(update.specs, self._horizons_ns, strict=True)
+        pending = [elapsed_ns <= horizon for spec, horizon in specs if str(spec.verdict) == "pending"]
+        is_open = any(pending)
+        if not all(pending):
+            verdicts.add("unknown")
         match self._until:
             case "violated":
-                return "violated" in verdicts
+                return "violated" in verdicts or not is_open
             case "satisfied":
-                return verdicts == {"satisfied"}
+                return not (is_open and verdicts.isdisjoint({"violated", "unknown"}))
             case "settled":
-                return "pending" not in verdicts
+                return not is_open
         return False
 
     def _show_end(self) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from math import inf
 from typing import Any, Literal
 
 from spatial_replay.spec.format import format_number, format_relation, format_term
@@ -320,6 +321,40 @@ def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
 # -------------------------------------------------------------------------------------- substitution
 
 Names = Mapping[str, TrackedName | Variable]
+
+
+def horizon_ns(formula: Formula) -> float:
+    """Return how long after its sample a formula depends on others; inf if that is not bounded in time."""
+    longest_ns = max(map(horizon_ns, operands_of(formula)), default=0.0)
+    if not isinstance(formula, Temporal) or formula.operator not in FUTURE_OPERATORS:
+        return longest_ns
+    bound = formula.bound
+    if bound is None or bound.upper is None or bound.unit != "ns":
+        return inf
+    return longest_ns + bound.upper
+
+
+def can_settle(formula: Formula, *, satisfied: bool) -> bool:
+    """Return False if no prefix of a run can permanently satisfy, or violate, a formula.
+
+    True where that is not plain from its operators.
+    """
+    match formula:
+        case Boolean(operator="not", operands=(operand,)):
+            return can_settle(operand, satisfied=not satisfied)
+        case Boolean(operator="and" | "or" as operator, operands=operands):
+            needs_all = (operator == "and") == satisfied
+            return (all if needs_all else any)(can_settle(each, satisfied=satisfied) for each in operands)
+        case Temporal(operator="G" | "F" as operator, operands=(operand,), bound=bound):
+            is_open = bound is None or bound.upper is None
+            if is_open and (operator == "G") == satisfied:
+                return isinstance(operand, Truth)
+            return can_settle(operand, satisfied=satisfied)
+        case (
+            Boolean(operator="spec", operands=(operand,)) | Temporal(operator="X" | "WX", operands=(operand,))
+        ):
+            return can_settle(operand, satisfied=satisfied)
+    return True
 
 
 def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELATION_NAMES) -> Formula:

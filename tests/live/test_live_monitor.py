@@ -709,3 +709,99 @@ def test_a_name_that_the_robot_does_not_report_is_noted_once(tmp_path: Path) -> 
         driving.join()
     notes = [note for each in found for note in each.notes if "robto" in note]
     assert len(notes) == 1 and "in its first 5.000 s; did you mean 'robot'?" in notes[0]
+
+
+def test_a_topic_that_comes_after_another_of_the_same_time_makes_samples_of_that_time(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, "spec clear = G (robot dist vase >= 0.5)")
+    with robot() as own:
+
+        def drive_apart() -> None:
+            until(own.is_heard)
+            for tick in range(30):
+                own.send("/vase", tick * 50 * MS, x=0.0, y=0.0)
+                time.sleep(0.005)
+                own.send("/robot", tick * 50 * MS, x=2.0, y=0.0)
+                time.sleep(0.02)
+
+        driving = threading.Thread(target=drive_apart)
+        driving.start()
+        found = asyncio.run(updates_of(own.address, spec, mapped, 30))
+        driving.join()
+    assert [each.time_ns for each in found] == [tick * 50 * MS for tick in range(30)]
+    assert all(set(each.sample.objects) == {"robot", "vase"} for each in found)
+
+
+@pytest.mark.parametrize(
+    ("formula", "until", "code", "said"),
+    [
+        ("F[0s, 50ms] (robot dist vase >= 9)", "satisfied", 1, "goal  violated"),
+        ("F[0s, 50ms] (robot dist door >= 9)", "satisfied", 4, "goal  unknown"),
+        ("F[0s, 50ms] (robot dist vase >= 1)", "violated", 0, "goal  satisfied"),
+    ],
+)
+def test_a_run_ends_when_what_it_waits_for_cannot_come(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], formula: str, until: str, code: int, said: str
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, f"spec goal = {formula}")
+    sent = [pose(number, tick, 2.0 * (number == 1)) for tick in range(30) for number in (2, 1)]
+    with rude_server(*sent) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "--until", until]
+        assert run(command) == code
+    assert said in capsys.readouterr().out
+
+
+def test_waiting_for_what_no_run_satisfies_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    command = ["monitor", "ws://127.0.0.1:9", "--mapping", str(mapped), "--spec", str(spec)]
+    assert run([*command, "--until", "satisfied"]) == 2
+    assert "--until satisfied: clear can be violated as long as the run goes on" in capsys.readouterr().err
+
+
+def test_the_reason_of_an_unknown_result_is_printed_at_the_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(
+        tmp_path, MAPPING, "spec clear = G (robot dist vase >= 0.5)\nspec seen = F (robot dist vase >= 9)"
+    )
+    output = tmp_path / "live.mcap"
+    sent = [pose(number, tick, 2.0 * (number == 1)) for tick in range(20) for number in (2, 1)]
+    with rude_server(*sent[:10], breaks_off=True) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "-o", str(output)]
+        assert run([*command, "--for", "1s"]) == 4
+    said = capsys.readouterr().out
+    [reason] = [
+        line.strip() for line in said.splitlines() if "`robot dist vase >= 0.5` is unknown at" in line
+    ]
+    assert run(["replay", str(output), "--spec", str(spec)]) == 4
+    explained = capsys.readouterr().out
+    assert reason.removesuffix(".") in explained
+    assert "The samples pause from 0.040 s" in explained and "the connection was lost" in explained
+    assert "max_gap" not in said + explained
+
+
+def test_a_topic_that_is_rarer_than_its_timeout_is_said(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    with robot() as own:
+
+        def drive_slowly() -> None:
+            until(own.is_heard)
+            for tick in range(80):
+                if tick % 20 == 0:
+                    own.send("/vase", tick * 10 * MS, x=0.0, y=0.0)
+                own.send("/robot", tick * 10 * MS + 1, x=2.0, y=0.0)
+                time.sleep(0.02)
+
+        driving = threading.Thread(target=drive_slowly)
+        driving.start()
+        found = asyncio.run(
+            updates_of(
+                own.address, spec, mapped, lambda each: each.time_ns > 79 * 10 * MS, topic_timeout_s=0.2
+            )
+        )
+        driving.join()
+    notes = [note for each in found for note in each.notes]
+    assert any("no message on /vase for 0.2 s" in note for note in notes)
+    assert any("a message on /vase again, after" in note for note in notes)
+    assert len([note for note in notes if "/vase usually comes every" in note]) == 1
