@@ -307,12 +307,8 @@ class _Assembling:
             times_ns, counts = self._counting(reader, stamped.times_ns, log_times_ns)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
             sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
-            columns = times_ns, sequences, log_times_ns, recorded
-            if counts.all():
-                reader.pending.add(columns, stamped.contents)
-            else:
-                contents = list(compress(stamped.contents, counts.tolist()))
-                reader.pending.add(tuple(column[counts] for column in columns), contents)
+            columns = times_ns[counts], sequences[counts], log_times_ns[counts], recorded[counts]
+            reader.pending.add(columns, list(compress(stamped.contents, counts.tolist())))
 
     def _counting(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
