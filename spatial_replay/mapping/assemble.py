@@ -331,7 +331,9 @@ class _Assembling:
             LogError, UsageError: as `Assembler.add`.
         """
         newest_ns = max(self._newest_ns, self._latest_ns)
-        upto_ns = self._sampled_ends.limit(upto_ns, newest_ns, self._comes_again, is_last=is_last)
+        # while a system runs, messages from before its newest one may still come
+        known_ns = upto_ns if self._is_live else newest_ns
+        upto_ns = self._sampled_ends.limit(upto_ns, known_ns, self._comes_again, is_last=is_last)
         if upto_ns <= self._settled_ns:
             return Trace.empty()
         start_ns, end_ns = self._window_ns
