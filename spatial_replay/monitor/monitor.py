@@ -218,6 +218,8 @@ class Monitor:
         units: Mapping[str, str] | None = None,
         missing_after: str | int | None = "5s",
         strict_names: bool = False,
+        wait_for: Collection[str] = (),
+        start_within: str | None = "1s",
     ) -> None:
         """Start before the first sample, with everything compiled: the first time on a machine, that takes
         many seconds.
@@ -228,10 +230,14 @@ class Monitor:
             missing_after: a time ("5s") or a number of samples; updates after it warn of each object and
                 signal that has never come so far. None for no warnings.
             strict_names: a missing name is an error of `update` then.
+            wait_for: names of objects and signals; evaluation begins at the first sample by which each of
+                them has come. Samples before it are not evaluated.
+            start_within: a time ("1s") after the first sample; evaluation begins then without those that are
+                missing (`late`). None to wait for them as long as it takes.
 
         Raises:
-            UsageError: not a specification, unknown semantics, an invalid start, units that are not texts, or
-                a template, whose objects are not known yet.
+            UsageError: not a specification, unknown semantics, an invalid start, units that are not texts,
+                names that are not texts, or a template, whose objects are not known yet.
         """
         require_specification(specification)
         checked = checked_semantics(semantics, [specification])
@@ -258,6 +264,7 @@ class Monitor:
         self._live = LiveStream(specification, checked, start_ns or 0)
         self._violations = ViolationLog(specification, start_ns or 0, known) if checked == "ltlf" else None
         self._awaited = _AwaitedNames(specification, missing_after, strict=strict_names)
+        self._start = _Start(wait_for, start_within)
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
         self._unknown: dict[int, Settled] = {}
@@ -271,6 +278,16 @@ class Monitor:
                 self._unknown.pop(index, None)
             elif index not in self._unknown:
                 self._unknown[index] = self._violations.unknown(self._specs[index])
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Time of the first evaluated sample; None before it."""
+        return self._start.begin_ns
+
+    @property
+    def late(self) -> tuple[str, ...]:
+        """The names of `wait_for` that had not come when evaluation began."""
+        return tuple(sorted(self._start.missing)) if self._start.begin_ns is not None else ()
 
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends here; unknown before the first sample."""
@@ -318,6 +335,8 @@ class Monitor:
             )
         remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
         self._last_ns = time_ns
+        if not self._start.has_begun(sample):
+            return Update(time_ns, self._numbers, self._monitored, remarks=remarks)
         self._numbers = numbers = self._live.extend(sample)
         settled: tuple[Settled, ...] = ()
         satisfied: tuple[Settled, ...] = ()
@@ -325,6 +344,38 @@ class Monitor:
             self._violations.extend(sample, numbers)
             settled, satisfied = self._violations.settled, self._violations.satisfied
         return Update(time_ns, numbers, self._monitored, settled, satisfied, remarks)
+
+
+class _Start:
+    """Decides at which sample evaluation begins.
+
+    Attributes:
+        begin_ns: time of that sample; None before it.
+        missing: the names that are still to come.
+    """
+
+    def __init__(self, wait_for: Collection[str], within: str | None) -> None:
+        names = [] if isinstance(wait_for, str) else list(wait_for)
+        if isinstance(wait_for, str) or not all(isinstance(name, str) for name in names):
+            remedy = "give a list of names, such as ['cup', 'battery']"
+            raise UsageError(f"wait_for is {shortened(wait_for)}; {remedy}")
+        if within is not None and not isinstance(within, str):
+            raise UsageError(f"start_within is {shortened(within)}; give a time such as '1s', or None")
+        self.missing = set(names)
+        self.begin_ns: int | None = None
+        self._within_ns = None if within is None else duration_ns_from_text(within)
+        self._first_ns: int | None = None
+
+    def has_begun(self, sample: Sample) -> bool:
+        """Return whether a sample is evaluated; samples come in the order of their times."""
+        if self.begin_ns is not None:
+            return True
+        self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
+        self.missing -= {*sample.objects, *sample.signals}
+        waited_ns = sample.time_ns - self._first_ns
+        if not self.missing or (self._within_ns is not None and waited_ns > self._within_ns):
+            self.begin_ns = sample.time_ns
+        return self.begin_ns is not None
 
 
 class _AwaitedNames:

@@ -114,6 +114,36 @@ def test_a_name_that_does_not_come_is_remarked_with_the_nearest_one(after: str |
     assert not monitor.update(at(7, charge=1)).remarks
 
 
+def test_evaluation_begins_when_awaited_names_have_come() -> None:
+    specification = parse_specification("spec apart = G (cube dist vase >= 1 and charge >= 0.2)")
+    objects = {name: Footprint.disc(place, 0, 0) for place, name in enumerate(("cube", "vase"))}
+    tenths = [
+        Sample(
+            at * SECOND // 10,
+            objects if at >= 3 else {"cube": objects["cube"]},
+            {"charge": 0.5} if at >= 2 else {},
+        )
+        for at in range(30)
+    ]
+    plain, waiting = Monitor(specification), Monitor(specification, wait_for=["vase", "charge"])
+    for sample in tenths:
+        plain.update(sample)
+        waiting.update(sample)
+    assert plain.endings()[0].verdict == "unknown"
+    assert waiting.endings()[0].verdict == "satisfied"
+    assert (waiting.begin_ns, waiting.late) == (3 * SECOND // 10, ())
+    # what does not come in time is not waited for, and is named
+    late = Monitor(specification, wait_for=["vase", "robot"], start_within="1s")
+    for sample in tenths:
+        late.update(sample)
+    assert (late.begin_ns, late.late) == (11 * SECOND // 10, ("robot",))
+    patient = Monitor(specification, wait_for=["robot"], start_within=None)
+    assert patient.update(tenths[-1]).verdict == "pending"
+    assert patient.begin_ns is None
+    with pytest.raises(UsageError, match=r"wait_for is 'vase'; give a list of names"):
+        Monitor(specification, wait_for="vase")
+
+
 def test_names_are_awaited_for_a_time_or_a_number_of_samples() -> None:
     specification = parse_specification("G p >= 0")
     assert Monitor(specification, missing_after=None).update(at(99, q=1)).remarks == ()
