@@ -592,7 +592,9 @@ class TagObserver:
                 poses.append((abs(frame.time_ns - time_ns), found))
             views.append(view)
         objects = dict(self._located(poses))
-        sample = Sample(time_ns, {**objects, **self._held(time_ns, objects)}, unknown=self._hidden)
+        held = self._held(time_ns, objects)
+        reported_ns = {name: self._last[name][0] for name in held}
+        sample = Sample(time_ns, {**objects, **held}, unknown=self._hidden, reported_ns=reported_ns)
         return Observation(sample, tuple(views))
 
     # ------------------------------------------------------------------------------------- the objects
