@@ -22,7 +22,7 @@ from spatial_replay.geometry.arrays import Integers, concatenated, equal_places,
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.logs.remote import LogFile, each_ahead
 from spatial_replay.text import Sentence, encodable
-from spatial_replay.trace.trace import LATEST_NS, Pauses, Sample, Trace, within
+from spatial_replay.trace.trace import LATEST_NS, Pauses, ReportsBack, Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 if TYPE_CHECKING:
@@ -270,21 +270,24 @@ IterBlocks = Callable[..., Iterator[Block]]
 
 
 def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
-    """Let `iter_blocks` of a source remark pauses at the end, and fill those longer than its `max_gap_ns`."""
+    """Let `iter_blocks` of a source remark pauses and steps back, and fill pauses beyond its `max_gap_ns`."""
 
     @wraps(iter_blocks)
     def wrapped(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        pauses, before = Pauses(), Trace.empty()
+        pauses, reports, before = Pauses(), ReportsBack(), Trace.empty()
         for block in iter_blocks(self, start_ns, end_ns):
             trace = block.trace
             pauses.add(trace.times_ns)
+            reports.add(trace)
             if self.max_gap_ns is not None and len(trace):
                 block = replace(block, trace=_without_gaps(before, trace, self.max_gap_ns))
                 before = trace.slice(len(trace) - 1, len(trace))
             yield block
-        remark = pauses.remark("samples", self.max_gap_ns)
-        if remark is not None:
-            yield Block(Trace.empty(), remarks=(Sentence(f"{self.name}: ", remark),))
+        pause = pauses.remark("samples", self.max_gap_ns)
+        remarks = [*([] if pause is None else [pause]), *reports.remarks()]
+        if remarks:
+            said = tuple(Sentence(f"{self.name}: ", remark) for remark in remarks)
+            yield Block(Trace.empty(), remarks=said)
 
     return wrapped
 
@@ -307,7 +310,16 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
         steps = np.union1d(np.arange(first_ns + step_ns, next_ns, step_ns), [first_ns + 1, next_ns - 1])
         rows = np.repeat(np.where(last.rows >= 0, -2 - last.rows, last.rows), len(steps), axis=0)
         signals = {name: np.full(len(steps), np.nan) for name in last.signals}
-        unknown = replace(last, times_ns=steps, rows=rows, signals=signals, faults=(), remarks=())
+        unknown = replace(
+            last,
+            times_ns=steps,
+            rows=rows,
+            signals=signals,
+            reported_ns=None,
+            signals_reported_ns={},
+            faults=(),
+            remarks=(),
+        )
         parts += [trace.slice(done, begin), unknown]
         done = begin
     return Trace.concatenate([*parts, trace.slice(done, len(trace))]) if gaps else trace

@@ -862,3 +862,36 @@ class Pauses:
         if max_gap_ns is not None and found[0][1] > max_gap_ns:
             unknown = f"what lies in a pause of more than {max_gap_ns / 1e9:g} s is unknown (`max_gap`)"
         return Sentence(f"{what} pause ", *parts, f"{others}{usual}; {unknown}")
+
+
+class ReportsBack:
+    """Counts reports that are earlier than the last other one of their object or signal."""
+
+    def __init__(self) -> None:
+        self._last = Trace.empty()
+        self._counts: dict[str, tuple[int, int]] = {}
+
+    def add(self, trace: Trace) -> None:
+        """Add samples, which follow those before."""
+        before, self._last = self._last, trace.slice(len(trace) - 1, len(trace)) if len(trace) else self._last
+        if any(part.reported_ns is not None or part.signals_reported_ns for part in (before, trace)):
+            joined = Trace.concatenate([before, trace])
+            if joined.reported_ns is not None:
+                for name, rows, times in zip(joined.names, joined.rows.T, joined.reported_ns.T, strict=True):
+                    self._count(name, rows >= 0, times, joined.times_ns)
+            for name, times in joined.signals_reported_ns.items():
+                self._count(name, np.isfinite(joined.signals[name]), times, joined.times_ns)
+
+    def _count(self, name: str, known: NDArray[np.bool_], reported_ns: Integers, times_ns: Integers) -> None:
+        back = np.flatnonzero(known[1:] & known[:-1] & (reported_ns[1:] < reported_ns[:-1])) + 1
+        if len(back):
+            count, first_ns = self._counts.get(name, (0, int(times_ns[back[0]])))
+            self._counts[name] = count + len(back), first_ns
+
+    def remarks(self) -> Iterator[Sentence]:
+        """Yield a sentence on each object or signal whose reports step back."""
+        for name, (count, first_ns) in sorted(self._counts.items()):
+            reports = f"report of {name} is" if count == 1 else f"reports of {name} are"
+            first = Instant(first_ns, 0)
+            what = ": there is no rate of change there"
+            yield Sentence(f"{count} {reports} earlier than the one before, the first at ", first, what)

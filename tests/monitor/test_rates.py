@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 from math import inf, nan
@@ -10,7 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spatial_replay import Footprint, Recorder, Sample, Trace, TrackedObject, evaluate, parse_specification
+from spatial_replay import (
+    Footprint,
+    Recorder,
+    Sample,
+    Trace,
+    TrackedObject,
+    evaluate,
+    parse_specification,
+    read_trace,
+)
 from spatial_replay.cli import run
 from spatial_replay.spec.format import format_specification
 
@@ -212,3 +222,81 @@ def test_commands_say_rates_in_the_unit_of_the_log_per_second(
     assert run(["verify", "annotated.mcap"]) == 0
     assert run(["export", "annotated.mcap", "-o", "table.csv"]) == 0
     assert "slow: speed(robot) <= 1.5" in Path("table.csv").read_text()
+
+
+def slow_reports() -> list[Sample]:
+    """A cart at 0.4 m/s, reported every 0.1 s, and a battery every second; samples come every 0.05 s."""
+    samples = []
+    for step in range(60):
+        reported = step // 2 * 2, step // 20 * 20
+        cart = Footprint.disc(0.02 * reported[0], 0.0, 0.3)
+        times = (int(at * SECOND // 20) for at in reported)
+        reported_ns = dict(zip(("cart", "battery"), times, strict=True))
+        signals = {"battery": 1.0 - 0.0005 * reported[1]}
+        samples.append(Sample(step * SECOND // 20, {"cart": cart}, signals, reported_ns=reported_ns))
+    return samples
+
+
+def test_logs_keep_the_times_of_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Recorder("run.mcap", units={"": "m", "battery": "1"}) as recorder:
+        for sample in slow_reports():
+            recorder.write(sample)
+    Path("s.spatial").write_text(
+        "spec slow = G (speed(cart) <= 0.3)\n"
+        "spec steady = G (0.39 <= speed(cart) <= 0.41)\n"
+        "spec lasts = G (rate(battery) >= -0.0101)\n"
+    )
+    assert run(["replay", "run.mcap", "--spec", "s.spatial", "-o", "annotated.mcap"]) == 1
+    said = capsys.readouterr().out
+    verdicts = dict(re.findall(r"^ +(\w+) +(satisfied|violated) ", said, re.MULTILINE))
+    assert verdicts == {"slow": "violated", "steady": "satisfied", "lasts": "satisfied"}
+    assert "cart moved by 0.04 m from" in said
+    assert run(["verify", "annotated.mcap"]) == 0
+    assert run(["clip", "run.mcap", "--spec", "s.spatial", "-o", "clip.mcap", "--around", "0.2s"]) == 0
+    capsys.readouterr()
+    assert run(["replay", "clip.mcap", "--spec", "s.spatial"]) == 1
+    assert "by 0.1 m/s" in capsys.readouterr().out
+    assert run(["replay", "run.mcap", "--spec", "s.spatial", "--max-gap", "40ms"]) == 4
+    assert read_trace("annotated.mcap") == Trace.from_samples(slow_reports())
+
+
+def test_reports_that_step_back_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    samples = slow_reports()[:30]
+    samples[10] = replace(samples[10], reported_ns={**samples[10].reported_ns, "cart": 0})
+    with Recorder("run.mcap") as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    Path("s.spatial").write_text("spec steady = G (0 <= speed(cart) <= 0.5)\n")
+    assert run(["replay", "run.mcap", "--spec", "s.spatial"]) == 0
+    said = capsys.readouterr()
+    assert "1 report of cart is earlier than the one before, the first at 0.500 s" in said.out + said.err
+
+
+def test_what_a_mapping_holds_for_ever_stands_in_closing_speeds() -> None:
+    samples = [
+        replace(sample, objects={**sample.objects, "map": Footprint.box(9, -1, 10, 1)}, lasting={"map"})
+        for sample in slow_reports()
+    ]
+    samples = [replace(each, reported_ns={**each.reported_ns, "map": 0}) for each in samples]
+    (near, still) = evaluate(
+        parse_specification(
+            "spec near = G (0.39 <= speed(cart, map) <= 0.41)\nspec still = G (speed(map) <= 1)"
+        ),
+        Trace.from_samples(samples),
+    )
+    assert near.verdict == "satisfied"
+    assert still.tested == "nothing"
+
+
+def test_a_report_after_a_hole_has_no_rate_until_the_next_one() -> None:
+    samples = slow_reports()[:20]
+    samples[8] = replace(samples[8], objects={}, reported_ns={})
+    (result,) = evaluate(parse_specification("speed(cart) >= 0"), Trace.from_samples(samples))
+    has_rate = np.isfinite(result.nodes[0].now)
+    np.testing.assert_array_equal(np.flatnonzero(~has_rate), [0, 1, 8, 9])
