@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
+import json
 import re
 import secrets
 from collections.abc import Coroutine, Iterable
@@ -95,8 +96,15 @@ _MOST_CONNECTIONS: Final = 64
 _PATIENCE_S: Final = 10.0
 """How long a viewer may take for its request, and to read what is waiting for it."""
 
+_MOST_TEXT: Final = 1 << 20
+"""Bytes of a request that is read before it is passed on."""
+
+_FINAL: Final = 0x80
+_TEXT: Final = 1
 _BINARY: Final = 2
 _CONTROL_REQUEST: Final = 3
+_EXACT_DIGITS: Final = 15
+"""Digits of an integer that every float has exactly."""
 _PLAYBACK_STATE: Final = 5
 """The first byte of a viewer's request for playback, and of the message with its state."""
 
@@ -209,12 +217,52 @@ async def _until_one_ends(*both: Coroutine[Any, Any, None]) -> None:
 
 
 async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
-    """Pass on what a viewer sends, up to its end."""
-    while not viewer.understands_state:
+    """Pass on what a viewer sends, up to its end; numbers of parameters go on as exact texts."""
+    while True:
         frame = await _read_head(reader)
-        viewer.understands_state = frame.kind == (_BINARY, _CONTROL_REQUEST)
-        await _pass_on(frame, reader, writer)
-    await _copy(reader, writer)
+        viewer.understands_state |= frame.kind == (_BINARY, _CONTROL_REQUEST)
+        if frame.is_whole_text and frame.rest < _MOST_TEXT:
+            mask, first = frame.begin[-5:-1], frame.begin[-1:]
+            text = _unmasked(first + await reader.readexactly(frame.rest), mask)
+            writer.write(_text_frame(with_exact_numbers(text)))
+            await _drained(writer)
+        else:
+            await _pass_on(frame, reader, writer)
+
+
+def with_exact_numbers(text: bytes) -> bytes:
+    """Return a request with the numbers of its parameters in hexadecimal: the SDK rounds long decimals."""
+    if b'"setParameters"' not in text:
+        return text
+    try:
+        request = json.loads(text, parse_float=lambda number: float(number).hex(), parse_int=_exact_integer)
+        for parameter in request["parameters"]:
+            if isinstance(parameter["value"], str) and parameter.get("type") == "float64":
+                del parameter["type"]
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        # the SDK says what is wrong with it
+        return text
+    return json.dumps(request).encode()
+
+
+def _exact_integer(number: str) -> int | str:
+    return int(number) if len(number) <= _EXACT_DIGITS else float(number).hex()
+
+
+def _unmasked(content: bytes, mask: bytes) -> bytes:
+    return bytes(byte ^ mask[place % 4] for place, byte in enumerate(content))
+
+
+def _text_frame(content: bytes) -> bytes:
+    """Return a frame of a client, masked with zeros."""
+    size = len(content)
+    if size < 126:
+        length = bytes([0x80 | size])
+    elif size < 1 << 16:
+        length = b"\xfe" + size.to_bytes(2, "big")
+    else:
+        length = b"\xff" + size.to_bytes(8, "big")
+    return bytes([_FINAL | _TEXT]) + length + bytes(4) + content
 
 
 async def _to_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
@@ -236,6 +284,11 @@ class _Frame(NamedTuple):
     begin: bytes
     rest: int
     kind: tuple[int, int]
+
+    @property
+    def is_whole_text(self) -> bool:
+        """Whether it is a text of a client that is not split, and not empty."""
+        return self.begin[0] == _FINAL | _TEXT and self.begin[1] & 0x80 > 0 and self.kind[1] >= 0
 
 
 async def _read_head(reader: asyncio.StreamReader) -> _Frame:

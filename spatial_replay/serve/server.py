@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
+import re
 import secrets
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -224,6 +225,8 @@ _LONGEST_NOTE: Final = 2_000
 
 _REJECTED: Final = "rejected"
 """The parameter that says which value was rejected, and why; "" once another one is accepted."""
+
+_HEXADECIMAL: Final = re.compile(r"-?0x[01]\.[0-9a-f]+p[+-][0-9]+")
 
 _MOST_S: Final = 9e9
 """Seconds of a duration, at most."""
@@ -644,6 +647,9 @@ def _value(parameter: Parameter) -> float | str | bool:
         UsageError: neither a number nor a short text, true or false.
     """
     value = parameter.get_value()
+    if isinstance(value, str) and _HEXADECIMAL.fullmatch(value):
+        # the relay sends numbers so
+        return float.fromhex(value)
     if isinstance(value, bool) or (isinstance(value, str) and len(value) <= _LONGEST_TEXT):
         return value
     if isinstance(value, (int, float)):

@@ -264,6 +264,26 @@ def test_a_changed_constant_changes_the_verdict_the_curves_and_the_messages(serv
     watch(server, looking)
 
 
+@pytest.mark.parametrize("kind", [{}, {"type": "float64"}])
+@pytest.mark.parametrize("protocol", [PROTOCOL, OLD_PROTOCOL])
+def test_a_number_that_a_viewer_sets_stays_to_its_last_bit(
+    server: Serving, protocol: Subprotocol, kind: dict[str, str]
+) -> None:
+    async def looking() -> None:
+        chance = random.Random(3)
+        async with viewer(server.address, protocol) as own:
+            for _ in range(40):
+                number = chance.random() * 10.0 ** chance.randint(-8, -4)
+                parameter = {"name": "far", "value": number, **kind}
+                # long enough for each form of a frame's length
+                rest = "x" * chance.choice([0, 200, 70_000])
+                await own.send(op="setParameters", parameters=[parameter], rest=rest)
+                assert (await own.constants())["far"] == number
+            assert await own.set(far=7) == {"far": 7, "soon": 10}
+
+    asyncio.run(looking())
+
+
 def test_a_changed_constant_makes_viewers_drop_what_they_show(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.control(seek_ns=STEP_NS)
