@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.atoms.measurements import measured
 from spatial_replay.monitor.atoms.terms import Reach, TraceScene, tail
 from spatial_replay.monitor.stream import Instance
@@ -30,6 +31,10 @@ from spatial_replay.trace.trace import ABSENT, Trace
 
 _APPROACH_NS: Final = 1_000_000_000
 """The approach of an object is its change of distance over so long before it leaves."""
+
+
+_STAND_IN: Final = "\0"
+"""A name that no object has; it comes before all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +90,7 @@ class Departures:
         for watch in dict.fromkeys(watch for instance in instances for watch in _watches_of(instance)):
             self._watches.setdefault(watch.group, []).append(watch)
         self._past: Trace | None = None
-        self._absent: dict[tuple[Group, str], Trace] = {}
+        self._absent: dict[tuple[Group, str], _Absence] = {}
 
     def add(self, trace: Trace) -> None:
         """Add the next samples; the ones that fill a pause do not count."""
@@ -100,49 +105,98 @@ class Departures:
         self._past = tail(trace, Reach(1, _APPROACH_NS))
 
     def _follow(self, group: Group, scene: TraceScene) -> None:
-        trace, first = scene.trace, 0 if self._past is None else len(self._past)
+        trace, before = scene.trace, 0 if self._past is None else len(self._past)
         names, members, _ = scene.members(group)
-        turns = np.diff(members[max(first - 1, 0) :], axis=0)
-        samples, columns = np.nonzero(turns)
-        for sample, column in zip((samples + max(first, 1)).tolist(), columns.tolist(), strict=True):
-            key = group, names[column]
+        # the first sample of a log is no turn
+        start = max(before, 1)
+        samples, columns = np.nonzero(np.diff(members[start - 1 :], axis=0))
+        turns = list(zip((samples + start).tolist(), columns.tolist(), strict=True))
+        if not turns:
+            return
+        early = [_early(trace, members, *turn) for turn in turns]
+        wanted = [(first, sample - 1, sample) for first, (sample, _) in zip(early, turns, strict=True)]
+        distances = self._distances(group, [names[column] for _, column in turns], np.array(wanted), trace)
+        for (sample, column), places, own in zip(turns, wanted, distances, strict=True):
+            key, times_ns = (group, names[column]), trace.times_ns[list(places)].tolist()
             if not members[sample, column]:
-                early_ns = trace.times_ns[sample - 1] - _APPROACH_NS
-                early = int(np.searchsorted(trace.times_ns[:sample], early_ns))
-                early += int(members[early:sample, column].argmax())
-                # the first sample without it is the last of these
-                before = [early, sample - 1, sample] if early < sample - 1 else [sample - 1, sample]
-                self._absent[key] = trace.take(np.array(before, np.int64))
+                why = _why_absent(group, names[column], trace, sample)
+                self._absent[key] = _Absence(why, *times_ns, own[:, 0], own[:, 1])
             elif key in self._absent:
-                self._return(group, names[column], self._absent.pop(key), trace.slice(sample, sample + 1))
+                self._return(group, names[column], self._absent.pop(key), times_ns[-1], own[:, 2])
 
-    def _return(self, group: Group, name: str, before: Trace, after: Trace) -> None:
+    def _distances(self, group: Group, names: Sequence[str], samples: Integers, trace: Trace) -> Floats:
+        """Return the distances (N, watches, 3) of N members in three samples of each (N, 3)."""
+        columns = np.array([trace.names.index(name) for name in names])
+        rows = trace.rows[samples.ravel()]
+        own = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
+        # one object stands for each member in its samples, so that all are measured at once
+        rows = np.column_stack([rows[own], rows])
+        rows[own[0], own[1] + 1] = ABSENT
+        stand_in = replace(
+            trace,
+            times_ns=np.arange(len(rows), dtype=np.int64),
+            names=(_STAND_IN, *trace.names),
+            rows=rows,
+            signals={},
+            reported_ns=None,
+            signals_reported_ns={},
+        )
         watches = self._watches[group]
-        scene = TraceScene(Trace.concatenate([before, after]), self._regions)
-        distances, _ = measured(scene, [watch.distance(name) for watch in watches])
-        start_ns, end_ns = int(before.times_ns[-1]), int(after.times_ns[0])
-        for watch, (*early, last, _, returned) in zip(watches, distances.tolist(), strict=True):
-            approach = 0.0
-            if early:
-                span_ns = int(before.times_ns[1] - before.times_ns[0])
-                approach = (early[0] - last) / span_ns * (end_ns - int(before.times_ns[-2]))
-            reach = max(watch.threshold, approach)
-            if last - watch.threshold < reach or returned - watch.threshold < watch.threshold:
-                why = self._absence(group, name, before)
-                away = with_unit(last, self._unit)
-                text = f"; it was {away} away before, from {format_term(_without(watch.other, name))}"
-                message = Sentence(why, " from ", Instant(start_ns, 0), " to ", Instant(end_ns, 0), text)
-                self.departures.append(Departure(name, start_ns, end_ns, last, message))
+        values, _ = measured(
+            TraceScene(stand_in, self._regions), [watch.distance(_STAND_IN) for watch in watches]
+        )
+        by_member: Floats = values.reshape(len(watches), *samples.shape).swapaxes(0, 1)
+        return by_member
+
+    def _return(self, group: Group, name: str, absence: _Absence, end_ns: int, distances: Floats) -> None:
+        """Add the departure of a member that is back, if it was within reach of a threshold."""
+        span_ns = max(absence.last_ns - absence.early_ns, 1)
+        approach = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
+        for watch, close, last, back in zip(
+            self._watches[group], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
+        ):
+            reach = max(watch.threshold, close)
+            if last - watch.threshold < reach or back - watch.threshold < watch.threshold:
+                start, end = Instant(absence.start_ns, 0), Instant(end_ns, 0)
+                away = f"it was {with_unit(last, self._unit)} away before"
+                text = f"; {away}, from {format_term(_without(watch.other, name))}"
+                message = Sentence(absence.why, " from ", start, " to ", end, text)
+                self.departures.append(Departure(name, absence.start_ns, end_ns, last, message))
                 return
 
-    def _absence(self, group: Group, name: str, before: Trace) -> str:
-        """Return why an object is no member in the last of these samples."""
-        row = int(before.rows[-1, before.names.index(name)])
-        if row == ABSENT:
-            return f"{printable(name)} was not in the log"
-        current = before.classes[before.class_code[row if row >= 0 else -2 - row]]
-        instead = f" but {printable(current)!r}" if current else ""
-        return f"{printable(name)} was not of the class {printable(group.class_name or '')!r}{instead}"
+
+class _Absence(NamedTuple):
+    """An absence so far.
+
+    Attributes:
+        why: the beginning of the sentence about it.
+        early_ns, last_ns: a sample at most a second before the last one with the member, and that.
+        start_ns: the first sample without it.
+        early, last: (watches,), its distances in the first two.
+    """
+
+    why: str
+    early_ns: int
+    last_ns: int
+    start_ns: int
+    early: Floats
+    last: Floats
+
+
+def _early(trace: Trace, members: Flags, sample: int, column: int) -> int:
+    """Return the first sample with a member in the second before the one before a sample."""
+    begin = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
+    return begin + int(members[begin:sample, column].argmax())
+
+
+def _why_absent(group: Group, name: str, trace: Trace, sample: int) -> str:
+    """Return why an object is no member in a sample."""
+    row = int(trace.rows[sample, trace.names.index(name)])
+    if row == ABSENT:
+        return f"{printable(name)} was not in the log"
+    current = trace.classes[trace.class_code[row if row >= 0 else -2 - row]]
+    instead = f" but {printable(current)!r}" if current else ""
+    return f"{printable(name)} was not of the class {printable(group.class_name or '')!r}{instead}"
 
 
 def _watches_of(instance: Instance) -> Iterator[_Watch]:
