@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from examples import examples
 from laws.strategies_monitor import CLASSES, HEADER, NAMES, WORDS, recordings
 from laws.strategies_spec import formula_texts
-from spatial_replay import Sample, evaluate, parse_specification
+from spatial_replay import evaluate, parse_specification
 
 without_rates = formula_texts(replace(WORDS, rates=False))
 with_rates = formula_texts(replace(WORDS, max_depth=2))
@@ -59,8 +59,13 @@ def test_the_order_of_members_changes_no_bit(data, class_name, recording):
     )
     names = dict(zip(NAMES, data.draw(st.permutations(NAMES)), strict=True))
     swapped = [
-        Sample(each.time_ns, {names[name]: one for name, one in reversed(each.objects.items())}, each.signals)
-        for each in recording.samples
+        replace(
+            sample,
+            objects={names[name]: tracked for name, tracked in reversed(sample.objects.items())},
+            reported_ns={names.get(name, name): at_ns for name, at_ns in sample.reported_ns.items()},
+            lasting=frozenset(names[name] for name in sample.lasting),
+        )
+        for sample in recording.samples
     ]
     unreadable = frozenset((t, names[name]) for t, name in recording.unreadable)
     results = evaluate(specification, recording.trace())
