@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 from spatial_replay.bags.decoders import Topic
-from spatial_replay.logs.messages import DERIVED
+from spatial_replay.logs.messages import Channel, has_our_type
 from spatial_replay.mapping.binding import BY_PLACE, Codes, Namer
 from spatial_replay.mapping.field_paths import (
     INDEX,
@@ -659,7 +659,8 @@ def _axes_lines(axes: _Axes) -> Iterator[str]:
 
 
 def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
-    if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
+    is_ours = has_our_type(Channel(topic.name, topic.encoding, topic.schema))
+    if is_ours or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
         return TopicSuggestion(topic)
     kind = short_type(topic.type)
     if topic.unreadable is not None:

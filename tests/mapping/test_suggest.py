@@ -37,6 +37,11 @@ def test_a_pose_is_an_object_of_its_topic() -> None:
     assert "no size" in text
 
 
+def test_topics_of_others_with_our_names_are_suggested() -> None:
+    (topic,) = suggested(**{"spatial/scene": {"x": 1.0, "y": 2.0}})[1].topics
+    assert (topic.topic, topic.position) == ("/spatial/scene", ("x", "y"))
+
+
 def test_bare_coordinates_are_a_position() -> None:
     _, mapping = suggested(pose={"x": 1.0, "y": 2.0, "theta": 0.0, "velocity": POINT})
     (topic,) = mapping.topics
