@@ -98,6 +98,13 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     help="Objects of a topic become unknown after T without messages.",
 )
 @click.option(
+    "--start-within",
+    "start_within_s",
+    metavar="T",
+    callback=_seconds,
+    help="How long the run waits for needed topics to begin.  [default: their max_age]",
+)
+@click.option(
     "--max-delay",
     "max_delay_s",
     metavar="T",
@@ -155,6 +162,7 @@ def monitor(
     length_s: float | None,
     until: str | None,
     topic_timeout_s: float | None,
+    start_within_s: float | None,
     max_delay_s: float,
     triggers: tuple[str, ...],
     before_s: float,
@@ -202,6 +210,7 @@ def monitor(
     for option, span_s in (
         ("--for", length_s),
         ("--topic-timeout", topic_timeout_s),
+        ("--start-within", start_within_s),
         ("--max-delay", max_delay_s),
     ):
         if span_s is not None and span_s <= 0:
@@ -235,6 +244,7 @@ def monitor(
             topics=topics,
             max_delay_s=max_delay_s,
             topic_timeout_s=topic_timeout_s,
+            start_within_s=start_within_s,
         )
         run = _Run(session, recorders, length_s, until)
         asyncio.run(run.follow())

@@ -30,6 +30,7 @@ from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.monitor.ends import Needs, RunEnds
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -48,7 +49,7 @@ from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
-from spatial_replay.text import counted
+from spatial_replay.text import counted, counted_from
 from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 if TYPE_CHECKING:
@@ -89,6 +90,10 @@ class ObjectsAssembler:
             present = {name: row if row >= 0 else -2 - row for name, row in rows if row != ABSENT}
             self._classes = {name: trace.classes[int(trace.class_code[row])] for name, row in present.items()}
         return trace
+
+    def arrived_s(self, time_ns: int) -> float:
+        """Samples do not wait here."""
+        return math.inf
 
     def due_s(self) -> None:
         """Nothing waits."""
@@ -244,13 +249,18 @@ class LiveSession:
         topics: Sequence[str] = (),
         max_delay_s: float = MAX_DELAY_S,
         topic_timeout_s: float | None = None,
+        start_within_s: float | None = None,
     ) -> None:
         """Compile everything, before the connection is made; see `monitor` for the arguments.
 
         Args:
             recorders: take every sample, and the messages of mapped topics and of `topics`, as they come.
         """
-        for name, value in (("max_delay_s", max_delay_s), ("topic_timeout_s", topic_timeout_s)):
+        for name, value in (
+            ("max_delay_s", max_delay_s),
+            ("topic_timeout_s", topic_timeout_s),
+            ("start_within_s", start_within_s),
+        ):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise UsageError(f"{name} is {value!r}; give seconds above 0")
         self.files = listed_specifications(specifications)
@@ -268,6 +278,8 @@ class LiveSession:
         units = {} if self._mapping is None else self._mapping.axes.units
         self._monitors = [Monitor(file, units=units) for file in self.files]
         self._changes = VerdictChanges(self.files)
+        within_ns = None if start_within_s is None else round(start_within_s * 1e9)
+        self._ends = RunEnds(Needs.of(self.files, {}), end=False, within_ns=within_ns)
         rehearse()
         self._assembler: LiveAssembler | ObjectsAssembler | None = None
         self._channels: tuple[Channel, ...] = ()
@@ -625,6 +637,8 @@ class LiveSession:
 
     async def _evaluated(self, trace: Trace | None, arrived_s: float) -> AsyncIterator[LiveUpdate]:
         """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait."""
+        if trace is not None:
+            trace = self._since_begin(trace)
         if trace is None or not len(trace):
             return
         turn_s = time.monotonic()
@@ -644,6 +658,23 @@ class LiveSession:
                 turn_s = now_s
             yield self._update(sample, arrived_s)
 
+    def _since_begin(self, trace: Trace, *, is_last: bool = False) -> Trace:
+        """Return the samples that count: none before each needed topic can be judged."""
+        ends = self._ends
+        had_begun = ends.begin_ns is not None
+        if had_begun:
+            return trace
+        counting = [*ends.add(trace), *(ends.finish() if is_last else ())]
+        if ends.begin_ns is not None:
+            self._notes += counted_from(ends.remarks, ends.log_begin_ns)
+            if ends.late:
+                listed = ", ".join(ends.late)
+                self._notes.append(
+                    f"the run begins although {listed} cannot be judged yet: what it reports is unknown until"
+                    " then; --start-within (start_within_s) waits longer"
+                )
+        return Trace.concatenate(counting)
+
     def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
         updates = tuple(monitor.update(sample) for monitor in self._monitors)
         for monitor in self._monitors:
@@ -655,6 +686,8 @@ class LiveSession:
         self._samples += 1
         self._time_ns = sample.time_ns
         now_s = time.monotonic()
+        if self._assembler is not None:
+            arrived_s = min(arrived_s, self._assembler.arrived_s(sample.time_ns))
         self._delay_s = max(0.0, now_s - min(arrived_s, now_s))
         for recorder in self._recorders:
             recorder.write(sample)
@@ -664,7 +697,7 @@ class LiveSession:
     def _finish(self) -> Trace | None:
         if self._assembler is None:
             return None
-        trace = self._assembler.finish()
+        trace = self._since_begin(self._assembler.finish(), is_last=True)
         self.remarks = self._assembler.take_remarks()
         return trace
 
@@ -737,6 +770,7 @@ async def monitor(
     topics: Sequence[str] = (),
     max_delay_s: float = MAX_DELAY_S,
     topic_timeout_s: float | None = None,
+    start_within_s: float | None = None,
     overwrite: bool = False,
 ) -> AsyncIterator[LiveUpdate]:
     """Monitor a running robot; yield an update for each sample.
@@ -752,6 +786,8 @@ async def monitor(
         topics: patterns of the topics whose messages are written; those that are mapped by default.
         max_delay_s: how long a sample waits for transforms, and for topics whose stamps lag behind.
         topic_timeout_s: after so much silence of a topic, what it reported is unknown.
+        start_within_s: how long the run waits for each topic that the specification needs; by default the
+            `max_age` of the topic.
         overwrite: replace an output that exists.
 
     Raises:
@@ -774,6 +810,7 @@ async def monitor(
             topics=topics,
             max_delay_s=max_delay_s,
             topic_timeout_s=topic_timeout_s,
+            start_within_s=start_within_s,
         )
         async for update in session.updates():
             yield update

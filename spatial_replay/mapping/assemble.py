@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import compress, repeat
-from math import pi
+from math import inf, pi
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -774,6 +774,7 @@ class LiveAssembler(_Assembling):
         self._latest_of = dict.fromkeys((each.name for each in plan.planned), -1)
         self._back_ns = {name: int(reader.repeats_times) for name, reader in self._readers.items()}
         self._silent: deque[tuple[float, int]] = deque()
+        self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_HELD)
         self._patient_ns = -1
         self._held: list[_Held] = []
         self._are_transforms_new = False
@@ -803,7 +804,17 @@ class LiveAssembler(_Assembling):
         if waited_ns < self._newest_ns:
             patience_s = _MOMENT_S if self._is_in_order else self._max_delay_s
             self._silent.append((now_s + patience_s, self._newest_ns))
+            self._arrivals.append((now_s, self._newest_ns))
         return self._settle(self._upto_ns(now_s))
+
+    def arrived_s(self, time_ns: int) -> float:
+        """Return when the first message of the time of a sample, or a later one, arrived; inf if unknown.
+
+        Ask for samples in the order of time.
+        """
+        while self._arrivals and self._arrivals[0][1] < time_ns:
+            self._arrivals.popleft()
+        return self._arrivals[0][0] if self._arrivals else inf
 
     def due_s(self) -> float | None:
         """Return when to `add` again, even without messages; None if nothing waits."""

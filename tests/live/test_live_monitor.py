@@ -805,3 +805,38 @@ def test_a_topic_that_is_rarer_than_its_timeout_is_said(tmp_path: Path) -> None:
     assert any("no message on /vase for 0.2 s" in note for note in notes)
     assert any("a message on /vase again, after" in note for note in notes)
     assert len([note for note in notes if "/vase usually comes every" in note]) == 1
+
+
+@pytest.mark.parametrize(("first", "code"), [(8, 0), (200, 4)])
+def test_a_run_begins_where_its_recording_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], first: int, code: int
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING.replace("10s", "1s"), "spec clear = G (robot dist vase >= 0.5)")
+    output = tmp_path / "live.mcap"
+    ticks = range(first + 20)
+    sent = [pose(1, tick, 2.0) for tick in ticks if tick < first]
+    sent += [pose(number, tick, 2.0 * (number == 1)) for tick in ticks[first:] for number in (2, 1)]
+    # the last sample is not evaluated before the end, as no message follows
+    with rude_server(*sent) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "-o", str(output)]
+        assert run([*command, "--for", "2s"]) == code
+    said = capsys.readouterr().out
+    begin_ns = int(sr.read_trace(output).times_ns[0])
+    if code:
+        assert begin_ns == 1 and "the run begins although /vase cannot be judged yet" in said
+    else:
+        assert begin_ns == first * 10 * MS + 1
+        assert (
+            "8 samples at the beginning are left out, from 0.000 s to 0.070 s: /vase begins at 0.080 s"
+            in said
+        )
+    assert run(["replay", str(output), "--spec", str(spec)]) == code
+
+
+def test_a_run_waits_as_long_as_it_is_told_to(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING.replace("10s", "1s"), "spec clear = G (robot dist vase >= 0.5)")
+    sent = [pose(1, tick, 2.0) for tick in range(200)]
+    sent += [pose(number, 200, 2.0 * (number == 1)) for number in (2, 1)]
+    with rude_server(*sent) as address:
+        [update] = asyncio.run(updates_of(address, spec, mapped, 1, start_within_s=5.0))
+    assert update.time_ns == 200 * 10 * MS + 1
