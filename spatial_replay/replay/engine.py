@@ -42,6 +42,7 @@ from spatial_replay.logs.messages import (
 from spatial_replay.monitor.departures import Departure, Departures
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import verdict_text
+from spatial_replay.monitor.stillness import Stillness
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
 from spatial_replay.monitor.vacuity import UntestedPart, idle_templates
 from spatial_replay.monitor.verdict import Semantics, Verdict, worst_verdict
@@ -197,6 +198,7 @@ class Replay:
         self._topics: set[str] = set()
         self._images: set[str] = set()
         self._names = LogNames()
+        self._stillness = Stillness()
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
         self._traces = _KeptTraces(self._selection, min(_KEPT_BYTES * len(self.trees), _MOST_KEPT_BYTES))
@@ -270,6 +272,7 @@ class Replay:
     def _add(self, trace: Trace, messages: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults
         self._names.add(trace)
+        self._stillness.add(trace)
         for departures in self._departures:
             departures.add(trace)
         own = trace.without_filling()
@@ -316,6 +319,7 @@ class Replay:
                 *dropped.remarks,
                 *self._empty_ends(first_ns),
                 *(departure.message for departure in left),
+                *self._stillness.remarks(),
             ),
             missing=missing,
             dropped=dropped,

@@ -380,3 +380,25 @@ def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
     assert left[0]["message"] in capsys.readouterr().err
     assert run(["batch", "visits.jsonl", "--spec", "safe.spatial", "--fail-on", "left", "-o", "out"]) == 1
     assert f"left: {left[0]['message']}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("class_name", "others", "is_remarked"),
+    [("person", 1, True), ("person", 0, False), ("", 3, True), ("", 2, False)],
+)
+def test_an_object_that_never_changes_by_a_bit_while_its_kind_moves_is_remarked(
+    folder: Path, capsys: pytest.CaptureFixture[str], class_name: str, others: int, is_remarked: bool
+) -> None:
+    kind = {"class": class_name} if class_name else {}
+
+    def at(name: str, x: float, y: float) -> dict[str, object]:
+        return {"name": name, "parts": [{"vertices": [[x, y]], "radius": 0.125}], **kind}
+
+    samples = [
+        {"time_ns": k * 10**8, "objects": [at("stuck", 0, 9), *(at(f"o{n}", k, n) for n in range(others))]}
+        for k in range(30)
+    ]
+    (folder / "still.jsonl").write_text("\n".join(map(json.dumps, samples)))
+    assert run(["replay", "still.jsonl", "--spec", "G (stuck dist stuck <= 1)"]) == 0
+    said = "stuck never changes by a bit in 30 reports, while all other objects"
+    assert (said in capsys.readouterr().err) is is_remarked

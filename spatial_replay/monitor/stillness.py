@@ -1,0 +1,99 @@
+"""Objects that never change by a bit while all of their kind do: a tracker may have lost them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.text import counted, printable
+from spatial_replay.trace.trace import Trace
+
+_LEAST_REPORTS: Final = 20
+"""An object with fewer reports may rest."""
+_MOSTLY: Final = 0.95
+"""The others change in at least this part of their reports."""
+_LEAST_OTHERS: Final = {True: 1, False: 3}
+"""How many others there have to be: of its class, or without a class, where a goal among two is usual."""
+
+
+@dataclass(slots=True)
+class _Reports:
+    """The reports of an object after its first one.
+
+    Attributes:
+        last: numbers of the last one.
+    """
+
+    count: int = 0
+    changes: int = 0
+    class_name: str | None = None
+    last: Floats = field(default_factory=lambda: np.full(3, np.nan))
+
+    @property
+    def mostly_changes(self) -> bool:
+        return self.count >= _LEAST_REPORTS and self.changes >= _MOSTLY * self.count
+
+
+class Stillness:
+    """How often each object changed from one report to the next, collected block by block."""
+
+    def __init__(self) -> None:
+        """Start before the first sample."""
+        self._reports: dict[str, _Reports] = defaultdict(_Reports)
+        self._lasting: set[str] = set()
+
+    def add(self, trace: Trace) -> None:
+        """Add the next samples."""
+        self._lasting |= trace.lasting
+        numbers = _numbers(trace)
+        for column, name in enumerate(trace.names):
+            rows = trace.rows[:, column]
+            is_new = rows >= 0
+            if trace.reported_ns is not None:
+                times = trace.reported_ns[:, column]
+                is_new &= np.concatenate([[True], times[1:] != times[:-1]])
+            rows = rows[is_new]
+            if not len(rows):
+                continue
+            reports = self._reports[name]
+            own = np.concatenate([reports.last[None], numbers[rows]])
+            is_first = bool(np.isnan(own[0]).all())
+            changed = ((own[1:] != own[:-1]) & ~(np.isnan(own[1:]) & np.isnan(own[:-1]))).any(axis=1)
+            reports.count += len(rows) - is_first
+            reports.changes += int(changed[is_first:].sum())
+            reports.class_name = trace.classes[trace.class_code[rows[-1]]]
+            reports.last = own[-1]
+
+    def remarks(self) -> Iterator[str]:
+        """Yield a sentence on each object that never changed while all others of its class mostly did."""
+        by_class: dict[str | None, dict[str, _Reports]] = defaultdict(dict)
+        for name, reports in self._reports.items():
+            if name not in self._lasting:
+                by_class[reports.class_name][name] = reports
+        for class_name, objects in by_class.items():
+            still = [name for name, reports in objects.items() if not reports.changes]
+            others = [reports for name, reports in objects.items() if name not in still]
+            if len(still) != 1 or len(others) < _LEAST_OTHERS[bool(class_name)]:
+                continue
+            count = objects[still[0]].count
+            if count >= _LEAST_REPORTS and all(reports.mostly_changes for reports in others):
+                kind = f"of the class {printable(class_name)!r}" if class_name else "without a class"
+                never = f"never changes by a bit in {counted(count + 1, 'report')}"
+                others_move = f"while all other objects {kind} move"
+                yield f"{printable(still[0])} {never}, {others_move}: is it still tracked?"
+
+
+def _numbers(trace: Trace) -> Floats:
+    """Return numbers (R, 3) of each observation that change whenever it moves or turns."""
+    batch = trace.footprints
+    places = batch.vertex_start[batch.part_start]
+    sums = np.zeros((len(trace.yaw), 3))
+    if len(trace.yaw):
+        sums[:, :2] = np.add.reduceat(batch.vertices, places[:-1].astype(np.intp))
+        sums[:, 2] = trace.yaw
+    return sums
