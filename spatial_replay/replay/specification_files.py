@@ -159,7 +159,7 @@ class SpecificationFiles:
             if constant not in (None, loaded[name], self._written.get((index, name))):
                 saved = str(constant_value(constant)).removesuffix(".0")
                 raise UsageError(
-                    f"{name} was saved as {saved} meanwhile; write it again once the saved file is evaluated"
+                    f"{name} was just saved as {saved}; write it again once the saved file is evaluated"
                 )
 
     def _saved(self) -> list[Specification] | SpatialReplayError | None:

@@ -578,7 +578,7 @@ def test_services_answer_in_json(server: Serving) -> None:
     watch(server, looking)
 
 
-def test_services_answer_with_the_constants_that_viewers_were_told(server: Serving) -> None:
+def test_services_answer_with_the_constants_that_were_set_before(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.subscribe([CURVES_TOPIC, ROBUSTNESS, SCENE])
         for number in range(10):

@@ -94,7 +94,7 @@ def test_what_a_viewer_sets_while_its_former_value_is_written_stays(tmp_path: Pa
     assert session.values == {"near": 90.0}
     # the text changed it after that, which is not overwritten before it is loaded
     path.write_text(text.replace("70", "60"))
-    with pytest.raises(sr.UsageError, match="near was saved as 60 meanwhile"):
+    with pytest.raises(sr.UsageError, match="near was just saved as 60"):
         session.edited.loaded.write_constants(session.edited.given)
     assert path.read_text() == text.replace("70", "60")
     session.replace_log(session.edited.loaded.with_files(files.load()))
