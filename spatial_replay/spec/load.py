@@ -196,7 +196,7 @@ class AtomBuilder:
         term = self.resolver.term(written, scope)
         if looks_back(term):
             hint = "leave out the [-n]"
-            self.resolver.fault(written.span, scope, "a speed is from the sample before to this one", hint)
+            self.resolver.fault(written.span, scope, "a speed is from the report before to this one", hint)
         elif alone and isinstance(base_of(term), Group):
             hint = "write forall p in GROUP: speed(p) <= c"
             self.resolver.fault(written.span, scope, "a group has no speed of its own", hint)

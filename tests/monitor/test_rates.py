@@ -160,7 +160,7 @@ def test_samples_without_rates_test_nothing_and_are_not_what_decides(
 @pytest.mark.parametrize(
     ("formula", "message", "hint"),
     [
-        ("speed(a[-1]) <= 1", "a speed is from the sample before to this one", "leave out the [-n]"),
+        ("speed(a[-1]) <= 1", "a speed is from the report before to this one", "leave out the [-n]"),
         ("speed(class x) <= 1", "a group has no speed of its own", "write forall p in GROUP: speed(p) <= c"),
         ("speed(2) <= 1", "a number has no speed", "write speed(a) or speed(a, b)"),
         ("speed() <= 1", "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"),
