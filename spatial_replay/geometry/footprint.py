@@ -15,7 +15,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spatial_replay.compiled import elementwise, long_kernel
+from spatial_replay.compiled import elementwise, kernel, long_kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import (
     Floats,
@@ -505,6 +505,35 @@ def centre_object(tracked: TrackedObject) -> TrackedObject:
     point = centres_of(FootprintBatch.from_footprints([tracked.footprint], [tracked.height]))
     x, y = point.vertices[0]
     return replace(tracked, footprint=Footprint.disc(x, y, 0.0), height=point.height(0))
+
+
+def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
+    """Return what `centre_object` packs: a fiftieth of the time, for control loops."""
+    # a part's numbers are a pair of their own, then those of its vertices; writable, as kernels take them
+    numbers, centre = np.frombuffer(bytearray(b"".join(tracked.packed[1:]))).reshape(-1, 2), np.empty(2)
+    _fill_packed_centre(numbers, centre)
+    bottom, top = tracked.height or (math.nan, math.nan)
+    middle = bottom + 0.5 * (top - bottom)
+    yaw = math.nan if tracked.yaw is None else tracked.yaw
+    point = _pack_part(1, 0.0) + centre.tobytes()
+    return _pack_object(1, middle, middle, yaw, tracked.uncertainty), point
+
+
+@elementwise
+@kernel
+def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
+    """Fill `centre` (2,), by the steps of `_fill_centres`; see `ConvexPart.packed`."""
+    total = sum_x = sum_y = mean_x = mean_y = 0.0
+    at, parts = 0, 0
+    while at < len(numbers):
+        end = at + 1 + int(numbers[at, 0])
+        area, x, y = weight_and_centre(numbers, at + 1, end, numbers[at, 1])
+        total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
+        mean_x, mean_y = mean_x + x, mean_y + y
+        at, parts = end, parts + 1
+    if total <= 0.0:
+        total, sum_x, sum_y = float(parts), mean_x, mean_y
+    centre[0], centre[1] = sum_x / total, sum_y / total
 
 
 def centres_of(batch: FootprintBatch) -> FootprintBatch:

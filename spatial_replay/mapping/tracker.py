@@ -95,7 +95,7 @@ class Events:
     ) -> tuple[Integers, Integers, Integers]:
         """Return rows, class codes and times of reports by the events `at` some times.
 
-        Those before `starts` are of others.
+        Events before `starts` are of other objects.
         """
         has_appeared = at >= starts
         at = np.maximum(at, starts)
@@ -453,7 +453,7 @@ class Tracker:
     def _is_lasting(self, name: int) -> bool:
         """Return whether an object stands where it is until it is reported again."""
         planned = self.readers[self._topic_of_name[name]].planned
-        # frames are placed anew in every sample
+        # transforms report frames in every sample
         return planned.is_lasting and not planned.is_static
 
     def _spans(self, times_ns: Integers) -> tuple[TopicSpan, ...]:
@@ -581,7 +581,7 @@ class Tracker:
                 if row in self._following:
                     where = np.flatnonzero(rows == row)
                     rows[where] = self._placed(topic, self._following[row], times_ns[where])
-                    # a transform places it anew, as a report does
+                    # a transform is a report of where it is now
                     reported_ns[where] = times_ns[where]
 
     def _placed(self, topic: str, following: _Following, times_ns: Integers) -> Integers:

@@ -34,19 +34,19 @@ from spatial_replay.geometry.footprint import (
     FootprintBatch,
     TrackedObject,
     centre_object,
+    packed_centre,
 )
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import QUANTITY_CODES, closest_rows, misalignment_of
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
 from spatial_replay.monitor.atoms.measurements import quantity_of
+from spatial_replay.monitor.atoms.reports import RecentReports, left_out_of
 from spatial_replay.monitor.atoms.terms import (
     NO_DELAY,
     Delay,
-    RecentReports,
     RecentSamples,
     footprint_from_outline,
     iter_delays,
-    left_out_of,
     open_group,
 )
 from spatial_replay.spec.formula import (
@@ -636,7 +636,7 @@ class LeafPlan:
                         numbers.append(code_of(class_name))
                     continue
             if tracked is not None:
-                packed += (centre_object(tracked) if is_point else tracked).packed
+                packed += packed_centre(tracked) if is_point else tracked.packed
                 if self._has_classes:
                     numbers.append(code_of(tracked.class_name))
                 continue

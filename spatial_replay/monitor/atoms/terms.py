@@ -1,7 +1,6 @@
 """Terms in a trace: footprints, uncertainty, where they are unknown, and how far they look back (`a[-3]`).
 
-A rate looks back at reports. A run of samples that show the same report of an object ends where they show
-another one, or none.
+A rate looks back at reports (see `reports`).
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf, isfinite, isnan, nan
-from typing import Any, NamedTuple, TypeAlias
+from math import isnan
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,12 +18,11 @@ from spatial_replay.geometry.arrays import Booleans, Flags, Floats, Integers
 from spatial_replay.geometry.footprint import (
     Footprint,
     FootprintBatch,
-    TrackedObject,
-    centre_of,
     centres_of,
     shifted,
 )
 from spatial_replay.geometry.measure import Operand
+from spatial_replay.monitor.atoms.reports import Reports, before_last_reports, is_signal_known, left_out_of
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Centre,
@@ -46,7 +44,6 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.relations import computed_signal
 from spatial_replay.spec.walks import has_rate, iter_terms, named_members, standing, step_of
-from spatial_replay.text import TEXTS
 from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 
@@ -102,55 +99,8 @@ def tail(trace: Trace, reach: Reach) -> Trace:
         begin = min(begin, int(np.searchsorted(trace.times_ns, latest_ns, side="right")) - 1)
     recent = np.arange(max(begin, 0), len(trace))
     if reach.to_reports:
-        recent = np.union1d(_before_last_reports(trace), recent)
+        recent = np.union1d(before_last_reports(trace), recent)
     return trace.take(recent)
-
-
-def _before_last_reports(trace: Trace) -> Integers:
-    """Return the samples right before those that show the last reports."""
-    columns = [(trace.rows >= 0, trace.reported_ns)] if trace.reported_ns is not None else []
-    for name, reported_ns in trace.signals_reported_ns.items():
-        columns.append((is_signal_known(trace.signals[name])[:, None], reported_ns[:, None]))
-    samples = [np.empty(0, np.int64)]
-    for is_known, reported_ns in columns:
-        begins = _begins(is_known, reported_ns)[:, is_known[-1]]
-        first = len(trace) - 1 - np.argmax(begins[::-1], axis=0)
-        samples.append(first[first > 0] - 1)
-    return np.concatenate(samples).astype(np.int64)
-
-
-def is_signal_known(values: Floats) -> Booleans:
-    """Return where the values of a signal are numbers."""
-    return np.asarray(np.isfinite(values) & (values > TEXTS))
-
-
-def _begins(is_known: Booleans, reported_ns: Integers) -> Booleans:
-    """Return where reports begin to be shown; both columns are (T, ...)."""
-    begins = is_known.copy()
-    begins[1:] &= ~is_known[:-1] | (reported_ns[1:] != reported_ns[:-1])
-    return begins
-
-
-class Reports(NamedTuple):
-    """The report of an object or a signal that each sample shows, and the last other one before it.
-
-    Attributes:
-        before: (T,), the last sample that showed the other one, -1 if there is none: what is reported for the
-            first time, or for the first time after a hole.
-        seconds: (T,), the time between both; NaN if there is none, or if it is not positive.
-    """
-
-    before: Integers
-    seconds: Floats
-
-    @classmethod
-    def of(cls, is_known: Booleans, reported_ns: Integers) -> Reports:
-        begins = np.where(_begins(is_known, reported_ns), np.arange(len(is_known)), -1)
-        before = np.where(is_known, np.maximum.accumulate(begins) - 1, -1)
-        before = np.where((before >= 0) & is_known[before], before, -1)
-        step_ns = np.where(before < 0, 0, reported_ns - reported_ns[before])
-        seconds = np.where(step_ns > 0, step_ns / 1e9, np.nan)
-        return cls(before.astype(np.int64), seconds)
 
 
 class RecentSamples:
@@ -179,116 +129,6 @@ def _at_delay(delay: Delay, queue: deque[Sample], sample: Sample) -> Sample | No
     while len(queue) > 1 and queue[1].time_ns <= latest_ns:
         queue.popleft()
     return queue[0] if queue[0].time_ns <= latest_ns else None
-
-
-class LatestReport(NamedTuple):
-    """What a sample shows of an object or a signal (see `Reports`).
-
-    Attributes:
-        shown: the object, or the value.
-        reported_ns: when it was reported.
-        before: the last other report, None if there is none.
-        seconds: the time between both; NaN if there is none, or if it is not positive.
-    """
-
-    shown: Any
-    reported_ns: int
-    before: LatestReport | None = None
-    seconds: float = nan
-
-    def follow(self, shown: Any, reported_ns: int) -> LatestReport:
-        """Return what the next sample shows, by what it reports."""
-        if reported_ns == self.reported_ns:
-            return self._replace(shown=shown)
-        step_ns = reported_ns - self.reported_ns
-        before = self._replace(before=None)
-        return LatestReport(shown, reported_ns, before, step_ns / 1e9 if step_ns > 0 else nan)
-
-
-class RecentReports:
-    """The reports that the newest sample shows of objects and signals, and the last other ones.
-
-    Args:
-        objects: their names; None for all objects.
-    """
-
-    def __init__(self, objects: frozenset[str] | None, signals: Iterable[Signal]) -> None:
-        self._objects = objects
-        self._signals = tuple(signals)
-        self.of: dict[str | Signal, LatestReport] = {}
-
-    def add(self, sample: Sample) -> None:
-        """Add the next sample; a hole forgets the reports before it."""
-        latest: dict[str | Signal, LatestReport] = {}
-        objects, times = sample.objects, sample.reported_ns
-        for name in objects if self._objects is None else self._objects:
-            if name in objects:
-                latest[name] = self._next(name, objects[name], times.get(name, sample.time_ns))
-        for signal in self._signals:
-            time_ns = sample.time_ns
-            if isinstance(signal, ComputedSignal):
-                value = computed_signal(signal, sample)
-            else:
-                value, time_ns = sample.signals.get(signal.name, nan), times.get(signal.name, time_ns)
-            if isfinite(value) and value > TEXTS:
-                latest[signal] = self._next(signal, value, time_ns)
-        self.of = latest
-
-    def _next(self, key: str | Signal, shown: Any, reported_ns: int) -> LatestReport:
-        latest = self.of.get(key)
-        return LatestReport(shown, reported_ns) if latest is None else latest.follow(shown, reported_ns)
-
-    def seconds(self, name: str) -> float:
-        """Return the time between the last two reports of an object; NaN if there are no two."""
-        latest = self.of.get(name)
-        return nan if latest is None else latest.seconds
-
-    def step(self, terms: Iterable[Term], sample: Sample) -> float:
-        """Return the shortest time between two reports of what moves in some terms, NaN for none."""
-        shortest = inf
-        for term in terms:
-            for name in _members_in(term, sample):
-                seconds = self.seconds(name)
-                if seconds != seconds and name not in sample.lasting:
-                    return nan
-                shortest = min(shortest, seconds if seconds == seconds else inf)
-        return shortest if isfinite(shortest) else nan
-
-    def moved_back(self, name: str, sample: Sample, shortest: float) -> TrackedObject | None:
-        """Return an object as it was some seconds ago by its velocity; None if it was not reported before."""
-        latest = self.of.get(name)
-        if latest is None:
-            return None
-        before, seconds = latest.before, latest.seconds
-        now: TrackedObject = latest.shown
-        if before is None or seconds != seconds:
-            return now if name in sample.lasting else None
-        then: TrackedObject = before.shown
-        if seconds == shortest:
-            return then
-        if not seconds > shortest:
-            return None
-        (x, y), (then_x, then_y) = (centre_of(tracked.footprint) for tracked in (now, then))
-        share = shortest / seconds
-        shift = np.array([[(then_x - x) * share, (then_y - y) * share]])
-        moved = shifted(FootprintBatch.from_footprints([now.footprint]), shift)
-        uncertainty = max(now.uncertainty, then.uncertainty)
-        return replace(now, footprint=moved.footprint(0), uncertainty=uncertainty)
-
-
-def _members_in(term: Term, sample: Sample) -> Iterable[str]:
-    """Return the objects of a term in a sample."""
-    if not isinstance(term, Group):
-        return (term.name,)  # type: ignore[union-attr]
-    if not term.is_open:
-        return named_members(term)
-    wanted, left_out = (term.class_name or "").casefold(), left_out_of(term)
-    classes = {name: tracked.class_name for name, tracked in sample.objects.items()} | dict(sample.unknown)
-    return [
-        name
-        for name, class_name in classes.items()
-        if name not in left_out and (term.class_name == ANY_CLASS or (class_name or "").casefold() == wanted)
-    ]
 
 
 _NO_REPORT = ABSENT - 1
@@ -393,7 +233,7 @@ class TraceScene:
     def compared_ns(self, rate: Rate) -> tuple[int, int] | None:
         """Return the times of the two reports that a rate compares in the first sample; None if it has none.
 
-        Of several objects, those of the one whose reports are nearest to each other.
+        If a rate is of several objects, the pair of reports with the shortest time between them.
         """
         shown: list[TrackedName | Signal] = [rate.signal] if rate.signal else []
         for term in step_of(rate).terms:
@@ -641,7 +481,3 @@ def open_group(term: Group | Earlier) -> Group:
     if not isinstance(base, Group) or base.members is not None:
         raise TypeError(f"{term!r} is not an open group")
     return base
-
-
-def left_out_of(group: Group) -> frozenset[str]:
-    return frozenset(each.name for each in group.excluded)
