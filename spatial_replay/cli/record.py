@@ -31,7 +31,7 @@ from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import check_names
-from spatial_replay.text import counted, listed
+from spatial_replay.text import counted, listed, nearest_hint
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
@@ -343,6 +343,11 @@ class RecordGroup(click.Group):
         if args and args[0] in self.commands:
             ctx.args = args
             return args
+        if args and args[0] not in SCENARIOS and not args[0].startswith("-") and not ctx.resilient_parsing:
+            hint = (
+                nearest_hint(args[0], [*SCENARIOS, *self.commands]) or "`record tracks FILE` records a file"
+            )
+            ctx.fail(f"no scenario is named {args[0]!r}; {hint}")
         return click.Command.parse_args(self, ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -78,6 +78,9 @@ def test_a_group_without_a_command_prints_its_help_and_no_error(tmp_path: Path) 
     ("arguments", "said"),
     [
         (("chekc",), "no command is named 'chekc'; did you mean 'check'?"),
+        (("record", "pshu", "-o", "a.mcap"), "no scenario is named 'pshu'; did you mean 'push'?"),
+        (("record", "vido", "-o", "a.mcap"), "no scenario is named 'vido'; did you mean 'video'?"),
+        (("record", "run.csv", "-o", "a.mcap"), "'run.csv'; `record tracks FILE` records a file"),
         (("check",), "Missing argument 'SPEC'"),
         (("check", "a.spatial", "--loog", "x"), "No such option"),
         (("check", "missing.spatial"), "missing.spatial"),
