@@ -30,7 +30,7 @@ from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.mapping.topic_reader import ReadingPlan
-from spatial_replay.monitor.ends import Needs, RunEnds
+from spatial_replay.monitor.ends import Needs, RunEnds, trim_trace
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -698,6 +698,8 @@ class LiveSession:
         if self._assembler is None:
             return None
         trace = self._since_begin(self._assembler.finish(), is_last=True)
+        trace, left_out = trim_trace(trace, self._ends.needs, start=False, is_rest=self._samples > 0)
+        self._notes += counted_from(left_out, self._ends.log_begin_ns)
         self.remarks = self._assembler.take_remarks()
         return trace
 

@@ -79,6 +79,7 @@ class RunEnds:
 
     Args:
         start, end: whether samples are left out at the start, and at the end.
+        is_rest: whether samples came before, so that all of these may be left out.
         within_ns: replaces the limits of the topics at the start.
 
     Attributes:
@@ -89,10 +90,16 @@ class RunEnds:
     """
 
     def __init__(
-        self, needs: Needs, *, start: bool = True, end: bool = True, within_ns: int | None = None
+        self,
+        needs: Needs,
+        *,
+        start: bool = True,
+        end: bool = True,
+        is_rest: bool = False,
+        within_ns: int | None = None,
     ) -> None:
         self.needs = needs
-        self._start, self._end, self._within_ns = start, end, within_ns
+        self._start, self._end, self._is_rest, self._within_ns = start, end, is_rest, within_ns
         self._spans: dict[str, TopicSpan] = {}
         self._since_ns: dict[str, int | None] = {}
         self._held: list[Trace] = []
@@ -202,7 +209,7 @@ class RunEnds:
             return
         for span in self.needs.choose(tuple(self._spans.values())):
             since_ns = self._since_ns[span.topic]
-            begin_ns = self.begin_ns or 0
+            begin_ns = -1 if self._is_rest else self.begin_ns or 0
             if since_ns is not None and since_ns > begin_ns and self._log_end_ns - since_ns <= span.limit_ns:
                 yield span
 
@@ -226,12 +233,12 @@ class RunEnds:
 
 
 def trim_trace(
-    trace: Trace, needs: Needs, *, start: bool = True, end: bool = True
+    trace: Trace, needs: Needs, *, start: bool = True, end: bool = True, is_rest: bool = False
 ) -> tuple[Trace, tuple[Sentence, ...]]:
-    """Return the samples of a whole trace that count, and remarks on those left out."""
+    """Return the samples of a trace that count, and remarks on those left out; see `RunEnds`."""
     if not trace.spans:
         return trace, ()
-    ends = RunEnds(needs, start=start, end=end)
+    ends = RunEnds(needs, start=start, end=end, is_rest=is_rest)
     (counting,) = [*ends.add(trace), *ends.finish()]
     # a trace that stays whole keeps its measurements
     return (counting, ends.remarks) if ends.remarks else (trace, ())

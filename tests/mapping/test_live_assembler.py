@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from examples import examples
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
-from spatial_replay import Trace
+from spatial_replay import Trace, parse_specification
 from spatial_replay.mapping.assemble import LiveAssembler
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.monitor.ends import Needs, trim_trace
 
 MS = 10**6
 TWO = """
@@ -118,6 +119,25 @@ def test_an_observation_waits_for_its_transform_and_then_is_unknown() -> None:
     (late,) = assembler.add([], 1.31).samples()
     assert (dict(late.objects), dict(late.unknown)) == ({}, {"a": None})
     assert (assembler.overdue, assembler.overdue_frame) == (1, ("/a", "cam"))
+
+
+def test_a_run_that_ends_while_an_observation_waits_ends_before_it() -> None:
+    feed = Feed()
+    for tick in range(3):
+        at = SECOND + tick * 100 * MS
+        feed.add("/tf", at, tf(transform("map", "cam", (tick, 0, 0), time_ns=at)))
+        feed.add("/a", at + 10 * MS, pose_stamped(0, 0, "cam", time_ns=at + 5 * MS))
+    assembler, _ = live(FRAMED, feed)
+    needs = Needs.of(
+        [parse_specification("region home = box(0, 0, 9, 9)\nspec s = G (a dist home <= 1)")], {}
+    )
+    running = [assembler.add([message], 1.0 + place / 20) for place, message in enumerate(feed.raw())]
+    last, (remark,) = trim_trace(assembler.finish(), needs, start=False, is_rest=True)
+    assert len(last) == 0
+    assert str(remark).startswith("1 sample at the end is left out")
+    recorded, _ = trim_trace(make(FRAMED, feed).trace, needs)
+    assert Trace.concatenate([*running, last]) == recorded
+    assert len(recorded) == 2
 
 
 def test_what_is_lost_is_unknown_until_it_is_reported_again() -> None:
