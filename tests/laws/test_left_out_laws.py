@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from examples import examples
 from laws.strategies_monitor import CLASSES, HEADER, NAMES, WORDS, recordings
 from laws.strategies_spec import formula_texts
-from spatial_replay import evaluate, parse_specification
+from spatial_replay import NoAutomatonError, automaton, evaluate, parse_specification
+from spatial_replay.monitor.offline import evaluate_offline
 
 without_rates = formula_texts(replace(WORDS, rates=False))
 with_rates = formula_texts(replace(WORDS, max_depth=2))
@@ -74,3 +75,34 @@ def test_the_order_of_members_changes_no_bit(data, class_name, recording):
     )
     for result, other in zip(results, others, strict=True):
         np.testing.assert_array_equal(result.series, other.series)
+
+
+_ahead = replace(WORDS, past=False, times=False, max_depth=3)
+
+
+@examples(100)
+@given(text=formula_texts(_ahead), recording=recordings(max_size=6))
+def test_automata_accept_what_is_satisfied_with_samples_left_out(text, recording):
+    specification = parse_specification(f"{HEADER}spec s = {text}\n")
+    try:
+        machine = automaton(specification)
+    except NoAutomatonError:
+        assume(False)
+    (result,) = evaluate(specification, recording.trace())
+    order = result.evidence.instance.program.leaves
+    symbols = []
+    for proposition in machine.propositions:
+        done = evaluate_offline(proposition.formula, order, result.leaves, result.times_ns)
+        low, high = done.ends(0)
+        symbols.append(
+            [True if a >= 0.0 else False if b < 0.0 else None for a, b in zip(low, high, strict=True)]
+        )
+    possible = frozenset({machine.initial})
+    for symbol in zip(*symbols, strict=True):
+        possible = machine.step_set(possible, list(symbol))
+    if symbols and result.lower > 0.0:
+        assert possible & machine.accepting
+    if symbols and result.upper < 0.0:
+        assert possible - machine.accepting
+    if symbols and result.lower == result.upper != 0.0 and len(possible) == 1:
+        assert bool(possible & machine.accepting) == (result.lower > 0.0)
