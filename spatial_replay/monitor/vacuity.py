@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -141,10 +141,10 @@ def find_vacuous(
     """
     instance = evidence.instance
     nodes = nodes_of(instance.formula)
-    scopes = _scopes(instance.formula, times_ns)
     implications = _implications_of(instance.formula)
     held = _Holding(instance, leaves, times_ns)
-    active = _scopes(implications.formula, times_ns, held)
+    scopes = _scopes(instance.formula, times_ns, held)
+    active = _scopes(implications.formula, times_ns, held, is_conditional=True)
     found = [
         *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), times_ns, evidence),
         *_idle_implications(implications, active, held, evidence),
@@ -288,12 +288,14 @@ class _Holding:
 
 
 def _scopes(
-    formula: Formula, times_ns: Integers, held: Callable[[Formula], _Samples] | None = None
+    formula: Formula, times_ns: Integers, held: _Holding, *, is_conditional: bool = False
 ) -> list[_Samples]:
     """Return for each node the samples (T,) at which the number of the formula depends on it.
 
+    Samples that an operator leaves out, because a rate has no value there, are not among them.
+
     Args:
-        held: where an antecedent may hold; then the samples at which the verdict depends on a node.
+        is_conditional: only those at which the verdict depends on a node, where antecedents may hold.
     """
     tree = nodes_with_operands(formula)
     scopes = [np.arange(len(times_ns)) == 0 for _ in tree]
@@ -302,7 +304,10 @@ def _scopes(
             within = scope
             if isinstance(node, Temporal):
                 within = _below(node, place, scope, times_ns)
-            elif held and place and operator_of(node) == "->" and scope.any():
+                read = judged(node).operands[place]
+                if operator_of(read) in ("given", "with"):
+                    within = within & held(operands_of(read)[0])
+            elif is_conditional and place and operator_of(node) == "->" and scope.any():
                 within = scope & held(operands_of(node)[0])
             scopes[operand] = within
     return scopes

@@ -155,6 +155,9 @@ def test_samples_without_rates_test_nothing_and_are_not_what_decides(
     for body in ("speed(a) <= 5", "(speed(a) <= 5) -> (a dist b >= 9)"):
         assert run(["replay", "run.mcap", "--spec", f"G[0, 0] ({body})"]) == 4
     assert "where no sample in its window has a rate" in capsys.readouterr().out
+    # the condition is unknown only in the sample that is left out
+    assert run(["replay", "run.mcap", "--spec", "G[0, 1] ((speed(a) >= 5) -> (a dist b >= 9))"]) == 4
+    assert "`speed(a) >= 5` never held" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
