@@ -286,7 +286,8 @@ class LiveSession:
         self._planned: dict[str, Channel] = {}
         self._offered_s = self._settled_s = math.inf
         self._last_s: dict[str, float] = {}
-        self._silent: set[str] = set()
+        # when they sent their last messages
+        self._silent: dict[str, float] = {}
         self._heard: set[str] = set()
         self._rare: set[str] = set()
         self._intervals_s: dict[str, deque[float]] = {}
@@ -488,7 +489,7 @@ class LiveSession:
         if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
             self._begin(inbox, now_s)
         if silent := self._silent_topics(now_s):
-            self._silent |= {*silent}
+            self._silent |= {topic: self._last_s[topic] for topic in silent}
             listed = ", ".join(silent)
             self._notes.append(
                 f"no message on {listed} for {self._topic_timeout_s:g} s: what it reports is unknown"
@@ -506,8 +507,8 @@ class LiveSession:
         self._last_s[topic] = arrived_s
         if topic not in self._silent:
             return
-        self._silent.discard(topic)
-        self._notes.append(f"a message on {topic} again, after {since_s:.3g} s")
+        silent_s = arrived_s - self._silent.pop(topic)
+        self._notes.append(f"a message on {topic} again, after {silent_s:.3g} s")
         usual_s = median(intervals) if len(intervals) > 1 else 0.0
         timeout_s = self._topic_timeout_s or math.inf
         if usual_s >= timeout_s and topic not in self._rare:

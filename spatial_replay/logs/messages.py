@@ -277,7 +277,7 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
         pauses, reports, before = Pauses(), ReportsBack(), Trace.empty()
         for block in iter_blocks(self, start_ns, end_ns):
             trace = block.trace
-            pauses.add(trace.times_ns)
+            pauses.add(trace.times_ns, trace.is_unknown)
             reports.add(trace)
             if self.max_gap_ns is not None and len(trace):
                 block = replace(block, trace=_without_gaps(before, trace, self.max_gap_ns))

@@ -339,7 +339,8 @@ class Tracker:
         self._placed_messages: dict[str, Booleans] = {}
         self._begun_ns: dict[str, int] = {}
         self._unplaced_at: dict[str, list[Integers]] = defaultdict(list)
-        self._lost: set[str] = set()
+        # until when topics stay silent after they were lost
+        self._lost_until_ns: dict[str, int] = {}
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
@@ -364,8 +365,9 @@ class Tracker:
             is_placed = np.ones(len(times_ns), np.bool_)
             if reader.is_mapped:
                 columns = reader.read(log_times_ns, contents)
-                self._lost.discard(name)
                 times_ns, log_times_ns = times_ns[columns.good], log_times_ns[columns.good]
+                if len(times_ns) and self._lost_until_ns.get(name) == FOREVER_NS:
+                    self._lost_until_ns[name] = int(times_ns[0])
                 is_placed = np.ones(len(times_ns), np.bool_)
                 if columns.detections is not None and len(times_ns):
                     is_placed = self._take_detections(reader, times_ns, log_times_ns, columns.detections)
@@ -522,7 +524,7 @@ class Tracker:
             self._events[topic] = Events(last.name, at, rows, forever, last.class_code).after(last)
             # it does not pause, and did not fall silent by itself
             self._reported.pop(topic, None)
-        self._lost |= set(topics)
+        self._lost_until_ns |= dict.fromkeys(topics, FOREVER_NS)
         self._signals = {
             key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
             for key, series in self._signals.items()
@@ -707,10 +709,10 @@ class Tracker:
             state = events.state(times_ns, self.readers[topic].planned.max_age_ns)
             rows, in_gap = state.rows, self._in_gap(topic, times_ns, newest_ns)
             rows[in_gap[:, None] & (rows >= 0)] = STALE
-            is_stale = (rows == STALE).any(axis=0) & (topic not in self._lost)
-            for column in np.flatnonzero(is_stale).tolist():
+            is_stale = (rows == STALE) & (times_ns >= self._lost_until_ns.get(topic, 0))[:, None]
+            for column in np.flatnonzero(is_stale.any(axis=0)).tolist():
                 name = self.names.by_code[int(state.names[column])]
-                self.remarks.count_stale(topic, name, times_ns, rows[:, column] == STALE, in_gap)
+                self.remarks.count_stale(topic, name, times_ns, is_stale[:, column], in_gap)
             self._place_following(topic, times_ns, state)
             states.append(state)
         names, *columns = zip(*states, strict=True)
@@ -732,7 +734,7 @@ class Tracker:
             in_gap = self._in_gap(topic, times_ns, newest_ns)
             column = np.where((at < 0) | is_old | in_gap, np.nan, values[at])
             name = planned.mapping.signals[index].name
-            is_stale = (at >= 0) & (is_old | in_gap) & (topic not in self._lost)
+            is_stale = (at >= 0) & (is_old | in_gap) & (times_ns >= self._lost_until_ns.get(topic, 0))
             unknown.append((topic, name, is_stale, in_gap))
             # several topics may report one signal: the first that has a value counts
             first = columns.get(name, np.full(len(times_ns), np.nan))

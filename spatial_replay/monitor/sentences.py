@@ -619,13 +619,13 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     begin_ns, end_ns = gap.longest_ns
     length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"
     if gap.name is None:
+        lost = "the connection was lost, or topics were silent"
+        if not gap.is_filled and end_ns - begin_ns < 10**6:
+            return Sentence("Everything is unknown at ", Instant(begin_ns, first_ns), f": {lost}.")
         place = (Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length)
-        others = "" if (gap.first_ns, gap.last_ns) == (begin_ns, end_ns - 1) else ", and at other times"
-        why = (
-            "`max_gap` makes that unknown"
-            if gap.is_filled
-            else "the connection was lost, or topics were silent"
-        )
+        last_ns = end_ns - 1 if gap.is_filled else begin_ns
+        others = "" if (gap.first_ns, gap.last_ns) == (begin_ns, last_ns) else ", and at other times"
+        why = "`max_gap` makes that unknown" if gap.is_filled else lost
         return Sentence("The samples pause from ", *place, f"{others}: {why}.")
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")

@@ -425,11 +425,17 @@ class Trace(Displayed):
         return int(np.count_nonzero(self.rows < ABSENT))
 
     @property
-    def filling(self) -> NDArray[np.bool_]:
-        """Return (T,), which samples fill a pause: nothing is known, right after a sample or before one."""
+    def is_unknown(self) -> NDArray[np.bool_]:
+        """Return (T,), in which samples no object and no signal is known."""
         unknown = (self.rows < 0).all(axis=1)
         for values in self.signals.values():
             unknown &= np.isnan(values)
+        return unknown
+
+    @property
+    def filling(self) -> NDArray[np.bool_]:
+        """Return (T,), which samples fill a pause: nothing is known, right after a sample or before one."""
+        unknown = self.is_unknown
         turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
         is_close = np.concatenate([[False], np.diff(self.times_ns) == 1, [False]])
         found = np.zeros(len(self), np.bool_)
@@ -792,17 +798,24 @@ class Pauses:
     """The intervals between times, added in order; few of them are held in a long log."""
 
     def __init__(self) -> None:
-        self._last = np.empty(0, np.int64)
+        self._last, self._is_lost = np.empty(0, np.int64), np.empty(0, np.bool_)
         self._pieces: list[Integers] = []
         self._first_usual_ns: int | None = None
         self._count = 0
 
-    def add(self, times_ns: Integers) -> None:
-        """Add times, which follow those before."""
+    def add(self, times_ns: Integers, is_lost: NDArray[np.bool_] | None = None) -> None:
+        """Add times, which follow those before.
+
+        Args:
+            is_lost: (T,) where nothing is known from a time on, so that the interval after it is no pause.
+        """
         times = np.concatenate([self._last, times_ns])
-        self._last = times[-1:].copy()
+        lost = np.concatenate(
+            [self._is_lost, np.zeros(len(times_ns), np.bool_) if is_lost is None else is_lost]
+        )
+        self._last, self._is_lost = times[-1:].copy(), lost[-1:].copy()
         self._count += max(0, len(times) - 1)
-        self._hold(np.array([times[:-1], np.diff(times)]))
+        self._hold(np.array([times[:-1], np.diff(times)])[:, ~lost[:-1]])
         if self._first_usual_ns is None and self._count >= _MOST_HELD:
             held = self._held
             self._first_usual_ns = int(np.median(held[1, :_MOST_HELD]))

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spatial_replay import UsageError, read_trace, replay_log
+from spatial_replay import (
+    Footprint,
+    Recorder,
+    Sample,
+    UsageError,
+    parse_specification,
+    read_trace,
+    replay_log,
+)
 from spatial_replay.cli import run
 from spatial_replay.trace.trace import Pauses
 
@@ -34,6 +42,21 @@ def test_a_pause_is_remarked_with_its_place_and_length(log: Path) -> None:
         "run.jsonl: samples pause for 5.100 s from 1.900 s on, where one usually comes every 0.1 s; `max_gap`"
         " makes what lies there unknown",
     )
+
+
+def test_a_lost_connection_is_no_pause_and_not_called_max_gap(tmp_path: Path) -> None:
+    log, spec = tmp_path / "run.mcap", parse_specification("spec far = G (cup dist wall >= 1)")
+    wall = Footprint.box(50, 0, 51, 1)
+    with Recorder(log, specifications=[spec]) as recorder:
+        for tick in range(40):
+            time_ns = tick * 10**8 + (5 * 10**9 if tick >= 20 else 0)
+            recorder.write(Sample(time_ns, {"cup": Footprint.box(tick, 0, tick + 1, 1), "wall": wall}))
+            if tick == 19:
+                recorder.write(Sample(time_ns + 1, unknown={"cup": None, "wall": None}))
+    replayed = replay_log(log, spec)
+    explained = replayed.results[0].explain()
+    assert "The samples pause from 1.900 s to 7.000 s (5.100 s): the connection was lost" in explained
+    assert "max_gap" not in explained + " ".join(map(str, replayed.remarks))
 
 
 def test_everything_in_a_longer_pause_is_unknown(log: Path, tmp_path: Path) -> None:
