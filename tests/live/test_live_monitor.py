@@ -777,7 +777,7 @@ def test_the_reason_of_an_unknown_result_is_printed_at_the_end(
     assert run(["replay", str(output), "--spec", str(spec)]) == 4
     explained = capsys.readouterr().out
     assert reason.removesuffix(".") in explained
-    assert "The samples pause from 0.040 s" in explained and "the connection was lost" in explained
+    assert "at 0.040 s: the connection was lost, or topics were silent." in explained
     assert "max_gap" not in said + explained
 
 

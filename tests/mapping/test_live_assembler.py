@@ -181,3 +181,29 @@ def test_a_stamp_in_another_unit_is_told_by_its_value() -> None:
         feed.add("/a", at + MS, pose_stamped(0, 0, "cam", time_ns=at // 10**9))
     [remark] = make(FRAMED, feed).remarks
     assert "its stamp is 1.79 s, in 1970: `stamp: {field: PATH, unit: s}` reads it in s" in remark
+
+
+@examples(60)
+@given(delays=st.lists(st.sampled_from([0, 0, 3, 20, 90]), min_size=60, max_size=60), stamped=st.booleans())
+def test_transforms_that_come_late_give_the_same_samples(delays: list[int], stamped: bool) -> None:
+    feed, arrivals = Feed(), []
+    arrived_ns = {"/tf": 0, "/a": 0}
+    for tick, delay in enumerate(delays):
+        at, topic = SECOND + tick // 2 * 20 * MS, "/a" if tick % 4 == 1 else "/tf"
+        if topic == "/tf":
+            content = tf(transform("map", "cam", (tick * tick, 0, 0), time_ns=at))
+        else:
+            content = pose_stamped(0, 0, "cam", time_ns=(at - 7 * MS) * stamped)
+        arrived_ns[topic] = max(arrived_ns[topic] + 1, at + delay * MS)
+        feed.add(topic, at, content)
+        arrivals.append(arrived_ns[topic])
+    assembler, _ = live(FRAMED, feed)
+    raw, traces = feed.raw(), []
+    for number in sorted(range(len(raw)), key=arrivals.__getitem__):
+        now_s = arrivals[number] / SECOND
+        while (due_s := assembler.due_s()) is not None and due_s < now_s:
+            traces.append(assembler.add([], due_s))
+        traces.append(assembler.add([raw[number]], now_s))
+    traces.append(assembler.finish())
+    assert Trace.concatenate(traces) == make(FRAMED, feed).trace
+    assert assembler.late == 0
