@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spatial_replay.perception import Frame, TagsFile, parse_tags
+from spatial_replay.perception import Frame, TagsFile, open_frames, parse_tags
 from spatial_replay.perception.opencv import Camera, pose_looking_at
 from spatial_replay.perception.video import VideoWriter
 from spatial_replay.runs.virtual_camera import Plate, render
@@ -65,6 +65,29 @@ def film(poses_at: Callable[[int], Poses], count: int, text: str = TABLE) -> Ite
     tags = parse_tags(text)
     for index in range(count):
         yield Frame(index * PERIOD_NS, picture(plates(tags, poses_at(index)), seed=index))
+
+
+def circling(time: float) -> Poses:
+    """Return where red and blue are at a time in frames: both move by up to 9 pixels a frame, and turn."""
+    angle = 0.12 * time
+    return {
+        0: (0.4 + 0.05 * math.sin(angle), -0.09 + 0.02 * math.cos(angle), 0.3 * angle),
+        1: (0.5, 0.07 + 0.06 * math.sin(angle + 1), 0.4),
+    }
+
+
+def compressed(frames: Sequence[Frame], crf: int, path: Path) -> Iterator[Frame]:
+    """Yield frames as they come out of a video, H.264 with the usual settings of its encoder."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.height, stream.width = frames[0].image.shape[:2]
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": f"{crf}"}
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame.image, format="gray")))
+        container.mux(stream.encode(None))
+    yield from open_frames(path)
 
 
 def approaching(count: int) -> Callable[[int], Poses]:

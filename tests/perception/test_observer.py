@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from perception.filmed import (
     PERIOD_NS,
     REFERENCES,
     TABLE,
+    circling,
+    compressed,
     film,
     picture,
     plate,
@@ -98,6 +101,64 @@ def test_the_truth_is_within_the_stated_uncertainty(text: str) -> None:
             stated.append(each.uncertainty)
     # and it says something: millimetres, where a pixel is 1.6 mm
     assert np.median(stated) < 0.004
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.5], ids=["sharp", "blurred"])
+def moving(request: pytest.FixtureRequest) -> list[Frame]:
+    """A film of two moving blocks, each frame exposed for a share of its period."""
+    instants = request.param * (np.arange(6) / 5 - 0.5) if request.param else [0.0]
+    tags = parse_tags(TABLE)
+    return [
+        Frame(
+            PERIOD_NS * index,
+            render(
+                "36h11",
+                [plates(tags, circling(index + instant)) for instant in instants],
+                LENS,
+                FROM_THE_SIDE,
+                seed=(index,),
+            ),
+        )
+        for index in range(30)
+    ]
+
+
+@pytest.mark.parametrize("crf", [28, 36])
+def test_moving_tags_are_within_the_stated_uncertainty_in_compressed_and_blurred_films(
+    crf: int, moving: list[Frame], tmp_path: Path
+) -> None:
+    outside = outlines = 0
+    for seen in observe_frames(compressed(moving, crf, tmp_path / "film.mp4"), parse_tags(TABLE)):
+        for number, pose in circling(seen.sample.time_ns / PERIOD_NS).items():
+            tracked = seen.sample.objects.get(("red", "blue")[number])
+            if tracked is None:
+                continue
+            outlines += 1
+            outside += farthest_corner(tracked, *pose) > tracked.uncertainty
+    # strong compression makes some tags unreadable
+    assert outlines >= 45
+    assert outside <= 1
+
+
+def test_moving_tags_of_a_clean_film_are_at_most_a_fifth_less_certain_than_resting_ones(
+    moving: list[Frame],
+) -> None:
+    def stated(text: str) -> float:
+        observed = observe_frames(moving, parse_tags(text))
+        return float(
+            np.median([each.uncertainty for seen in observed for each in seen.sample.objects.values()])
+        )
+
+    assert stated(TABLE) <= 1.2 * stated(TABLE + "corner_error: 0.1\n")
+
+
+def farthest_corner(tracked: TrackedObject, x: float, y: float, yaw: float) -> float:
+    """Return how far a corner of a block of 50 mm is from the nearest of its outline."""
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    square = 0.025 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    corners = square @ np.array([[cosine, sine], [-sine, cosine]]) + [x, y]
+    (part,) = tracked.footprint.parts
+    return float(np.linalg.norm(corners[:, None] - part.vertices, axis=2).min(axis=1).max())
 
 
 @pytest.mark.parametrize("top", [0.01, 0.04, -0.02])
