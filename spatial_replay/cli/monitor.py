@@ -80,15 +80,16 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     "--topics",
     metavar="PATTERN",
     multiple=True,
-    help="Messages to write, such as '/camera/*'; repeat for several.  [default: mapped]",
+    help="Messages to write, such as '/camera/*'; repeat.  [default: mapped]",
 )
 @click.option(
     "--for", "length_s", metavar="T", callback=_seconds, help="End after so much time, such as 60s."
 )
 @click.option(
     "--until",
+    metavar="WHEN",
     type=click.Choice(["violated", "satisfied", "settled"]),
-    help="End when any is violated, all are satisfied, or each is decided; or none can be.",
+    help="End when: violated (any), satisfied (all), settled (each); or none can be.",
 )
 @click.option(
     "--topic-timeout",
@@ -173,13 +174,11 @@ def monitor(
     serving: ServingArguments,
     layout: bool,
 ) -> ExitCode:
-    """Monitor a running robot through foxglove_bridge, or another server of Foxglove's WebSocket protocol.
+    """Monitor a running robot through foxglove_bridge, or another Foxglove WebSocket server.
 
     Prints each change of a verdict with its reason. While the connection is lost, everything is unknown.
-    Ctrl-C ends the run.
-
-    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown, 3 if the server does
-    not answer or its time jumps back.
+    Ctrl-C ends the run. Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown,
+    3 if the server does not answer or its time jumps back.
 
     With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1
     fires it, too, and so does the service `trigger` of --serve.
