@@ -131,7 +131,7 @@ def _value(node: yaml.Node, place: Place, document: Document) -> Value:
     if isinstance(node, yaml.MappingNode):
         return _table(node, place, document)
     if not isinstance(node, yaml.ScalarNode) or node.style is not None:
-        return node.value
+        return cast("Value", node.value)
     value = _scalar(node.value)
     if isinstance(value, float) and not isfinite(value):
         fault = f"{_text_from_place(place)}{cut(node.value, 60)} is no finite number; give one, such as 0.5"

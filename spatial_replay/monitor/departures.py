@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class Departures:
     """Members of open groups that leave and come back, collected block by block.
 
     A member counts if it was less than twice the threshold away before or after, or approached fast enough to
-    reach the threshold meanwhile.
+    reach the threshold while it was away.
 
     Attributes:
         departures: the ones so far.
@@ -120,7 +120,8 @@ class Departures:
             key, times_ns = (group, names[column]), trace.times_ns[list(places)].tolist()
             if not members[sample, column]:
                 why = _why_absent(group, names[column], trace, sample)
-                self._absent[key] = _Absence(why, *times_ns, own[:, 0], own[:, 1])
+                early_ns, last_ns, start_ns = times_ns
+                self._absent[key] = _Absence(why, early_ns, last_ns, start_ns, own[:, 0], own[:, 1])
             elif key in self._absent:
                 self._return(group, names[column], self._absent.pop(key), times_ns[-1], own[:, 2])
 
@@ -209,8 +210,9 @@ def _watches_of(instance: Instance) -> Iterator[_Watch]:
         first, second = (_with_group(term, groups) for term in (distances[0].first, distances[0].second))
         for member, other in ((first, second), (second, first)):
             group = base_of(member)
-            is_open = isinstance(group, Group) and group.is_open and not looks_back(member)
-            if is_open and not isinstance(base_of(other), Variable) and not looks_back(other):
+            is_now = not looks_back(member) and not looks_back(other)
+            is_bound = not isinstance(base_of(other), Variable)
+            if isinstance(group, Group) and group.is_open and is_now and is_bound:
                 yield _Watch(group, member, other, max(limits, default=0.0))
 
 
@@ -219,28 +221,38 @@ def _distances_of(atom: Atom) -> Iterator[SignedDistance]:
     return (part for part in dict.fromkeys(parts) if isinstance(part, SignedDistance))
 
 
+def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
+    """Return a term in which what it enlarges, or is the centre of, is changed."""
+    if isinstance(term, Enlarged | Centre):
+        inner: Any = _with_base(term.term, change)
+        return replace(term, term=inner)
+    return change(term)
+
+
 def _with_group(term: Term, groups: Mapping[str, Group | Earlier]) -> Term:
     """Return a term about the whole group that its variable stands for, without other variables."""
-    match term:
-        case Enlarged() | Centre():
-            return replace(term, term=_with_group(term.term, groups))
-        case Variable() if isinstance(group := groups.get(term.name), Group):
-            return _with_group(group, groups)
-        case Group():
-            return replace(term, excluded=tuple(x for x in term.excluded if isinstance(x, TrackedName)))
-    return term
+
+    def change(base: Term) -> Term:
+        group = groups.get(base.name, base) if isinstance(base, Variable) else base
+        if not isinstance(group, Group):
+            return base
+        excluded = tuple(member for member in group.excluded if isinstance(member, TrackedName))
+        return replace(group, excluded=excluded)
+
+    return _with_base(term, change)
 
 
 def _about(term: Term, name: str) -> Term:
     """Return a term about one member in place of its open group."""
-    if isinstance(term, Enlarged | Centre):
-        return replace(term, term=_about(term.term, name))
-    return TrackedName(name)
+    return _with_base(term, lambda _: TrackedName(name))
 
 
 def _without(term: Term, name: str) -> Term:
     """Return a term in which an object is no member of its open group."""
-    if isinstance(term, Enlarged | Centre):
-        return replace(term, term=_without(term.term, name))
-    is_open = isinstance(term, Group) and term.is_open
-    return replace(term, excluded=(*term.excluded, TrackedName(name))) if is_open else term
+
+    def change(base: Term) -> Term:
+        if not isinstance(base, Group) or not base.is_open:
+            return base
+        return replace(base, excluded=(*base.excluded, TrackedName(name)))
+
+    return _with_base(term, change)
