@@ -833,7 +833,7 @@ def test_a_run_begins_where_its_recording_does(
     assert run(["replay", str(output), "--spec", str(spec)]) == code
 
 
-def test_a_run_waits_as_long_as_it_is_told_to(tmp_path: Path) -> None:
+def test_a_run_waits_as_long_as_start_within_says(tmp_path: Path) -> None:
     mapped, spec = files(tmp_path, MAPPING.replace("10s", "1s"), "spec clear = G (robot dist vase >= 0.5)")
     sent = [pose(1, tick, 2.0) for tick in range(200)]
     sent += [pose(number, 200, 2.0 * (number == 1)) for number in (2, 1)]

@@ -173,7 +173,7 @@ def test_a_clock_that_steps_back_gives_the_same_samples_while_it_comes() -> None
     assert whole.states("a") == 30 * "+" + 4 * "?" + 26 * "+"
 
 
-def test_a_stamp_in_another_unit_is_told_by_its_value() -> None:
+def test_a_stamp_in_another_unit_is_named_with_its_value() -> None:
     feed = Feed()
     for tick in range(3):
         at = 1_790_000_000 * SECOND + tick * SECOND
