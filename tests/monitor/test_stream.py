@@ -86,7 +86,12 @@ def test_look_back_is_the_farthest_of_all_terms():
     def reach(text):
         return look_back([spec.formula for spec in parse_specification(text).specs])
 
-    assert reach("a ovlp b") == (0, 0)
-    assert reach("G (a[-3] ovlp enlarge(b[-5], 1)) and p >= 0") == (5, 0)
-    assert reach("F a closer b[-2s] than c[-1]") == (1, 2 * SECOND)
-    assert reach("group g = all\nspec s = forall x in g[-4]: a between[x] (x[-250ms], b)") == (4, SECOND // 4)
+    assert reach("a ovlp b") == (0, 0, False)
+    assert reach("G (a[-3] ovlp enlarge(b[-5], 1)) and p >= 0") == (5, 0, False)
+    assert reach("F a closer b[-2s] than c[-1]") == (1, 2 * SECOND, False)
+    assert reach("G (speed(a) <= 1 and a[-2] ovlp b)") == (2, 0, True)
+    assert reach("group g = all\nspec s = forall x in g[-4]: a between[x] (x[-250ms], b)") == (
+        4,
+        SECOND // 4,
+        False,
+    )
