@@ -34,7 +34,6 @@ from spatial_replay.geometry.footprint import (
     FootprintBatch,
     TrackedObject,
     centre_object,
-    packed_centre,
 )
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import QUANTITY_CODES, closest_rows, misalignment_of
@@ -587,8 +586,15 @@ class LeafPlan:
         arrays = _arrays(frame, rows, code, outputs)
         self.packed = PackedPlan.of(arrays)
         self.placeholders = placeholders
-        self._places = tuple(rows.places)
-        self._signals = tuple(code.signals)
+        terms = [place.rate for place in rows.places]
+        terms += [signal.terms for signal in code.signals if isinstance(signal, ReportStep)]
+        self._rates: tuple[tuple[Term, ...], ...] = tuple(filter(None, dict.fromkeys(terms)))
+        numbers = {rate: number for number, rate in enumerate(self._rates)}
+        self._places = tuple((*place[:3], numbers.get(place.rate)) for place in rows.places)
+        steps = (
+            numbers.get(signal.terms) if isinstance(signal, ReportStep) else None for signal in code.signals
+        )
+        self._signals = tuple(zip(code.signals, steps, strict=True))
         self._has_classes = bool(frame.classes)
         count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
         self._pack = Struct(f"={count}d").pack
@@ -612,12 +618,15 @@ class LeafPlan:
         numbers = [0.0]
         if len(samples) > 1:
             numbers = [0.0 if sample else ABSENT for sample in samples]
-        for signal in self._signals:
-            if isinstance(signal, Present):
+        steps = [_step(rate, newest, reports, stands_for) for rate in self._rates]
+        for signal, rate in self._signals:
+            if rate is not None:
+                numbers.append(steps[rate])
+            elif isinstance(signal, Present):
                 name = stands_for.get(signal.term.name, signal.term.name)
                 numbers.append(name in newest.objects or name in newest.unknown)
             else:
-                numbers.append(_signal(signal, newest, reports, stands_for))
+                numbers.append(_signal(signal, newest, reports))
         if not self._places:
             return self._pack(*numbers)
         packed = [b""]
@@ -627,16 +636,16 @@ class LeafPlan:
         for place, name, is_point, rate in self._places:
             name = stands_for.get(name, name) if stands_for else name
             tracked: Any = lookups[place](name)
-            if rate and tracked is not None:
+            if rate is not None and tracked is not None:
                 class_name = tracked.class_name
-                tracked = reports.moved_back(name, newest, _step(rate, newest, reports, stands_for))
+                tracked = reports.moved_back(name, newest, steps[rate])
                 if tracked is None:
                     packed.append(_HIDDEN)
                     if self._has_classes:
                         numbers.append(code_of(class_name))
                     continue
             if tracked is not None:
-                packed += packed_centre(tracked) if is_point else tracked.packed
+                packed += reports.packed_centre(name, tracked) if is_point else tracked.packed
                 if self._has_classes:
                     numbers.append(code_of(tracked.class_name))
                 continue
@@ -648,15 +657,13 @@ class LeafPlan:
         return b"".join(packed)
 
 
-def _signal(signal: Signal, sample: Sample, reports: RecentReports, stands_for: Mapping[str, str]) -> float:
+def _signal(signal: Signal, sample: Sample, reports: RecentReports) -> float:
     """Return what `TraceScene.signal` does of one sample."""
-    if isinstance(signal, ReportStep) and signal.signal is None:
-        return _step(signal.terms, sample, reports, stands_for)
     if isinstance(signal, ReportStep | PreviousSignal):
         latest = reports.of.get(signal.signal or signal)
         if latest is None or latest.before is None:
             return nan
-        return latest.seconds if isinstance(signal, ReportStep) else float(latest.before.shown)
+        return latest.seconds if isinstance(signal, ReportStep) else float(latest.before.value)
     if isinstance(signal, ComputedSignal):
         return computed_signal(signal, sample)
     return sample.signals.get(signal.name, nan)

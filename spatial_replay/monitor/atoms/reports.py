@@ -6,15 +6,15 @@ A run of samples that show one report of an object ends where they show another 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf, isfinite, nan
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.geometry.footprint import FootprintBatch, TrackedObject, centre_of, shifted
-from spatial_replay.spec.formula import ANY_CLASS, ComputedSignal, Group, Signal, Term
+from spatial_replay.geometry.footprint import FootprintBatch, TrackedObject, centre_of, packed_centre, shifted
+from spatial_replay.spec.formula import ANY_CLASS, ComputedSignal, Group, Signal, Term, TrackedName
 from spatial_replay.spec.relations import computed_signal
 from spatial_replay.spec.walks import named_members
 from spatial_replay.text import TEXTS
@@ -68,28 +68,31 @@ class Reports(NamedTuple):
         return cls(before.astype(np.int64), seconds)
 
 
-class LatestReport(NamedTuple):
+@dataclass(slots=True)
+class LatestReport:
     """The report that a sample shows of an object or a signal (see `Reports`).
 
     Attributes:
-        shown: the object, or the value.
+        value: the object, or the number of the signal.
         reported_ns: when it was reported.
         before: the last other report, None if there is none.
         seconds: the time between both; NaN if there is none, or if it is not positive.
+        centre: of an object, once it was asked for: its packed centre.
     """
 
-    shown: Any
+    value: Any
     reported_ns: int
     before: LatestReport | None = None
     seconds: float = nan
+    centre: tuple[bytes, bytes] | None = None
 
-    def follow(self, shown: Any, reported_ns: int) -> LatestReport:
+    def follow(self, value: Any, reported_ns: int) -> LatestReport:
         """Return what the next sample shows, by what it reports."""
         if reported_ns == self.reported_ns:
-            return self._replace(shown=shown)
+            return LatestReport(value, reported_ns, self.before, self.seconds)
         step_ns = reported_ns - self.reported_ns
-        before = self._replace(before=None)
-        return LatestReport(shown, reported_ns, before, step_ns / 1e9 if step_ns > 0 else nan)
+        self.before = None  # no more than two are needed
+        return LatestReport(value, reported_ns, self, step_ns / 1e9 if step_ns > 0 else nan)
 
 
 class RecentReports:
@@ -121,25 +124,30 @@ class RecentReports:
                 latest[signal] = self._next(signal, value, time_ns)
         self.of = latest
 
-    def _next(self, key: str | Signal, shown: Any, reported_ns: int) -> LatestReport:
+    def _next(self, key: str | Signal, value: Any, reported_ns: int) -> LatestReport:
         latest = self.of.get(key)
-        return LatestReport(shown, reported_ns) if latest is None else latest.follow(shown, reported_ns)
-
-    def seconds(self, name: str) -> float:
-        """Return the time between the last two reports of an object; NaN if there are no two."""
-        latest = self.of.get(name)
-        return nan if latest is None else latest.seconds
+        return LatestReport(value, reported_ns) if latest is None else latest.follow(value, reported_ns)
 
     def step(self, terms: Iterable[Term], sample: Sample) -> float:
         """Return the shortest time between two reports of what moves in some terms, NaN for none."""
-        shortest = inf
+        shortest, of = inf, self.of
         for term in terms:
-            for name in _members_in(term, sample):
-                seconds = self.seconds(name)
-                if seconds != seconds and name not in sample.lasting:
+            for name in (term.name,) if isinstance(term, TrackedName) else _members_in(term, sample):
+                seconds = of[name].seconds if name in of else nan
+                if seconds < shortest:
+                    shortest = seconds
+                elif seconds != seconds and name not in sample.lasting:
                     return nan
-                shortest = min(shortest, seconds if seconds == seconds else inf)
         return shortest if isfinite(shortest) else nan
+
+    def packed_centre(self, name: str, tracked: TrackedObject) -> tuple[bytes, bytes]:
+        """Return the packed centre of an object, computed once for each report."""
+        latest = self.of.get(name)
+        for report in () if latest is None else (latest, latest.before):
+            if report is not None and report.value is tracked:
+                report.centre = report.centre or packed_centre(tracked)
+                return report.centre
+        return packed_centre(tracked)
 
     def moved_back(self, name: str, sample: Sample, shortest: float) -> TrackedObject | None:
         """Return an object as it was some seconds ago by its velocity; None if it was not reported before."""
@@ -147,10 +155,10 @@ class RecentReports:
         if latest is None:
             return None
         before, seconds = latest.before, latest.seconds
-        now: TrackedObject = latest.shown
+        now: TrackedObject = latest.value
         if before is None or seconds != seconds:
             return now if name in sample.lasting else None
-        then: TrackedObject = before.shown
+        then: TrackedObject = before.value
         if seconds == shortest:
             return then
         if not seconds > shortest:

@@ -235,36 +235,36 @@ class TraceScene:
 
         If a rate is of several objects, the pair of reports with the shortest time between them.
         """
-        shown: list[TrackedName | Signal] = [rate.signal] if rate.signal else []
+        sources: list[TrackedName | Signal] = [rate.signal] if rate.signal else []
         for term in step_of(rate).terms:
-            shown += map(TrackedName, self._members_of(term)[0])
-        seconds = {name: float(self._reports_of(name).seconds[self.skip]) for name in shown}
-        moving = [name for name in shown if not isnan(seconds[name])]
+            sources += map(TrackedName, self._members_of(term)[0])
+        seconds = {name: float(self._reports_of(name).seconds[self.skip]) for name in sources}
+        moving = [name for name in sources if not isnan(seconds[name])]
         if not moving:
             return None
         nearest = min(moving, key=seconds.__getitem__)
         times_ns, before = self._reported_ns(nearest), self._reports_of(nearest).before[self.skip]
         return int(times_ns[before]), int(times_ns[self.skip])
 
-    def _reported_ns(self, shown: TrackedName | Signal) -> Integers:
+    def _reported_ns(self, source: TrackedName | Signal) -> Integers:
         """Return when each sample's report of an object or a signal was made, (T,) of the whole trace."""
         trace, reported_ns = self.trace, None
-        if isinstance(shown, TrackedName):
-            if trace.reported_ns is not None and shown.name in self._column:
-                reported_ns = trace.reported_ns[:, self._column[shown.name]]
-        elif not isinstance(shown, ComputedSignal):
-            reported_ns = trace.signals_reported_ns.get(shown.name)
+        if isinstance(source, TrackedName):
+            if trace.reported_ns is not None and source.name in self._column:
+                reported_ns = trace.reported_ns[:, self._column[source.name]]
+        elif not isinstance(source, ComputedSignal):
+            reported_ns = trace.signals_reported_ns.get(source.name)
         return trace.times_ns if reported_ns is None else reported_ns
 
-    def _reports_of(self, shown: TrackedName | Signal) -> Reports:
+    def _reports_of(self, source: TrackedName | Signal) -> Reports:
         """Return the reports of an object or a signal in the whole trace."""
-        if shown not in self._reports:
-            if isinstance(shown, TrackedName):
-                is_known = self._rows_of(shown.name) >= 0
+        if source not in self._reports:
+            if isinstance(source, TrackedName):
+                is_known = self._rows_of(source.name) >= 0
             else:
-                is_known = is_signal_known(self._signal(shown))
-            self._reports[shown] = Reports.of(is_known, self._reported_ns(shown))
-        return self._reports[shown]
+                is_known = is_signal_known(self._signal(source))
+            self._reports[source] = Reports.of(is_known, self._reported_ns(source))
+        return self._reports[source]
 
     def _step(self, terms: tuple[TrackedName | Variable | Group, ...]) -> Floats:
         """Return the shortest time between two reports of some terms, (T,) of the whole trace."""
@@ -343,8 +343,8 @@ class TraceScene:
     def _moved_back(self, term: Earlier) -> ResolvedTerm:
         """Resolve a term as a rate looks back at it."""
         shortest, columns, spreads = self._step(term.rate), [], []
-        for name, shown in zip(*self._members_of(term.term), strict=True):
-            rows, spread = self._moved_rows(name, shown, shortest)
+        for name, current in zip(*self._members_of(term.term), strict=True):
+            rows, spread = self._moved_rows(name, current, shortest)
             columns.append(rows)
             spreads.append(spread)
         if not columns:
@@ -357,24 +357,24 @@ class TraceScene:
         spread = np.stack(spreads, axis=1)[self.skip :].max(axis=1)
         return ResolvedTerm(Operand(rows), unknown, spread, np.full(len(rows), np.nan))
 
-    def _moved_rows(self, name: str, shown: Integers, shortest: Floats) -> tuple[Integers, Floats]:
+    def _moved_rows(self, name: str, current: Integers, shortest: Floats) -> tuple[Integers, Floats]:
         """Return an object's row in each sample, moved back by its velocity, and its uncertainty then.
 
         Args:
-            shown: (T,), its row in each sample of the whole trace.
+            current: (T,), its row in each sample of the whole trace.
             shortest: (T,), how far to move it back, in seconds.
         """
         before, seconds = self._reports_of(TrackedName(name))
-        is_there, stands = shown >= 0, np.isnan(seconds) & (name in self.trace.lasting)
+        is_there, stands = current >= 0, np.isnan(seconds) & (name in self.trace.lasting)
         before_rows = np.where(before < 0, ABSENT, self._rows_of(name)[before])
-        rows = np.where(is_there & ~stands, _NO_REPORT, shown)
+        rows = np.where(is_there & ~stands, _NO_REPORT, current)
         uncertainty = np.append(self.trace.uncertainty, 0.0)
-        spread = np.where(is_there, uncertainty[np.where(is_there, shown, -1)], 0.0)
+        spread = np.where(is_there, uncertainty[np.where(is_there, current, -1)], 0.0)
         was = is_there & (seconds == shortest)
         rows[was], spread[was] = before_rows[was], uncertainty[before_rows[was]]
         between = np.flatnonzero(is_there & (seconds > shortest))
         if len(between):
-            now, then = shown[between], before_rows[between]
+            now, then = current[between], before_rows[between]
             rows[between] = self._add_moved(now, then, shortest[between] / seconds[between])
             spread[between] = np.maximum(uncertainty[now], uncertainty[then])
         return rows, spread
