@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap_protobuf.schema import build_file_descriptor_set
 
-from bags.bag_files import POINT, SECOND, START_NS, Sent, point, write_json_mcap, write_ros1, write_ros2
+from bags.bag_files import (
+    POINT,
+    SECOND,
+    START_NS,
+    Sent,
+    point,
+    write_json_mcap,
+    write_mcap,
+    write_ros1,
+    write_ros2,
+)
 from mapping.feeding import Feed, make, pose_stamped, ros
 from spatial_replay import Footprint, Sample, Trace, evaluate, parse_specification, read_trace
 
 MS = 10**6
+POINT2 = build_file_descriptor_set(Point2).SerializeToString()
 
 
 def rates(trace: Trace, quantity: str) -> np.ndarray:
@@ -94,6 +107,11 @@ def test_containers_with_the_same_numbers_give_the_same_rates(tmp_path) -> None:
         write_ros2(tmp_path / "db3", sent, storage="sqlite3"),
         write_ros2(tmp_path / "mcap", sent),
         write_json_mcap(tmp_path / "run.mcap", listed),
+        write_mcap(
+            tmp_path / "protobuf.mcap",
+            [(topic, "protobuf", "foxglove.Point2", "protobuf", POINT2) for topic in ("/a", "/b")],
+            [(topic, time_ns, Point2(**at).SerializeToString()) for topic, time_ns, at in listed],
+        ),
     ]
     mapping = tmp_path / "m.yaml"
     mapping.write_text(
