@@ -342,6 +342,9 @@ _SHARED: Final = 1.2
 """The error of a pose in misfits: a codec moves blocks of pixels, so that corners share errors. In films with
 crf 23 to 36 a pose was off by up to 1.2 times the misfit per coordinate, root mean square."""
 
+_BLURRED: Final = 2.0
+"""How many times larger the error of a tag than that of the reference tags is worth a remark."""
+
 _MOVED: Final = 2.0
 """Pixels beyond which a reference tag is no longer where it was: the camera has moved."""
 
@@ -391,6 +394,7 @@ class CameraView:
         self._size: tuple[int, int] | None = None
         self._averages: dict[int, tuple[Floats, int]] = {}
         self._misfits: dict[int, deque[float]] = {}
+        self._sharpness: Counter[str] = Counter()
 
     def look(self, frame: Frame) -> tuple[View, dict[int, ObjectPose]]:
         """Return what a frame shows, and the pose that each tag gives its object.
@@ -490,6 +494,8 @@ class CameraView:
         misfits = self._misfits.setdefault(number, deque(maxlen=_LATE))
         misfits.append(pose.misfit)
         larger = max(_SHARED * max(misfits) / plane.corner_error, 1.0)
+        self._sharpness["fitted"] += 1
+        self._sharpness["blurred"] += larger > _BLURRED
         return pose._replace(spread=pose.spread * larger**2)
 
     def remarks(self) -> list[str]:
@@ -520,6 +526,13 @@ class CameraView:
                 f" reference tags, and no camera{of_it} is calibrated: outlines are up to"
                 f" {1e3 * self._parallax:.3g} mm less certain; calibrate the camera (tags calibrate), or fix"
                 " the reference tags as high as the others and give their height (plane: height: …)"
+            )
+        fitted, blurred = self._sharpness["fitted"], self._sharpness["blurred"]
+        if 2 * blurred > fitted:
+            lines.append(
+                f"the video{of_it} is blurred or strongly compressed: in {blurred} of {fitted} places,"
+                f" objects are more than {_BLURRED:g} times less certain; expose shorter, or"
+                " compress less (crf 18)"
             )
         if self.moved:
             who = self.name or "the camera"

@@ -128,7 +128,9 @@ def test_moving_tags_are_within_the_stated_uncertainty_in_compressed_and_blurred
     crf: int, moving: list[Frame], tmp_path: Path
 ) -> None:
     outside = outlines = 0
-    for seen in observe_frames(compressed(moving, crf, tmp_path / "film.mp4"), parse_tags(TABLE)):
+    observer = TagObserver(parse_tags(TABLE))
+    for frame in compressed(moving, crf, tmp_path / "film.mp4"):
+        seen = observer.observe(frame)
         for number, pose in circling(seen.sample.time_ns / PERIOD_NS).items():
             tracked = seen.sample.objects.get(("red", "blue")[number])
             if tracked is None:
@@ -138,6 +140,8 @@ def test_moving_tags_are_within_the_stated_uncertainty_in_compressed_and_blurred
     # strong compression makes some tags unreadable
     assert outlines >= 45
     assert outside <= 1
+    is_remarked = any("blurred or strongly compressed" in remark for remark in observer.remarks())
+    assert is_remarked == (crf == 36)
 
 
 def test_moving_tags_of_a_clean_film_are_at_most_a_fifth_less_certain_than_resting_ones(
