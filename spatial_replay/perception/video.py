@@ -401,32 +401,32 @@ class VideoFile:
         first, count, widest_ns = None, 0, 0
         untrue = Untrue()
         # a frame that is not true, until there is another one
-        kept: Frame | None = None
+        waiting: Frame | None = None
         try:
             length_ns = self._length_ns()
-            for found in self._decoded():
-                stamp = self._stamp_ns(found.frame, count)
+            for decoded in self._decode():
+                stamp = self._stamp_ns(decoded.frame, count)
                 count += 1
-                first = stamp if first is None and found.is_true else first
+                first = stamp if first is None and decoded.is_true else first
                 time_ns = 0 if first is None else stamp - first
-                untrue.add(time_ns, found.is_true)
-                if kept is not None:
-                    yield kept
-                    kept = None
+                untrue.add(time_ns, decoded.is_true)
+                if waiting is not None:
+                    yield waiting
+                    waiting = None
                 if first is None:
                     continue
-                if time_ns < last_ns and found.is_true:
+                if time_ns < last_ns and decoded.is_true:
                     raise LogError(self._order_fault(count, stamp, last_ns - time_ns))
                 if time_ns <= last_ns:
                     self.faults.append(f"{self.name}: frame {count} is not after the one before it; left out")
                     continue
                 widest_ns = max(widest_ns, time_ns - last_ns) if last_ns >= 0 else 0
                 before_ns, last_ns = last_ns, time_ns
-                frame = Frame(time_ns, picture(found), found.of)
-                if found.is_true:
+                frame = Frame(time_ns, picture(decoded), decoded.of)
+                if decoded.is_true:
                     yield frame
                 else:
-                    kept = frame
+                    waiting = frame
             # a file that ends within a frame has damaged that one
             if untrue.last == untrue.frames == 1:
                 at = (
@@ -436,8 +436,8 @@ class VideoFile:
                 )
                 self.faults.append(f"{self.name} breaks off {at}")
                 return
-            if kept is not None:
-                yield kept
+            if waiting is not None:
+                yield waiting
             self.faults += untrue.faults(self.name)
             # the last frame is shown as long as any other, however uneven they are
             if widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
@@ -456,7 +456,7 @@ class VideoFile:
             f" --rate {self._own_rate or 30:g}"
         )
 
-    def _decoded(self) -> Iterator[Decoded]:
+    def _decode(self) -> Iterator[Decoded]:
         """Yield frames in the order of showing, each with its bytes if it can be copied."""
         av = load_av()
         # an .avi has no times of showing: the frames shown take the times of decoding, in their order
@@ -476,17 +476,17 @@ class VideoFile:
             if packet.is_corrupt:
                 self.faults.append(f"{self.name}: a packet is damaged")
             copies: list[bytes] = []
-            found = []
+            frames: list[Decoded] = []
             try:
-                found = self._decoder.decode(packet, (copies, slot))
+                frames = self._decoder.decode(packet, (copies, slot))
             except av.InvalidDataError as error:
                 self.faults.append(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
             # the filter takes the packet's content
             if convert is not None and packet.size:
                 # one that is damaged has been reported above
                 with suppress(av.InvalidDataError):
-                    copies += [bytes(each) for each in convert.filter(packet)]
-            for decoded in found:
+                    copies += [bytes(converted) for converted in convert.filter(packet)]
+            for decoded in frames:
                 copies, slot = decoded.of
                 # a key frame is not shown before it is decoded: frames lost ahead of it leave their slots
                 while decoded.frame.key_frame and slot is not None and slots and slots[0] < slot:
