@@ -138,9 +138,8 @@ def _squares(centres: Floats, edges: Floats) -> Floats:
     """Return the corners (N, 4, 2) of squares around centres (N, 2), whose lower edges are (N, 2)."""
     half = edges[:, None] / 2
     across = np.stack([-half[..., 1], half[..., 0]], axis=-1)
-    return centres[:, None] + np.concatenate(
-        [-half - across, half - across, half + across, -half + across], axis=1
-    )
+    corners: Floats = np.concatenate([-half - across, half - across, half + across, -half + across], axis=1)
+    return np.asarray(centres[:, None] + corners)
 
 
 def _misfits(plane: Plane, corners: Floats, squares: Floats, z: Floats) -> Floats:
