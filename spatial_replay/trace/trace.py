@@ -427,7 +427,7 @@ class Trace(Displayed):
     @property
     def is_unknown(self) -> NDArray[np.bool_]:
         """Return (T,), in which samples no object and no signal is known."""
-        unknown = (self.rows < 0).all(axis=1)
+        unknown: NDArray[np.bool_] = np.asarray((self.rows < 0).all(axis=1))
         for values in self.signals.values():
             unknown &= np.isnan(values)
         return unknown

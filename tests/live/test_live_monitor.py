@@ -840,3 +840,23 @@ def test_a_run_waits_as_long_as_start_within_says(tmp_path: Path) -> None:
     with rude_server(*sent) as address:
         [update] = asyncio.run(updates_of(address, spec, mapped, 1, start_within_s=5.0))
     assert update.time_ns == 200 * 10 * MS + 1
+
+
+def test_a_message_that_comes_too_late_is_said(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    with robot() as own:
+
+        def drive_late() -> None:
+            until(own.is_heard)
+            for tick in (0, 10, 20):
+                own.send("/robot", tick * 10 * MS, x=2.0, y=0.0)
+                time.sleep(0.5 * (tick == 10))
+                own.send("/vase", tick * 10 * MS, x=0.0, y=0.0)
+
+        driving = threading.Thread(target=drive_late)
+        driving.start()
+        found = asyncio.run(updates_of(own.address, spec, mapped, 3))
+        driving.join()
+    assert [each.time_ns for each in found] == [0, 100 * MS, 200 * MS]
+    notes = [note for each in found for note in each.notes if "it came after the samples" in note]
+    assert len(notes) == 1 and "/vase at 0.100 s" in notes[0] and "the next sample has it" in notes[0]
