@@ -165,12 +165,12 @@ def _refuse_endless(path: Path) -> None:
         OSError: there is no such file.
     """
     mode = path.stat().st_mode
-    inside = [each for each in path.iterdir() if _BAG_FILE.search(each.name)] if S_ISDIR(mode) else []
     if not (S_ISREG(mode) or S_ISDIR(mode)):
         raise LogError(f"{path.name} is no regular file but a pipe, a socket or a device; give a file")
-    for file in inside:
-        if file.exists() and not file.is_dir():
-            _refuse_endless(file)
+    if is_bag_folder(path):
+        for file in path.iterdir():
+            if _BAG_FILE.search(file.name) and file.exists() and not file.is_dir():
+                _refuse_endless(file)
 
 
 def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
