@@ -183,8 +183,8 @@ class DecidingPath(NamedTuple):
     """The path down from a node.
 
     Attributes:
-        steps: at least one. The last is at a leaf, at `true` or `false`, or at an operator without a sample:
-            its window is empty, lies beyond the log, or has only samples that are left out.
+        steps: at least one. The last is at a leaf, at `true` or `false`, or at an operator without a sample.
+            The window of such an operator is empty, lies beyond the log, or has only samples left out.
         end: which end of the last node's interval decides.
     """
 
