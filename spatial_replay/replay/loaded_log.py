@@ -302,8 +302,8 @@ class LoadedLog:
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
         """Return the log with other specifications; samples and measurements are those in memory.
 
-        The log is read again only if these look back at samples before the window, and the former did not, or
-        if these name other objects or signals of a log whose ends are trimmed.
+        The log is read again if these look back at samples before the window, and the former did not. It is
+        also read again if these name other objects or signals of a log whose ends are trimmed.
 
         Raises:
             UsageError: an option that does not fit these specifications.

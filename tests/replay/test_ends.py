@@ -252,8 +252,8 @@ def test_an_object_that_is_not_in_view_yet_is_unknown(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "s.spatial").write_text("spec met = F[0s, 1s] (robot dist anna <= 9)\n")
-    nobody, somebody = people(range(0, 400, 100)), people(range(400, 4_000, 100), "anna")
-    write_frames(folder, range(0, 5_000, 100), persons=nobody + somebody)
+    empty, seen = people(range(0, 400, 100)), people(range(400, 4_000, 100), "anna")
+    write_frames(folder, range(0, 5_000, 100), persons=empty + seen)
     document, said = replay(capsys, code=0)
     assert document["log"]["samples"] == 80
     assert "left out" not in said

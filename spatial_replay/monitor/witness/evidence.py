@@ -29,7 +29,7 @@ class Gap:
         missing, samples: in how many of how many samples it is missing.
         first_ns, last_ns: the first and the last of these.
         window: the start, and the end (not included), of the samples between missing ones at the ends of a
-            log; None if others are missing, and for a member of a class that comes later, or leaves.
+            log; None if others are missing. A member of a class that comes later, or leaves, has none.
         longest_ns: the first sample of the longest stretch without it, and the first one after, if any.
         is_filled: whether samples fill that stretch to its end, as `max_gap` does: a lost connection has one.
     """
