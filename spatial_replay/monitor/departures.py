@@ -152,7 +152,9 @@ class Departures:
     def _return(self, group: Group, name: str, absence: _Absence, end_ns: int, distances: Floats) -> None:
         """Add the departure of a member that is back, if it was within reach of a threshold."""
         span_ns = max(absence.last_ns - absence.early_ns, 1)
-        approach = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
+        # a group without members is infinitely far away, and no member approaches it
+        with np.errstate(invalid="ignore"):
+            approach = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
         for watch, close, last, back in zip(
             self._watches[group], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
         ):

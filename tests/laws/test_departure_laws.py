@@ -81,3 +81,9 @@ def test_departures_do_not_depend_on_how_a_log_is_divided(samples, data):
     for begin, end in pairwise([0, *sorted(cuts), len(trace)]):
         departures.add(trace.slice(begin, end))
     assert set(departures.departures) == set(replayed.left)
+
+
+def test_a_member_infinitely_far_from_an_empty_group_is_no_departure():
+    samples = [{"p": (0.25, "person")}, {"p": (0.25, "person")}, {}, {"p": (0.25, "person")}]
+    away = sr.parse_specification('G (forall p in class "person": p dist (class "dog") >= 0.5)')
+    assert not Replay(MemorySource(trace_of(samples)), [away], certify=False).run().left
