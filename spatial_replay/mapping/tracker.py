@@ -488,8 +488,10 @@ class Tracker:
         at = np.maximum(np.searchsorted(heard_ns, times_ns, "right") - 1, 0)
         is_placed = self._placed_messages[planned.name][at]
         is_old = times_ns - heard_ns[at] > planned.max_age_ns
-        is_unplaced = np.isin(times_ns, np.concatenate([times_ns[:0], *self._unplaced_at[planned.name]]))
-        return np.asarray((times_ns >= begun_ns) & is_placed & ~is_old & ~is_unplaced)
+        is_judged = (times_ns >= begun_ns) & is_placed & ~is_old
+        if unplaced := self._unplaced_at.get(planned.name):
+            is_judged &= ~np.isin(times_ns, np.concatenate(unplaced))
+        return np.asarray(is_judged)
 
     def forget(self, upto_ns: int) -> None:
         """Drop what no later sample needs: all but the last observation of each object and signal."""
