@@ -95,6 +95,23 @@ def test_an_explanation_offers_presence_where_the_object_is_all_that_is_missing(
     assert "while bob" not in said
     assert run(["explain", log, "--spec", "F (speed(ann) >= 2)"]) == 4
     assert "it is violated: write `F (present(ann) and …)`." in capsys.readouterr().out
+    # a name that the log never has is misspelt rather than absent
+    assert run(["explain", log, "--spec", "G (speed(eve) <= 2)"]) == 4
+    assert "Asked only" not in capsys.readouterr().out
     # without a lamp there is nothing that presence could make known
     assert run(["explain", log, "--spec", "G (ann dist bob >= 1 and lamp >= 2)"]) in (2, 4)
     assert "Asked only" not in capsys.readouterr().out
+
+
+def test_an_explanation_names_the_rate_that_leaves_a_certain_body_open(
+    log: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for formula in (
+        "G (present(ann) and speed(ann) <= 2)",
+        "G (present(ann) and (WX (Y (speed(ann) <= 2))))",
+    ):
+        assert run(["explain", log, "--spec", formula]) == 4
+        said = capsys.readouterr().out
+        assert "`speed(ann) <= 2` is unknown at 2.000 s" in said
+        assert "ann is not in the sample" in said
+        assert "uncertainty" not in said

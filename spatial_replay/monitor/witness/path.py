@@ -224,9 +224,34 @@ class _Walk:
                 if taken is None or self._done.is_left_out(taken.node, taken.sample):
                     return DecidingPath((here,), end)
                 below = self.follow(taken.node, taken.sample, end)
+                if end is End.OPEN and not self._is_open(below.steps[-1]):
+                    # the operand is certain there, but not whether its rates have values
+                    below = next(self._unknown_rates(taken.node, taken.sample), below)
             case _:
                 return DecidingPath((here,), end)
         return DecidingPath((here, *below.steps), below.end)
+
+    def _is_open(self, step: PathNode) -> bool:
+        low, high = self._done.interval(step.node, step.sample)
+        return low < 0.0 <= high
+
+    def _unknown_rates(self, node: int, sample: int) -> Iterator[DecidingPath]:
+        """Iterate over the paths to rates that an operator asks of its operand and that are unknown."""
+        here, (formula, operands) = PathNode(node, sample), self._done.tree[node]
+        match formula:
+            case Atom() if rate_conditions(formula) and self._is_open(here):
+                yield DecidingPath((here,), End.OPEN)
+                return
+            case Temporal(operator="X" | "WX"):
+                sample += 1
+            case Temporal(operator="Y"):
+                sample -= 1
+            case Temporal() | Quantified():
+                return
+        if 0 <= sample < len(self._done.times_ns):
+            for operand in operands:
+                for below in self._unknown_rates(operand, sample):
+                    yield DecidingPath((here, *below.steps), End.OPEN)
 
     def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
         low, high = (column[samples] for column in self._done.judged_ends(operand.index))

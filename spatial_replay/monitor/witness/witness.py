@@ -252,7 +252,7 @@ def _while_present(
 ) -> WhilePresent | None:
     """Return the verdict of a node while its objects are present, by the innermost operator of a path.
 
-    None where that is unknown, too, or the leaf's objects are in all samples.
+    None where that is unknown, too, the leaf's objects are in all samples, or one of them is in none.
     """
     instance, bindings = evidence.instance, evidence.instance.bindings
     formula, order = instance.formula, instance.program.leaves
@@ -269,7 +269,7 @@ def _while_present(
     conditions = [Atom(each.signal.name, "present", each) for each in map(presence_of, terms)]
     columns = evidence.columns(conditions)[:, :, : len(times_ns)]
     absent = [place for place in range(len(terms)) if (columns[0, place] < 0.0).any()]
-    if not absent:
+    if not absent or any((columns[0, place] < 0.0).all() for place in absent):
         return None
     condition = Boolean("and", tuple(conditions[place] for place in absent))
     operator = nodes[around[-1]]
