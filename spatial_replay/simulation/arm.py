@@ -218,7 +218,7 @@ class Scene:
     def clearance(self, covered: Footprint, name: str, *, above: float = 0.0) -> float:
         """Return the distance, in metres, to all bodies but one that reach higher than `above`."""
         others = [
-            self.footprint(other) for other in self.bodies if other != name and self.height(other)[1] > above
+            self.footprint(body) for body in self.bodies if body != name and self.height(body)[1] > above
         ]
         return least_distance(covered, others) if others else math.inf
 
@@ -296,11 +296,11 @@ def best_grasp(
         opening = min(WIDEST, thickness + _OPENING)
         for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw, is_lifted):
             grasp = Grasp(grasp_yaw, turn, above_bottom, opening)
-            here = _room(scene, name, start, grasp.yaw, grasp, bottom)
-            there = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
+            room_at_pick = _room(scene, name, start, grasp.yaw, grasp, bottom)
+            room_at_goal = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
             can_turn_hand = True
-            can_pick, can_place = can_pick or here > _ROOM, can_place or there > _ROOM
-            room = min(here, there, _AMPLE)
+            can_pick, can_place = can_pick or room_at_pick > _ROOM, can_place or room_at_goal > _ROOM
+            room = min(room_at_pick, room_at_goal, _AMPLE)
             if room > best_room:
                 best, best_room = grasp, room
     if best is not None:
@@ -320,9 +320,9 @@ def surface(scene: Scene, name: str, goal: Point) -> float:
     """Return the height of the support under a point: the table, or a body that supports others."""
     spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
     under = [
-        scene.height(other)[1]
-        for other, body in scene.bodies.items()
-        if body.support and other != name and least_distance(spot, [scene.footprint(other)]) <= 0
+        scene.height(support)[1]
+        for support, body in scene.bodies.items()
+        if body.support and support != name and least_distance(spot, [scene.footprint(support)]) <= 0
     ]
     return max(under, default=0.0)
 
@@ -398,7 +398,7 @@ def picking(
     if not trouble:
         at, trouble = "place", (yield from set_down(scene, name, goal))
     yield from let_go(scene, grasp.opening)
-    trouble = trouble or missed(scene, name, goal, stood=stood)
+    trouble = trouble or miss_text(scene, name, goal, stood=stood)
     return Outcome(False, trouble, at) if trouble else Outcome(True, f"placed {name}")
 
 
@@ -478,7 +478,7 @@ def let_go(scene: Scene, opening: float) -> Motion:
     yield from scene.arm.move(x, y, ABOVE)
 
 
-def missed(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
+def miss_text(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
     """Return how a released body differs from its goal, or ""."""
     if stood and not scene.pose(name).stands:
         return f"{name} fell over"
@@ -535,7 +535,7 @@ def pushing(
 
     With `yaw`, turn it there: a stroke also turns a body a little, as its side comes to lie at the fingers.
     """
-    corners = straightened([scene.place_of(name), *path])[1:]
+    corners = straighten([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
         trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
         if trouble is not None:
@@ -555,17 +555,17 @@ def _push_to(
     scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
 ) -> Generator[None, None, Outcome | None]:
     """Push a body to a point in several strokes; return the failure, if it fails."""
-    missed = 0.0
+    miss_m = 0.0
     for _ in range(strokes):
         trouble = yield from _stroke(scene, name, goal)
         if trouble is not None:
             return trouble
-        missed = math.dist(scene.place_of(name), goal)
-        if missed <= _CLOSE:
+        miss_m = math.dist(scene.place_of(name), goal)
+        if miss_m <= _CLOSE:
             break
-    if missed <= allowed:
+    if miss_m <= allowed:
         return None
-    return Outcome(False, f"{name} ended {missed * 100:.1f} cm from where it was pushed to", "place")
+    return Outcome(False, f"{name} ended {miss_m * 100:.1f} cm from where it was pushed to", "place")
 
 
 def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, str]:
@@ -581,11 +581,11 @@ def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generat
     left = abs(scene.pose(name).turned_from(yaw))
     if left > _TURNED:
         return f"{name} is {math.degrees(left):.0f} degrees from how it was turned"
-    missed = math.dist(scene.place_of(name), goal)
-    return "" if missed <= _FAR else f"{name} ended {missed * 100:.1f} cm from where it was pushed to"
+    miss_m = math.dist(scene.place_of(name), goal)
+    return "" if miss_m <= _FAR else f"{name} ended {miss_m * 100:.1f} cm from where it was pushed to"
 
 
-def straightened(path: Sequence[Point]) -> list[Point]:
+def straighten(path: Sequence[Point]) -> list[Point]:
     """Return the corners of a path, without points on the line between others (Douglas–Peucker)."""
     if len(path) < 3:
         return list(path)
@@ -600,7 +600,7 @@ def straightened(path: Sequence[Point]) -> list[Point]:
     farthest = int(np.argmax(away))
     if away[farthest] <= _STRAIGHTENED:
         return [path[0], path[-1]]
-    return straightened(path[: farthest + 1])[:-1] + straightened(path[farthest:])
+    return straighten(path[: farthest + 1])[:-1] + straighten(path[farthest:])
 
 
 def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outcome | None]:

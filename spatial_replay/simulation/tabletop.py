@@ -142,7 +142,7 @@ class Tabletop:
             if injection.kind == "drop" and scenario.skill == "push":
                 what = f"nothing is held in {scenario.name}"
                 raise UsageError(f"{injection}: {what}; slip can be injected there")
-        names = [each.body.name for each in scenario.placements]
+        names = [placement.body.name for placement in scenario.placements]
         for start in starts:
             if start.name not in names:
                 hint = nearest_hint(start.name, names) or f"there are {', '.join(names)}"
@@ -171,7 +171,7 @@ class Tabletop:
     @property
     def bodies(self) -> tuple[Body, ...]:
         """The objects, in the order of the samples."""
-        return tuple(each.body for each in self._scenario.placements)
+        return tuple(placement.body for placement in self._scenario.placements)
 
     @property
     def workspace(self) -> Mapping[str, Any]:
@@ -207,17 +207,19 @@ class Tabletop:
         self._seed, self._ticks, self._last_sampled = seed, 0, -1
         # a reset of PyBullet leaves internal state behind; only a new simulator repeats a run exactly
         self._engine = engine = Engine(gui=self._gui)
-        scenario, drawn = self._scenario, np.random.default_rng([seed, 0])
-        for each in scenario.placements:
-            dx, dy, turn = (drawn.random(3) * 2 - 1).tolist()
-            tall = each.body.shape.height
-            x, y = each.x + dx * scenario.scatter_m, each.y + dy * scenario.scatter_m
-            yaw = each.yaw + turn * scenario.scatter_rad
-            if (start := self._starts.get(each.body.name)) is not None:
+        scenario, generator = self._scenario, np.random.default_rng([seed, 0])
+        for placement in scenario.placements:
+            dx, dy, turn = (generator.random(3) * 2 - 1).tolist()
+            tall = placement.body.shape.height
+            x, y = placement.x + dx * scenario.scatter_m, placement.y + dy * scenario.scatter_m
+            yaw = placement.yaw + turn * scenario.scatter_rad
+            if (start := self._starts.get(placement.body.name)) is not None:
                 x, y, yaw = start.x, start.y, yaw if start.turn is None else start.turn
-            place = (x, y, each.bottom + tall / 2 + 5e-4)
-            engine.add(each.body.name, each.body.shape, each.mass_kg, place, yaw, each.colour)
-        bodies = {each.body.name: each.body for each in scenario.placements}
+            place = (x, y, placement.bottom + tall / 2 + 5e-4)
+            engine.add(
+                placement.body.name, placement.body.shape, placement.mass_kg, place, yaw, placement.colour
+            )
+        bodies = {placement.body.name: placement.body for placement in scenario.placements}
         arm, bodies_by_name = Arm(engine), MappingProxyType(bodies)
         self._scene = Scene(engine, arm, bodies_by_name, lambda tick: self._listen_to_tree(tick))
         self._scene.arm.drive()
@@ -230,7 +232,7 @@ class Tabletop:
         number = self._ticks // _TICKS_PER_SAMPLE
         errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
         objects = {
-            name: self._tracked(body, self._scene.pose(name), error)
+            name: self._tracked_object(body, self._scene.pose(name), error)
             for (name, body), error in zip(self._scene.bodies.items(), errors, strict=True)
         }
         x, y, z = self._scene.arm.position.tolist()
@@ -337,11 +339,11 @@ class Tabletop:
     def _inject(self) -> None:
         if not self._injections:
             return
-        going_on = {each.kind for each in self._injections if each.holds(self.time_ns)}
+        going_on = {injection.kind for injection in self._injections if injection.holds(self.time_ns)}
         self._scene.arm.limp = "drop" in going_on
         self._scene.engine.set_grip(_OIL if "slip" in going_on else _RUBBER)
 
-    def _tracked(self, body: Body, pose: Pose, error: tuple[float, float]) -> TrackedObject:
+    def _tracked_object(self, body: Body, pose: Pose, error: tuple[float, float]) -> TrackedObject:
         detected = Pose(pose.position + np.array([*error, 0.0]), pose.rotation)
         yaw = pose.yaw if isinstance(body.shape, Box) and pose.is_level else None
         return TrackedObject(
@@ -365,8 +367,8 @@ class Tabletop:
     def _refuse_unless(self, skill: str, name: str, numbers: Sequence[float]) -> None:
         self._open_engine()
         if self._scenario.skill != skill:
-            other = self._scenario.skill
-            raise UsageError(f"the robot of {self.name} does not {skill} objects; it can {other} them")
+            robot_skill = self._scenario.skill
+            raise UsageError(f"the robot of {self.name} does not {skill} objects; it can {robot_skill} them")
         movable = [body.name for body in self.bodies if body.movable]
         if name not in movable:
             raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable)} can")
@@ -382,9 +384,9 @@ def _displacements(radius_m: float, seed: int, sample: int, count: int) -> list[
     """
     if radius_m == 0:
         return [(0.0, 0.0)] * count
-    drawn = np.random.default_rng([seed, sample, 1]).random((count, 2))
-    radii = (radius_m * np.sqrt(drawn[:, 0])).tolist()
-    angles = (2 * math.pi * drawn[:, 1]).tolist()
+    polar = np.random.default_rng([seed, sample, 1]).random((count, 2))
+    radii = (radius_m * np.sqrt(polar[:, 0])).tolist()
+    angles = (2 * math.pi * polar[:, 1]).tolist()
     return [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
 
 

@@ -32,11 +32,11 @@ def _script(scene: Scene) -> Generator[None, None, Outcome]:
         "mug": (x - 0.05, y + 0.24),
         "bottle": (x - 0.12, y + 0.31),
     }
-    done = Outcome(True, "nothing to do")
+    outcome = Outcome(True, "nothing to do")
     for name, goal in goals.items():
-        done = yield from picking(scene, name, goal, None)
-        if not done.succeeded:
-            return done
+        outcome = yield from picking(scene, name, goal, None)
+        if not outcome.succeeded:
+            return outcome
     x, y = scene.place_of("crackerbox")
     return (yield from picking(scene, "sugarbox", (x + 0.15, y - 0.1), None))
 

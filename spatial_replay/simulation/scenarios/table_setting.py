@@ -22,7 +22,7 @@ from spatial_replay.simulation.arm import (
     best_grasp,
     carry,
     let_go,
-    missed,
+    miss_text,
     pick_up,
     set_down,
 )
@@ -52,10 +52,10 @@ def setting_by_tree(
         yield
         ticks.tick()
     succeeded = tree.status is Status.SUCCESS
-    done = f"placed {', '.join(goals)}"
+    summary = f"placed {', '.join(goals)}"
     if blackboard.failures:
-        done += f", after this went wrong: {'; '.join(each.reason for each in blackboard.failures)}"
-    return Outcome(True, done) if succeeded else blackboard.failures[-1]
+        summary += f", after this went wrong: {'; '.join(failure.reason for failure in blackboard.failures)}"
+    return Outcome(True, summary) if succeeded else blackboard.failures[-1]
 
 
 class _Ticks:
@@ -101,7 +101,7 @@ def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard, via: Seq
 
     def leave() -> Generator[None, None, str]:
         yield from let_go(scene, _opening(blackboard, name))
-        return missed(scene, name, point)
+        return miss_text(scene, name, point)
 
     steps: dict[str, tuple[Stage, _Motion]] = {
         "pick": ("pick", lambda: pick_up(scene, name, blackboard.grasps[name])),
@@ -181,7 +181,7 @@ class _Placed(Behaviour):
     def update(self) -> Status:
         """Compare position and yaw with the goal."""
         point, yaw = self._goal
-        is_there = not missed(self._scene, self._body, point)
+        is_there = not miss_text(self._scene, self._body, point)
         turned = 0.0 if yaw is None else abs(self._scene.pose(self._body).turned_from(yaw))
         return Status.SUCCESS if is_there and turned <= _TURNED else Status.FAILURE
 
