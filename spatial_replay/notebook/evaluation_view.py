@@ -32,10 +32,10 @@ from spatial_replay.notebook.figures import (
     INK,
     Html,
     code,
+    details,
     draw_curve,
     draw_disc,
     element,
-    folded,
     new_panel,
     new_panels,
     plain,
@@ -71,8 +71,10 @@ def specification_html(specification: Specification) -> Html:
     about = quiet(f" {counted(len(results), 'result')}, profile {specification.profile}")
     kinds = ("constants", "regions", "groups")
     names = {kind: ", ".join(getattr(specification, kind)) for kind in kinds}
-    declared = [element("div", f"{kind}: {listed}") for kind, listed in names.items() if listed]
-    warnings = [element("div", f"warning: {each.message}") for each in specification.warnings[:5]]
+    declared = [
+        element("div", f"{kind}: {joined_names}") for kind, joined_names in names.items() if joined_names
+    ]
+    warnings = [element("div", f"warning: {warning.message}") for warning in specification.warnings[:5]]
     return element("div", element("div", title, about), *declared, _formula_trees(results), *warnings)
 
 
@@ -81,9 +83,9 @@ def _formula_trees(results: Sequence[NamedSpec]) -> Html:
     left = _MOST_FORMULAS
     rows: list[tuple[str]] = []
     for spec in results:
-        shown = [(tree_cell(stem, node),) for _, stem, node in islice(iter_branches(spec.formula), left)]
-        left -= len(shown)
-        rows += shown
+        cells = [(tree_cell(stem, node),) for _, stem, node in islice(iter_branches(spec.formula), left)]
+        left -= len(cells)
+        rows += cells
     return element("div", table(["tree"], rows), _left_out(results, len(rows)))
 
 
@@ -226,18 +228,18 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
             right, top = ring.max(axis=0).tolist()
             ax.text(right, top, plain(name), fontsize=8, ha="right", va="bottom")
     ends: list[tuple[float, float, str]] = []
-    shown = [column for column in range(len(trace.names)) if (trace.rows[:, column] >= 0).any()]
-    for number, column in enumerate(shown):
+    columns = [column for column in range(len(trace.names)) if (trace.rows[:, column] >= 0).any()]
+    for number, column in enumerate(columns):
         rows = trace.rows[:, column]
         rows = rows[rows >= 0]
         colour = CURVES[number % len(CURVES)]
-        kept = rows[np.unique(np.linspace(0, len(rows) - 1, _MOST_POINTS).astype(np.int64))]
-        ax.plot(*_centres(trace, kept).T, color=colour, linewidth=1.0)
+        sampled_rows = rows[np.unique(np.linspace(0, len(rows) - 1, _MOST_POINTS).astype(np.int64))]
+        ax.plot(*_centres(trace, sampled_rows).T, color=colour, linewidth=1.0)
         for ring in _rings(trace, rows[:1]):
             ax.fill(*ring.T, facecolor="none", edgecolor=colour, linestyle="--", linewidth=1.0)
         for ring in _rings(trace, rows[-1:]):
             ax.fill(*ring.T, facecolor=colour, edgecolor=colour, alpha=0.5)
-        if len(shown) <= _MOST_LABELS:
+        if len(columns) <= _MOST_LABELS:
             [(x, y)] = _centres(trace, rows[-1:]).tolist()
             ends.append((x, y, plain(trace.names[column])))
     _write_names(ax, ends)
@@ -252,18 +254,19 @@ def _write_names(ax: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
     """Write names at places (x, y, name), each above or below its place if another one is there already."""
     ax.apply_aspect()
     inches = ax.transData + ax.figure.dpi_scale_trans.inverted()
-    taken: list[tuple[float, float, float]] = []
+    labels: list[tuple[float, float, float]] = []
     for x, y, name in ends:
         across, up = (72.0 * inches.transform((x, y))).tolist()
         half = 0.3 * _NAME_SIZE * len(name)
         for step in _STEPS:
             is_free = all(
-                abs(across - other) > half + other_half or abs(up + step * _NAME_SIZE - row) >= _NAME_SIZE
-                for other, row, other_half in taken
+                abs(across - label_across) > half + label_half
+                or abs(up + step * _NAME_SIZE - row) >= _NAME_SIZE
+                for label_across, row, label_half in labels
             )
             if is_free:
                 break
-        taken.append((across, up + step * _NAME_SIZE, half))
+        labels.append((across, up + step * _NAME_SIZE, half))
         ax.annotate(
             name,
             (x, y),
@@ -309,7 +312,7 @@ def data_frame(value: Any) -> Any:
 def _of_evaluation(evaluation: Evaluation) -> Any:
     """Return a row for each result."""
     pandas = _pandas()
-    rows = [[getattr(each, name) for name in RESULT_COLUMNS] for each in evaluation.results]
+    rows = [[getattr(result, name) for name in RESULT_COLUMNS] for result in evaluation.results]
     frame = pandas.DataFrame(rows, columns=list(RESULT_COLUMNS))
     # times are whole numbers, or missing
     return frame.astype({"verdict": str} | dict.fromkeys(RESULT_TIMES, "Int64"))
@@ -358,10 +361,10 @@ def evaluation_html(evaluation: Evaluation) -> Html:
     """Return the verdict, a table of results, and a tree of each with its final numbers."""
     name = element("b", evaluation.specification.filename)
     title = element("div", name, " ", verdict_mark(evaluation.verdict))
-    shown = _worst_of(evaluation.results, _MOST_RESULTS)
-    left_out = len(evaluation.results) - len(shown)
+    worst = _worst_of(evaluation.results, _MOST_RESULTS)
+    left_out = len(evaluation.results) - len(worst)
     more = quiet(f"… and {counted(left_out, 'result')} more, none of them worse") if left_out else Html("")
-    return element("div", title, _results_table(shown), more, *_trees(shown))
+    return element("div", title, _results_table(worst), more, *_trees(worst))
 
 
 @html.register(SpecResult)
@@ -379,15 +382,15 @@ def _robustness_text(value: float, lower: float, upper: float, unit: str = "") -
 
 def _results_table(results: Sequence[SpecResult]) -> Html:
     rows = []
-    for each in results:
-        robustness = _robustness_text(each.robustness, each.lower, each.upper, each.unit)
-        name, verdict = element("b", each.title), verdict_mark(each.verdict)
-        tested = element("span", each.tested, title=" ".join(each.remarks))
-        rows.append((name, verdict, robustness, _first_satisfied(each), tested))
+    for result in results:
+        robustness = _robustness_text(result.robustness, result.lower, result.upper, result.unit)
+        name, verdict = element("b", result.title), verdict_mark(result.verdict)
+        tested = element("span", result.tested, title=" ".join(result.remarks))
+        rows.append((name, verdict, robustness, _first_satisfied_text(result), tested))
     return table(["result", "verdict", "robustness", "first satisfied", "tested"], rows)
 
 
-def _first_satisfied(result: SpecResult) -> str:
+def _first_satisfied_text(result: SpecResult) -> str:
     if result.verdict is Verdict.UNKNOWN:
         return "not known"
     at_ns = result.first_satisfied_ns
@@ -405,7 +408,7 @@ def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
         left_out = len(result.final) - len(rows)
         more = quiet(f"… and {counted(left_out, 'node')} more") if left_out else Html("")
         nodes = table(["verdict", "robustness", "node"], rows)
-        yield folded(f"tree of {result.title}, each node at the first sample", nodes, more)
+        yield details(f"tree of {result.title}, each node at the first sample", nodes, more)
 
 
 def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
@@ -442,22 +445,22 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
         UsageError: more or fewer axes than results, or matplotlib is not installed.
     """
     if ax is not None:
-        given = np.array(list(ax) if isinstance(ax, Iterable) else [ax], object)
-        return _drawn(evaluation.results, tuple(given.flat))
-    shown = _worst_of(evaluation.results, _MOST_PANELS)
-    if not shown:
+        axes = np.array(list(ax) if isinstance(ax, Iterable) else [ax], object)
+        return _draw_results(evaluation.results, tuple(axes.flat))
+    worst = _worst_of(evaluation.results, _MOST_PANELS)
+    if not worst:
         return ()
-    size = (_WIDTH, 0.4 + _HEIGHT * len(shown))
-    panels = _drawn(shown, new_panels(len(shown), 1, size, same_x=True))
+    size = (_WIDTH, 0.4 + _HEIGHT * len(worst))
+    panels = _draw_results(worst, new_panels(len(worst), 1, size, same_x=True))
     for panel in panels:
         panel.label_outer()
-    if len(shown) < len(evaluation.results):
-        left_out = counted(len(evaluation.results) - len(shown), "result")
+    if len(worst) < len(evaluation.results):
+        left_out = counted(len(evaluation.results) - len(worst), "result")
         panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\nand {left_out} more, none worse")
     return panels
 
 
-def _drawn(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axes, ...]:
+def _draw_results(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axes, ...]:
     """Draw each result in its axes."""
     if len(results) != len(panels):
         count = counted(len(results), "result")
@@ -501,13 +504,13 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
 def _curves(result: SpecResult) -> list[_Curve]:
     """Return the curve of a result, and those of the first named specs in it."""
     colours = {Verdict.SATISFIED: POSITIVE, Verdict.VIOLATED: NEGATIVE}
-    own = hexadecimal(colours.get(result.verdict, NEUTRAL))
+    verdict_colour = hexadecimal(colours.get(result.verdict, NEUTRAL))
     named = {node.name: number for number, _, node in reversed(list(iter_nodes(result.formula))) if node.name}
     parts = sorted((number, name) for name, number in named.items() if number)
     # the first two colours stand for satisfied and violated
     others = zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False)
     return [
-        _Curve(result.title, _finite(result, 0), own),
+        _Curve(result.title, _finite(result, 0), verdict_colour),
         *(_Curve(name, _finite(result, number), colour) for (number, name), colour in others),
     ]
 
@@ -552,8 +555,8 @@ def _draw_key(
 
 def _last(values: Floats) -> float:
     """Return the last number of a curve; 0 without one."""
-    known = values[~np.isnan(values)]
-    return float(known[-1]) if len(known) else 0.0
+    finite = values[~np.isnan(values)]
+    return float(finite[-1]) if len(finite) else 0.0
 
 
 def _apart(places: Sequence[float]) -> list[float]:
@@ -593,12 +596,12 @@ def automaton_html(automaton: Automaton) -> Html:
     if _is_large(automaton):
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
     drawing = automaton_svg(automaton)
-    shown = quiet("install Graphviz to see it drawn") if drawing is None else Html(drawing)
+    content = quiet("install Graphviz to see it drawn") if drawing is None else Html(drawing)
     words = words_text(automaton).split("\n")
     lines = [element("div", code(line)) for line in words[:_MOST_LINES]]
     more = [quiet(f"… and {len(words) - _MOST_LINES:,} lines more")] if len(words) > _MOST_LINES else []
-    drawn = element("div", shown, style="overflow-x:auto")
-    return element("div", title, drawn, folded("in words", *lines, *more))
+    picture = element("div", content, style="overflow-x:auto")
+    return element("div", title, picture, details("in words", *lines, *more))
 
 
 def automaton_svg(automaton: Automaton) -> str | None:
@@ -617,7 +620,7 @@ def _is_large(automaton: Automaton) -> bool:
     # the transitions of an automaton with very many states take long to find
     if len(automaton.states) > _MOST_STATES or not automaton.is_listable:
         return True
-    return sum(len(each.guard) for each in automaton.transitions) > _MOST_CUBES
+    return sum(len(transition.guard) for transition in automaton.transitions) > _MOST_CUBES
 
 
 @plot.register(Automaton)
@@ -666,7 +669,7 @@ def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None
 
 def _draw_edge(ax: Axes, edge: Mapping[str, Any]) -> None:
     """Draw a curve with a head, and the guard beside it."""
-    head, *points = (_point(each.removeprefix("e,")) for each in edge["pos"].split())
+    head, *points = (_point(point.removeprefix("e,")) for point in edge["pos"].split())
     draw_curve(ax, points, _ARROW)
     ax.annotate(
         "", head, points[-1],

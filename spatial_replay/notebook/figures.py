@@ -108,15 +108,15 @@ class Html(str):
 
 def element(tag: str, *content: str, **attributes: str) -> Html:
     """Return an element; content that is not `Html` is escaped."""
-    written = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
-    inner = "".join(each if isinstance(each, Html) else escape(printable(each)) for each in content)
-    return Html(f"<{tag}{written}>{inner}</{tag}>")
+    attribute_text = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
+    inner = "".join(part if isinstance(part, Html) else escape(printable(part)) for part in content)
+    return Html(f"<{tag}{attribute_text}>{inner}</{tag}>")
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
     """Return a table."""
-    head = element("tr", *(element("th", each, style=_CELL) for each in headings))
-    body = [element("tr", *(element("td", each, style=_CELL) for each in row)) for row in rows]
+    head = element("tr", *(element("th", heading, style=_CELL) for heading in headings))
+    body = [element("tr", *(element("td", cell, style=_CELL) for cell in row)) for row in rows]
     return element("table", element("thead", head), element("tbody", *body), style="border-collapse:collapse")
 
 
@@ -125,7 +125,7 @@ def code(*content: str) -> Html:
     return element("span", *content, style="font-family:ui-monospace,monospace; white-space:pre")
 
 
-def folded(summary: str, *content: str) -> Html:
+def details(summary: str, *content: str) -> Html:
     """Return content that unfolds on a click on its summary."""
     return element("details", element("summary", summary, style="cursor:pointer"), *content)
 

@@ -67,8 +67,8 @@ def tuning_html(tuning: Tuning) -> Html:
         )
         return element("div", name, f": {none} all runs. {about}")
     rows = [
-        (each.name, str(each.value), str(each.written), f"{each.low} to {each.high}")
-        for each in tuning.constants
+        (constant.name, str(constant.value), str(constant.written), f"{constant.low} to {constant.high}")
+        for constant in tuning.constants
     ]
     closest = sorted(tuning.runs, key=lambda run: run.margin)
     runs = [
@@ -116,7 +116,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
     """
     ax = ax or new_panel((6.4, 4.4))
     (_draw_curves if len(surface.names) == 1 else _draw_colours)(surface, ax)
-    ax.set_xlabel(_labelled(surface, 0))
+    ax.set_xlabel(_axis_label(surface, 0))
     _name_runs(surface, ax)
     return ax
 
@@ -181,10 +181,10 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
             )
     if surface.found is not None:
         ax.plot(*surface.found, marker="o", markersize=7, color="white", markeredgecolor=INK)
-    ax.set_ylabel(_labelled(surface, 1))
+    ax.set_ylabel(_axis_label(surface, 1))
 
 
-def _labelled(surface: Surface, axis: int) -> str:
+def _axis_label(surface: Surface, axis: int) -> str:
     """Return the label of an axis: the constant, and in which unit it is; numbers are as in the file."""
     return plain(f"{surface.names[axis]} (s)" if surface.durations[axis] else surface.names[axis])
 
@@ -233,7 +233,7 @@ def draw_specifications(diff: SpecificationDiff) -> tuple[Axes, ...]:
         UsageError: no spec changed, or matplotlib is not installed.
     """
     names = diff.old.filename, diff.new.filename
-    return _draw([_changed(each, names) for each in diff.specs if each.edits or each.is_different])
+    return _draw([_before_and_after(spec, names) for spec in diff.specs if spec.edits or spec.is_different])
 
 
 @plot.register(SpecDiff)
@@ -243,7 +243,7 @@ def draw_spec(diff: SpecDiff) -> Axes:
     Raises:
         UsageError: matplotlib is not installed.
     """
-    return _draw([_changed(diff, ("before", "after"))])[0]
+    return _draw([_before_and_after(diff, ("before", "after"))])[0]
 
 
 @plot.register(LogDiff)
@@ -258,27 +258,27 @@ def draw_runs(diff: LogDiff) -> tuple[Axes, ...]:
     pairs = []
     for spec in diff.specs:
         columns = []
-        for result, (trace, chosen) in zip((spec.a, spec.b), sides, strict=True):
+        for result, (trace, indices) in zip((spec.a, spec.b), sides, strict=True):
             value = np.full(len(trace), np.nan)
             value[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
-            columns.append(value[chosen])
+            columns.append(value[indices])
         pairs.append(_Pair(spec.a.title, ("A", "B"), (seconds, seconds), (columns[0], columns[1])))
     return _draw(pairs)
 
 
-def _changed(diff: SpecDiff, names: tuple[str, str]) -> _Pair:
+def _before_and_after(diff: SpecDiff, names: tuple[str, str]) -> _Pair:
     results = diff.old, diff.new
     first_ns = diff.old.times_ns[0] if len(diff.old.times_ns) else 0
-    one, other = ((result.times_ns - first_ns) / 1e9 for result in results)
-    return _Pair(diff.title, names, (one, other), (diff.old.series[0, 0], diff.new.series[0, 0]))
+    old_s, new_s = ((result.times_ns - first_ns) / 1e9 for result in results)
+    return _Pair(diff.title, names, (old_s, new_s), (diff.old.series[0, 0], diff.new.series[0, 0]))
 
 
 def _draw(pairs: Sequence[_Pair]) -> tuple[Axes, ...]:
     if not pairs:
         raise UsageError("there is nothing to draw: no spec differs, or none was evaluated")
-    shown = pairs[:_MOST_PANELS]
-    panels = new_panels(len(shown), 1, (_WIDTH, 0.4 + _HEIGHT * len(shown)), same_x=True)
-    for ax, pair in zip(panels, shown, strict=True):
+    drawn_pairs = pairs[:_MOST_PANELS]
+    panels = new_panels(len(drawn_pairs), 1, (_WIDTH, 0.4 + _HEIGHT * len(drawn_pairs)), same_x=True)
+    for ax, pair in zip(panels, drawn_pairs, strict=True):
         ax.axhline(0.0, color=NEUTRAL, linewidth=0.8, zorder=1)
         for number in range(2):
             values = np.where(np.isfinite(pair.values[number]), pair.values[number], np.nan)
@@ -397,11 +397,11 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float) -> Axe
 
 def _draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
     """Draw the objects of a sample, the one to be moved with bolder lines."""
-    for each, tracked in (sample.objects if sample is not None else {}).items():
-        _draw_footprint(ax, tracked.footprint, 2.0 if each == name else 1.0)
+    for object_name, tracked in (sample.objects if sample is not None else {}).items():
+        _draw_footprint(ax, tracked.footprint, 2.0 if object_name == name else 1.0)
         x, y = np.concatenate(outlines_of(tracked.footprint)).max(axis=0).tolist()
         ax.annotate(
-            plain(each, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
+            plain(object_name, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
             annotation_clip=True,
         )  # fmt: skip
 
@@ -413,8 +413,8 @@ def _draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
     ax.plot(target.x, target.y, "o", color="white", markeredgecolor=INK, markersize=6)
     tracked = None if sample is None else sample.objects.get(target.name)
     if tracked is not None:
-        there = moved_object(tracked, target.x, target.y, target.turn)
-        _draw_footprint(ax, there.footprint, 1.5, "--")
+        moved = moved_object(tracked, target.x, target.y, target.turn)
+        _draw_footprint(ax, moved.footprint, 1.5, "--")
 
 
 def _hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
@@ -463,19 +463,19 @@ def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
     maps = [candidate.map for _, _, candidate in places]
     for panel in panels:
         panel.set_axis_off()
-    drawn = tuple(panels[number] for number, _, _ in places)
+    used_panels = tuple(panels[number] for number, _, _ in places)
     reach = _reach_of(maps)
     images = [
         _draw_candidate(panel, edge, candidate, sample, reach)
-        for panel, (_, edge, candidate) in zip(drawn, places, strict=True)
+        for panel, (_, edge, candidate) in zip(used_panels, places, strict=True)
     ]
-    drawn[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
-    keys = _hatch_keys(drawn[0], maps)
+    used_panels[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
+    keys = _hatch_keys(used_panels[0], maps)
     if keys:
-        drawn[0].figure.legend(
+        used_panels[0].figure.legend(
             handles=keys, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=8.5
         )
-    return drawn
+    return used_panels
 
 
 def _draw_candidate(
