@@ -363,7 +363,8 @@ class Replay:
         """Remark that the window goes on where there is no sample: the log pauses, or has ended."""
         window, begin_ns, last_ns = self._selection.window, self._times[0], self._times[-1]
         usual_ns = (last_ns - begin_ns) / max(self._samples - 1, 1)
-        for start_ns, end_ns in ((max(window.start_ns, first_ns), begin_ns), (last_ns, window.end_ns)):
+        asked_ns = max(window.start_ns, first_ns) if window.start_ns else begin_ns
+        for start_ns, end_ns in ((asked_ns, begin_ns), (last_ns, window.end_ns)):
             if 0 < LONG_PAUSE * usual_ns < end_ns - start_ns and end_ns != FOREVER:
                 begin, end = Instant(start_ns, first_ns), Instant(end_ns, first_ns)
                 yield Sentence("the window has no sample from ", begin, " to ", end)
