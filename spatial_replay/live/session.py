@@ -667,12 +667,12 @@ class LiveSession:
             return trace
         counting = [*ends.add(trace), *(ends.finish() if is_last else ())]
         if ends.begin_ns is not None:
-            self._notes += counted_from(ends.remarks, ends.log_begin_ns)
+            self._notes += counted_from(ends.remarks, ends.begin_ns)
             if ends.late:
                 listed = ", ".join(ends.late)
                 self._notes.append(
-                    f"the run begins although {listed} cannot be judged yet: what it reports is unknown until"
-                    " then; --start-within (start_within_s) waits longer"
+                    f"the run begins although {listed} cannot be judged yet: until then, what it reports is"
+                    " unknown, and groups lack its objects; --start-within (start_within_s) waits longer"
                 )
         return Trace.concatenate(counting)
 
@@ -700,8 +700,9 @@ class LiveSession:
             return None
         trace = self._since_begin(self._assembler.finish(), is_last=True)
         trace, left_out = trim_trace(trace, self._ends.needs, start=False, is_rest=self._samples > 0)
-        self._notes += counted_from(left_out, self._ends.log_begin_ns)
-        self.remarks = self._assembler.take_remarks()
+        begin_ns = self._ends.begin_ns or 0
+        self._notes += counted_from(left_out, begin_ns)
+        self.remarks = counted_from(self._assembler.take_remarks(), begin_ns)
         return trace
 
 

@@ -827,10 +827,23 @@ def test_a_run_begins_where_its_recording_does(
     else:
         assert begin_ns == first * 10 * MS + 1
         assert (
-            "8 samples at the beginning are left out, from 0.000 s to 0.070 s: /vase begins at 0.080 s"
+            "8 samples at the beginning are left out, from -0.080 s to -0.010 s: /vase begins at 0.000 s"
             in said
         )
     assert run(["replay", str(output), "--spec", str(spec)]) == code
+
+
+def test_remarks_of_a_run_count_times_from_its_first_sample(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING.replace("10s", "1s"), "spec clear = F (robot dist vase >= 0.5)")
+    ticks = range(10_000, 10_300)
+    sent = [
+        pose(number, tick, 2.0 * (number == 1)) for tick in ticks for number in (2, 1)[: 2 - (tick > 10_010)]
+    ]
+    with rude_server(*sent) as address:
+        assert run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "--for", "2s"]) == 0
+    assert "samples are taken at /robot, which ends at 0.100 s" in capsys.readouterr().err
 
 
 def test_a_run_waits_as_long_as_start_within_says(tmp_path: Path) -> None:
