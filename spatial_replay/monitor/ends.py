@@ -13,6 +13,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.spec.checks import group_classes, object_names, signal_names
+from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import ANY_CLASS, Specification
 from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.spans import TopicSpan
@@ -117,7 +118,7 @@ class RunEnds:
 
     def add(self, trace: Trace) -> list[Trace]:
         """Add the next samples; return those that count now, one trace for each that was added, in order."""
-        if self.begin_ns is not None and not self._end:
+        if self.begin_ns is not None and not self._end and not self.late:
             return [trace]
         if len(trace):
             if self._is_empty:
@@ -138,6 +139,8 @@ class RunEnds:
         self.end_ns = self._open_since_ns()
         if self.end_ns < FOREVER:
             self._remark_end()
+        for topic in self.late:
+            self._remark_late(self._spans[topic])
         return self._release(FOREVER)
 
     def _note(self, trace: Trace) -> None:
@@ -171,7 +174,9 @@ class RunEnds:
 
     def _begin(self) -> None:
         needed = self.needs.choose(tuple(self._spans.values())) if self._start else []
-        delays = [(span, (span.first_ns or FOREVER) - self.log_begin_ns) for span in needed]
+        delays = [
+            (span, FOREVER if span.first_ns is None else span.first_ns - self.log_begin_ns) for span in needed
+        ]
         self.late = tuple(span.topic for span, delay in delays if delay > self._limit_ns(span))
         in_time = [span for span, delay in delays if delay <= self._limit_ns(span)]
         self.begin_ns = max((span.first_ns or 0 for span in in_time), default=self.log_begin_ns)
@@ -187,6 +192,15 @@ class RunEnds:
             why = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
         self._remark("beginning", left_out, why)
 
+    def _remark_late(self, span: TopicSpan) -> None:
+        """Say that objects are absent before a topic that was not waited for."""
+        if span.pattern is None or span.begun_ns is None or span.begun_ns <= self.log_begin_ns:
+            return
+        limit = format_duration(self._limit_ns(span))
+        why = f", more than its max_age ({limit}) after the first sample: its objects are absent before,"
+        begun = Instant(span.begun_ns, 0)
+        self.remarks = (*self.remarks, Sentence(f"{span.topic} begins at ", begun, why, " also from groups"))
+
     def _remark_end(self) -> None:
         span = min(self._open_spans(), key=lambda span: self._since_ns[span.topic] or FOREVER)
         times_ns = np.concatenate([trace.times_ns for trace in self._held])
@@ -200,7 +214,8 @@ class RunEnds:
         first, last = (Instant(int(at), 0) for at in left_out[[0, -1]])
         count = counted(len(left_out), "sample")
         are = "is" if len(left_out) == 1 else "are"
-        sentence = Sentence(f"{count} at the {which} {are} left out, from ", first, " to ", last, ": ", *why)
+        when = ("at ", first) if len(left_out) == 1 else ("from ", first, " to ", last)
+        sentence = Sentence(f"{count} at the {which} {are} left out, ", *when, ": ", *why)
         self.remarks = (*self.remarks, sentence)
 
     def _open_spans(self) -> Iterator[TopicSpan]:

@@ -176,6 +176,43 @@ def people(times_ms: range, *names: str, x: float = 6.0) -> Messages:
     ]
 
 
+def test_one_sample_is_left_out_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "s.spatial").write_text(NEAR)
+    write_frames(folder, range(0, 4_000, 100))
+    _, said = replay(capsys, code=0)
+    assert "1 sample at the end is left out, at 3.950 s: no transform places /odom then" in said
+
+
+def test_samples_that_are_left_out_are_said_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(
+        folder,
+        PAIR,
+        positions("/robot", range(0, 9_000, 50)),
+        positions("/cart", range(500, 9_000, 50), 0, 6.0),
+    )
+    document, said = replay(capsys, code=0)
+    assert document["log"]["samples"] == 170
+    assert (
+        "10 samples at the beginning are left out, from 0.000 s to 0.450 s: /cart begins at 0.500 s" in said
+    )
+    assert "the window" not in said
+
+
+@pytest.mark.parametrize("window", [(), ("--to", "3.5s")])
+def test_a_group_whose_topic_begins_later_than_is_waited_for_is_remarked(
+    folder: Path, capsys: pytest.CaptureFixture[str], window: tuple[str, ...]
+) -> None:
+    (folder / "s.spatial").write_text(
+        'group people = class "person"\nspec apart = G (forall x in people: robot dist x >= 0.1)\n'
+    )
+    write_frames(folder, range(0, 4_050, 50), persons=people(range(3_000, 4_000, 200), "p"))
+    _, said = replay(capsys, *window, code=0)
+    assert (
+        "/people begins at 3.000 s, more than its max_age (1s) after the first sample: its objects are absent"
+        " before, also from groups" in said
+    )
+
+
 def test_odometry_without_a_transform_behind_it_is_left_out(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
