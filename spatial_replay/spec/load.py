@@ -200,6 +200,9 @@ class AtomBuilder:
         elif alone and isinstance(base_of(term), Group):
             hint = "write forall p in GROUP: speed(p) <= c"
             self.resolver.fault(written.span, scope, "a group has no speed of its own", hint)
+        elif alone and isinstance(base_of(term), RegionName):
+            hint = "write speed(a) for an object a, or speed(a, REGION)"
+            self.resolver.fault(written.span, scope, "a region never moves", hint)
         return term
 
     def _limited(
