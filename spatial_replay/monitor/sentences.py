@@ -469,7 +469,7 @@ def _change(measured: Measured, units: Mapping[str, str], first_ns: int) -> Sent
     before_ns, now_ns = measured.reports_ns or (0, 0)
     names, of = measured.names, measured.names[0] if measured.quantity == "rate" else ""
     change = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(of, ""))
-    rate = with_unit(abs(measured.value), per_second(units.get(of, "")))
+    rate = with_unit(abs(measured.value), per_second(units.get(of, "")) or "a second")
     how = f"{names[0]} moved"
     if of:
         how = f"{of} {'rose' if measured.value > 0.0 else 'fell'}"
