@@ -291,6 +291,8 @@ class LiveSession:
         self._heard: set[str] = set()
         self._rare: set[str] = set()
         self._intervals_s: dict[str, deque[float]] = {}
+        self._overdue = 0
+        self._is_overdue_said = False
         self._notes: list[str] = []
         self._missing: tuple[str, ...] = ()
         self._server: str | None = None
@@ -332,10 +334,26 @@ class LiveSession:
 
     def take_notes(self, *, last: bool = False) -> tuple[str, ...]:
         """Return what happened since the last update, if anything did; at last, how often besides."""
+        self._note_overdue()
         if last and self._assembler is not None:
             self._notes += self._assembler.take_faults(last=True)
         notes, self._notes = tuple(self._notes), []
         return notes
+
+    def _note_overdue(self) -> None:
+        """Note once that a transform did not come in time; before a run begins, that is usual."""
+        assembler = self._assembler
+        if not isinstance(assembler, LiveAssembler) or assembler.overdue == self._overdue:
+            return
+        is_first = self._samples > 0 and not self._is_overdue_said and self._is_connected
+        self._overdue = assembler.overdue
+        if is_first and assembler.overdue_frame is not None:
+            topic, frame = assembler.overdue_frame
+            self._is_overdue_said = True
+            self._notes.append(
+                f"{topic} is unknown where no transform of {frame!r} came within {self._max_delay_s:g} s; if"
+                " transforms come later or seldom, give --max-delay (max_delay_s) more"
+            )
 
     def stop(self) -> None:
         """End `updates` once what has come is evaluated."""

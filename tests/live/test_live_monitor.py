@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import aclosing, suppress
 from pathlib import Path
 
+import foxglove
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -844,6 +845,60 @@ def test_remarks_of_a_run_count_times_from_its_first_sample(
     with rude_server(*sent) as address:
         assert run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "--for", "2s"]) == 0
     assert "samples are taken at /robot, which ends at 0.100 s" in capsys.readouterr().err
+
+
+FRAMED = """
+fixed_frame: map
+sample: {topic: /odom}
+topics:
+  /odom: {name: robot, frame: odom, position: [x, y], shape: {disc: 0.1}}
+"""
+
+
+def test_transforms_that_come_after_max_delay_are_said_with_the_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(
+        tmp_path, FRAMED, "region home = circle((0, 0), 9)\nspec near = G (robot dist home <= 1)"
+    )
+    context = foxglove.Context()
+    schemas = {"/odom": "Pose", "/tf": "foxglove.FrameTransform"}
+    odom, frames = (
+        foxglove.Channel(
+            topic,
+            schema=foxglove.Schema(name=name, encoding="jsonschema", data=b"{}"),
+            message_encoding="json",
+            context=context,
+        )
+        for topic, name in schemas.items()
+    )
+    server = foxglove.start_server(name="robot", host="127.0.0.1", port=0, context=context)
+
+    def place(at: int) -> None:
+        stamp = {"sec": at // 1000, "nsec": at % 1000 * MS}
+        placed = {"translation": {"x": 0, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+        names = {"timestamp": stamp, "parent_frame_id": "map", "child_frame_id": "odom"}
+        frames.log(json.dumps(names | placed).encode(), log_time=at * MS)
+
+    def drive() -> None:
+        until(lambda: odom.has_sinks() and frames.has_sinks())
+        for at in range(1_000, 1_500, 100):
+            place(at)
+            odom.log(b'{"x": 0, "y": 0}', log_time=at * MS)
+        # the transform behind the last report never comes
+        odom.log(b'{"x": 0, "y": 0}', log_time=1_450 * MS)
+
+    driving = threading.Thread(target=drive)
+    driving.start()
+    try:
+        command = ["monitor", f"ws://127.0.0.1:{server.port}", "--mapping", str(mapped), "--spec", str(spec)]
+        assert run([*command, "--for", "2s"]) == 4
+    finally:
+        driving.join()
+        server.stop()
+    said = capsys.readouterr().out
+    assert said.count("/odom is unknown where no transform of 'odom' came within 0.2 s") == 1
+    assert "give --max-delay (max_delay_s) more" in said
 
 
 def test_a_run_waits_as_long_as_start_within_says(tmp_path: Path) -> None:
