@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,11 +37,12 @@ from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.spec.walks import nodes_of
-from spatial_replay.text import counted, counted_from, json_fields
+from spatial_replay.text import Sentence, counted, counted_from, json_fields
 
 if TYPE_CHECKING:
     from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
+    from spatial_replay.monitor.ends import RunEnds
     from spatial_replay.monitor.plausibility import ThresholdRange
     from spatial_replay.monitor.stream import SeriesBlock
     from spatial_replay.sanity.examine import Examination
@@ -242,6 +243,7 @@ def _compare_with_log(
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries
+    from spatial_replay.monitor.ends import Needs, RunEnds
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
     from spatial_replay.replay.selection import LogNames
     from spatial_replay.sources.open_log import open_source
@@ -250,23 +252,28 @@ def _compare_with_log(
     specification = with_numbers(specification, source.axes.units)
     numbers, names = LogNumbers(specification), LogNames()
     evaluation = _CutResults(specification)
+    ends = RunEnds(Needs.of([specification], {}))
     faults: list[str] = []
-    first_ns: int | None = None
+
+    def compare(traces: Iterable[Trace]) -> None:
+        for trace in traces:
+            numbers.add(trace)
+            evaluation.add(trace)
+
     with progress("samples") as advance:
         for block in source.keeping().iter_blocks():
             names.add(block.trace)
-            numbers.add(block.trace)
-            evaluation.add(block.trace)
+            compare(ends.add(block.trace))
             faults += block.trace.faults
-            if first_ns is None and len(block.trace):
-                first_ns = int(block.trace.times_ns[0])
             advance(len(block.trace))
-    warn(*counted_from(faults, first_ns or 0))
+    compare(ends.finish())
+    remarks = (Sentence(f"{source.name}: ", remark) for remark in ends.remarks)
+    warn(*counted_from((*faults, *remarks), ends.log_begin_ns))
     unknown = names.check(specification, {})
     missing = sum(diagnostic.severity == "error" for diagnostic in unknown)
     if not strict_names:
         unknown = tuple(replace(diagnostic, severity="warning") for diagnostic in unknown)
-    doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source))
+    doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source, ends))
     counts = [counted(missing, "name") + " that it never has"] if missing else []
     others = len(unknown) - missing + len(doubtful)
     counts += [counted(others, "other warning" if missing else "warning")] if others else []
@@ -300,14 +307,14 @@ class _CutResults:
         for blocks, block in zip(self._kept, self._stream.extend(trace), strict=True):
             blocks.append(replace(block, series=block.series[..., :0].copy()))
 
-    def warnings(self, source: Source) -> Iterator[Diagnostic]:
+    def warnings(self, source: Source, ends: RunEnds) -> Iterator[Diagnostic]:
         """Yield a warning for each result, at its window."""
         from spatial_replay.monitor.result import SpecResult
         from spatial_replay.monitor.stream import join_blocks
         from spatial_replay.monitor.witness.evidence import Evidence
 
         def traces() -> Iterator[Trace]:
-            return (block.trace for block in source.keeping().iter_blocks())
+            return (ends.trim(block.trace) for block in source.keeping().iter_blocks())
 
         specification, units = self._specification, source.axes.units
         text = SourceText.of(specification.source, specification.filename)

@@ -183,6 +183,18 @@ def test_one_sample_is_left_out_at_a_time(folder: Path, capsys: pytest.CaptureFi
     assert "1 sample at the end is left out, at 3.950 s: no transform places /odom then" in said
 
 
+def test_a_check_against_a_log_compares_the_samples_of_its_replay(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "s.spatial").write_text(NEAR)
+    write_frames(folder, range(90, 3_900, 100))
+    assert run(["check", "s.spatial", "--log", "log.mcap", "--mapping", "m.yaml"]) == 0
+    output = capsys.readouterr()
+    assert "compared with 76 samples of log.mcap over 3.750 s" in output.out
+    assert "log.mcap: 2 samples at the end are left out, from 3.900 s to 3.950 s" in output.err
+    assert "robot is missing" not in output.err
+
+
 def test_samples_that_are_left_out_are_said_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(
         folder,
