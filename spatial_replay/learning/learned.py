@@ -23,13 +23,15 @@ from spatial_replay.learning.fit import (
     Pattern,
 )
 from spatial_replay.learning.quantities import Observed, Party, Quantity, robustness_of, scope_of
+from spatial_replay.monitor.ends import Needs, trim_trace
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.spec.formula import ANY_CLASS, NamedSpec, Specification
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.text import counted, json_value, number_text, printable
+from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.margins import LabelledRun
 from spatial_replay.tuning.tuned import require_comparable
 
@@ -502,6 +504,7 @@ def learn_runs(
         raise UsageError(f"{lines} lines cannot be learned; give 1 to {MOST_LINES}")
     if profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
+    runs = [replace(run, trace=trim_trace(run.trace, _needs(run.trace))[0]) for run in runs]
     _check(runs)
     good = [run for run in runs if run.is_good]
     bad = [run for run in runs if not run.is_good]
@@ -540,6 +543,11 @@ def learn_runs(
         checked,
         left_out,
     )
+
+
+def _needs(trace: Trace) -> Needs:
+    """Return the needs of a specification of all that a trace has."""
+    return Needs(frozenset(trace.names), frozenset(trace.signals), frozenset({ANY_CLASS}))
 
 
 def _check(runs: Sequence[LabelledRun]) -> None:

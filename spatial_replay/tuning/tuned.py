@@ -18,6 +18,7 @@ import numpy as np
 from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.lazy import Displayed
+from spatial_replay.monitor.ends import Needs, trim_trace
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.checks import with_numbers
@@ -863,6 +864,8 @@ def tune_runs(
         UsageError: no good run, too many runs, a constant that cannot be tuned, a run that does not fit the
             specification, runs in other units.
     """
+    needs = Needs.of([specification], each or {})
+    runs = [replace(run, trace=trim_trace(run.trace, needs)[0]) for run in runs]
     _check(specification, runs)
     varied = varied_constants(specification, ranges)
     if len(varied) > MOST_CONSTANTS:

@@ -195,6 +195,32 @@ def test_a_check_against_a_log_compares_the_samples_of_its_replay(
     assert "robot is missing" not in output.err
 
 
+def test_constants_and_lines_come_from_the_samples_of_a_replay(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "s.spatial").write_text(
+        "const near = 0.2 in [0.1, 9]\nspec apart = G (robot dist cart >= near)\n"
+    )
+    logs = {f"{name}.mcap": x for name, x in {"g1": 4.0, "g2": 5.0, "b1": 1.0, "b2": 1.5}.items()}
+    for log, x in logs.items():
+        write(
+            folder,
+            PAIR,
+            positions("/robot", range(0, 3_000, 50)),
+            positions("/cart", range(300, 3_000, 50), 0, x),
+        )
+        (folder / "log.mcap").rename(log)
+    good, bad = (tuple(log for log in logs if log.startswith(kind)) for kind in "gb")
+    labelled = [part for log in good for part in ("--good", log)] + [
+        part for log in bad for part in ("--bad", log)
+    ]
+    assert run(["tune", "--spec", "s.spatial", *labelled, "--mapping", "m.yaml"]) == 0
+    assert "widest margin for 2 good runs and 2 bad runs: 1.25" in capsys.readouterr().out
+    bad_options = [part for log in bad for part in ("--bad", log)]
+    assert run(["learn", *good, *bad_options, "--mapping", "m.yaml", "-o", "learned.spatial"]) == 0
+    assert "violated by 2 of 2" in capsys.readouterr().out
+
+
 def test_samples_that_are_left_out_are_said_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(
         folder,
