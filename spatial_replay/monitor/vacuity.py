@@ -201,14 +201,19 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
     """Write `->` for each implication of a formula.
 
     `not a or b` and `not (a and not b)` are `a -> b`. In `not (a and b)` each part is a condition for the
-    other: it is `(a or b) -> not (a and b)`.
+    other: it is `(a or b) -> not (a and b)`. `not F p` is `G not p`.
 
     Args:
         node: its id as written.
-        sign: 1 if it has to hold, -1 if it must not, 0 if neither, as for a goal. Only the first is one.
+        sign: 1 if it has to hold, -1 if it must not, 0 if neither, as for a goal. The last is none.
     """
     operands = list(_operands_with_ids(formula, node))
     operator = operator_of(formula)
+    has_condition = any(operator_of(operand) != "not" for operand, _ in operands)
+    if sign < 0 and operator == "and" and has_condition:
+        negation = _implications_of(Boolean("not", (formula,)), node - 1)
+        nodes = (node, *(max(identifier, node) for identifier in negation.nodes))
+        return _Implications(Boolean("not", (negation.formula,)), nodes)
     is_negated = operator == "not" and operator_of(operands[0][0]) == "and"
     if sign > 0 and (operator == "or" or is_negated):
         parts = list(_operands_with_ids(*operands[0])) if is_negated else operands
@@ -216,7 +221,7 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
         are_conditions = [(operator_of(part) == "not") is not is_negated for part, _ in parts]
         sides = [
             [
-                _implications_of(*_without_negation(*part), -1 if is_condition else 1)
+                _implications_of(*_without_negation(*part), 0 if is_condition else 1)
                 for part, is_condition in zip(parts, are_conditions, strict=True)
                 if is_condition is wanted
             ]
@@ -250,6 +255,8 @@ def _without_negation(formula: Formula, node: int) -> tuple[Formula, int]:
 
 _GOALS = frozenset({("F", 0), ("O", 0), ("U", 1), ("S", 1), ("W", 1), ("R", 0)})
 """Operators and the places of their operands that hold in some sample, not in all."""
+_EVERYWHERE = frozenset({"F", "G", "U", "R", "W", "O", "H", "S"})
+"""Operators over several samples."""
 
 
 def _body(node: Quantified) -> Formula:
@@ -257,9 +264,13 @@ def _body(node: Quantified) -> Formula:
 
 
 def _sign_below(operator: str, place: int, sign: int) -> int:
-    if operator in ("xor", "<->") or (operator, place) in _GOALS:
+    if operator == "not":
+        return -sign
+    if operator in ("xor", "<->") or (operator, place) == ("->", 0):
         return 0
-    return -sign if operator == "not" or (operator == "->" and place == 0) else sign
+    # a goal that must not hold in any sample has to fail in all of them, as in `not F`
+    is_goal = (operator, place) in _GOALS
+    return 0 if operator in _EVERYWHERE and is_goal is (sign > 0) else sign
 
 
 def _joined(operator: Literal["and", "or", "->"], parts: Sequence[_Implications], node: int) -> _Implications:

@@ -278,6 +278,27 @@ def test_an_antecedent_that_held_for_no_member_tests_nothing(
     assert _document(folder, "each.spatial", "--fail-on", "vacuous")[0] == 1
 
 
+@pytest.mark.parametrize(
+    ("formula", "tested"),
+    [
+        ("not (F (cup ovlp plate and not (fork ovlp plate)))", "nothing"),
+        ("G (not (F[0s, 1s] (cup ovlp plate and fork ovlp plate)))", "nothing"),
+        ("not (F (fork dist plate <= 1 and cup ovlp plate))", "full"),
+        ("not (F (cup ovlp plate))", "full"),
+        ("F (not (cup ovlp plate) or fork ovlp plate)", "full"),
+        ("not (G (not (not (cup ovlp plate) or fork ovlp plate)))", "full"),
+    ],
+)
+def test_what_never_may_happen_is_tested_as_its_opposite_always_is(
+    folder: Path, formula: str, tested: str
+) -> None:
+    (folder / "never.spatial").write_text(f"spec never = {formula}\n")
+    code, document = _document(folder, "never.spatial")
+    (never,) = document["specifications"]
+    assert (code, never["verdict"]) == (4 if tested == "nothing" else 0, "satisfied")
+    assert never["tested"] == tested
+
+
 def test_an_antecedent_that_never_held_fails_a_gate_under_the_semantics_of_the_paper(folder: Path) -> None:
     (folder / "polite.spatial").write_text("spec polite = G (cup ovlp plate -> fork ovlp plate)\n")
     paper = ("--semantics", "paper")
