@@ -328,7 +328,9 @@ class SpecResult(Displayed):
 
         Where the leaves were not stored, the log is read again.
         """
-        return find_vacuous(self.evidence, *self._stored, is_infinite=bool(self.final[0, 0] == np.inf))
+        lower, upper = self.final[0].tolist()
+        infinite = End.LOW if lower == np.inf else End.HIGH if upper == -np.inf else None
+        return find_vacuous(self.evidence, *self._stored, infinite=infinite)
 
     @property
     def tested(self) -> Tested:

@@ -129,7 +129,7 @@ def idle_templates(
 
 
 def find_vacuous(
-    evidence: Evidence, leaves: Floats, times_ns: Integers, *, is_infinite: bool
+    evidence: Evidence, leaves: Floats, times_ns: Integers, *, infinite: End | None
 ) -> tuple[UntestedPart, ...]:
     """Return the parts of an instance's formula that decided nothing, in the order of the text.
 
@@ -137,7 +137,8 @@ def find_vacuous(
         evidence: the samples that it was evaluated over.
         leaves: (C, A, T), its leaves in them.
         times_ns: (T,), T at least 1.
-        is_infinite: whether the formula's robustness is infinite at least, at the first sample.
+        infinite: the end that decides an infinite robustness at the first sample: the lower one of inf, the
+            upper one of -inf.
     """
     instance = evidence.instance
     nodes = nodes_of(instance.formula)
@@ -151,11 +152,12 @@ def find_vacuous(
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
-    if is_infinite:
+    if infinite is not None:
         done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
-        path = deciding_path(done, 0, End.LOW)
+        path = deciding_path(done, 0, infinite)
         node, sample = path.steps[-1].node, path.steps[-1].sample
-        if node not in {each.node for each in found}:
+        # -inf is the number of a missed goal, too
+        if node not in {part.node for part in found} and (infinite is End.LOW or leaves_out(nodes[node])):
             found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
     return tuple(
         _part(each, nodes[each.node], evidence) for each in sorted(found, key=lambda each: each.node)

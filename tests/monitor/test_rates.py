@@ -138,7 +138,7 @@ def test_members_that_come_and_go_are_left_out_where_they_are_new(order: str) ->
     calm, runs = evaluate(specification, Trace.from_samples(samples))
     assert (calm.verdict, calm.robustness) == ("satisfied", 2.0 if moves else inf)
     assert (runs.verdict, runs.robustness) == ("violated", -1.0 if moves else -inf)
-    assert calm.tested == ("full" if moves else "nothing")
+    assert calm.tested == runs.tested == ("full" if moves else "nothing")
 
 
 def test_samples_without_rates_test_nothing_and_are_not_what_decides(
