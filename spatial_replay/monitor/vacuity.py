@@ -479,7 +479,9 @@ def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
         yield _Idle(identifier, "past the end", what, when.time_ns)
     elif isinstance(node, Atom | Quantified) and not any(isinstance(e, Equality) for e in iter_parts(node)):
         # comparing a mode makes it infinite with members in its groups, too
-        what = ("decides at ", when, ", where no object is in its group.")
+        count = len(node.variables) if isinstance(node, Quantified) else 1
+        members = "no object is" if count == 1 else f"fewer than {count} objects are"
+        what = ("decides at ", when, f", where {members} in its group.")
         yield _Idle(identifier, "no members", what, when.time_ns)
 
 

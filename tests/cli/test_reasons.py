@@ -299,6 +299,15 @@ def test_what_never_may_happen_is_tested_as_its_opposite_always_is(
     assert never["tested"] == tested
 
 
+def test_a_pair_of_members_that_never_was_does_not_empty_their_group(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pairs = 'forall x, y in ((class "dish") except cup): x dist y >= 0'
+    (folder / "pairs.spatial").write_text(f"spec pairs = G ({pairs})\n")
+    assert run(["replay", str(LOG), "--spec", "pairs.spatial"]) == 4
+    assert "where fewer than 2 objects are in its group." in capsys.readouterr().out
+
+
 def test_an_antecedent_that_never_held_fails_a_gate_under_the_semantics_of_the_paper(folder: Path) -> None:
     (folder / "polite.spatial").write_text("spec polite = G (cup ovlp plate -> fork ovlp plate)\n")
     paper = ("--semantics", "paper")
