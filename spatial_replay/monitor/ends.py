@@ -197,7 +197,7 @@ class RunEnds:
         if span.pattern is None or span.begun_ns is None or span.begun_ns <= self.log_begin_ns:
             return
         limit = format_duration(self._limit_ns(span))
-        why = f", more than its max_age ({limit}) after the first sample: its objects are absent before,"
+        why = f", more than {limit} after the first sample: its objects are absent before,"
         begun = Instant(span.begun_ns, 0)
         self.remarks = (*self.remarks, Sentence(f"{span.topic} begins at ", begun, why, " also from groups"))
 

@@ -246,7 +246,7 @@ def test_a_group_whose_topic_begins_later_than_is_waited_for_is_remarked(
     write_frames(folder, range(0, 4_050, 50), persons=people(range(3_000, 4_000, 200), "p"))
     _, said = replay(capsys, *window, code=0)
     assert (
-        "/people begins at 3.000 s, more than its max_age (1s) after the first sample: its objects are absent"
+        "/people begins at 3.000 s, more than 1s after the first sample: its objects are absent"
         " before, also from groups" in said
     )
 
