@@ -6,6 +6,7 @@ each needed topic has sent a message and can be placed, and ends at the last suc
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -60,6 +61,14 @@ class Needs:
         """Return the spans of the topics that carry a needed object or signal, or may do so."""
         unseen = self.objects.difference(*(span.objects for span in spans))
         return [span for span in spans if self._is_needed(span, unseen)]
+
+    def choose_first(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
+        """Return the spans that are needed whichever of their objects are seen later.
+
+        A run does not know these, and begins where its recording does.
+        """
+        fixed = {name for name in self.objects for span in spans if span.pattern == re.escape(name)}
+        return [span for span in spans if self._is_needed(span, self.objects - fixed)]
 
     def _is_needed(self, span: TopicSpan, unseen: frozenset[str]) -> bool:
         if not (self.objects.isdisjoint(span.objects) and self.signals.isdisjoint(span.signals)):
@@ -139,8 +148,9 @@ class RunEnds:
         self.end_ns = self._open_since_ns()
         if self.end_ns < FOREVER:
             self._remark_end()
-        for topic in self.late:
-            self._remark_late(self._spans[topic])
+        for span in self.needs.choose(tuple(self._spans.values())):
+            if span.topic in self.late:
+                self._remark_late(span)
         return self._release(FOREVER)
 
     def _note(self, trace: Trace) -> None:
@@ -165,7 +175,7 @@ class RunEnds:
             self._start
             and any(
                 span.first_ns is None and passed_ns <= self._limit_ns(span)
-                for span in self.needs.choose(tuple(self._spans.values()))
+                for span in self.needs.choose_first(tuple(self._spans.values()))
             )
         )
         if not is_waiting:
@@ -173,7 +183,7 @@ class RunEnds:
         return not is_waiting
 
     def _begin(self) -> None:
-        needed = self.needs.choose(tuple(self._spans.values())) if self._start else []
+        needed = self.needs.choose_first(tuple(self._spans.values())) if self._start else []
         delays = [
             (span, FOREVER if span.first_ns is None else span.first_ns - self.log_begin_ns) for span in needed
         ]

@@ -221,6 +221,32 @@ def test_constants_and_lines_come_from_the_samples_of_a_replay(
     assert "violated by 2 of 2" in capsys.readouterr().out
 
 
+LISTS = """\
+sample: {topic: /robot}
+topics:
+  /robot: {name: robot, shape: {disc: 0.3}}
+  /near: {objects: "people[*]", name: "{id}", shape: {disc: 0.3}}
+  /far: {objects: "people[*]", name: "{id}", shape: {disc: 0.3}}
+"""
+
+
+@pytest.mark.parametrize("comes_ms", [0, 2_000])
+def test_a_log_begins_at_the_same_sample_whenever_an_object_comes(
+    folder: Path, capsys: pytest.CaptureFixture[str], comes_ms: int
+) -> None:
+    (folder / "s.spatial").write_text("spec met = F[0s, 1s] (robot dist p <= 9)\n")
+    listed = [
+        ("/near", START + at * MS, {"people": [{"id": "p", "x": 3.0, "y": 0.0}] if at >= comes_ms else []})
+        for at in range(0, 4_000, 200)
+    ]
+    others: Messages = [("/far", START + at * MS, {"people": []}) for at in range(500, 4_000, 200)]
+    write(folder, LISTS, positions("/robot", range(0, 4_000, 50)), listed, others)
+    document, said = replay(capsys, code=4 if comes_ms else 0)
+    # a run that has not seen p does not know which list will have it
+    assert document["log"]["start_ns"] == START + 500 * MS
+    assert "/far begins at 0.500 s" in said
+
+
 def test_samples_that_are_left_out_are_said_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(
         folder,
