@@ -44,7 +44,8 @@ class Departure:
     Attributes:
         name: of the object.
         start_ns, end_ns: the first sample without it, and the sample in which it is a member again.
-        distance: from the object that its atom compares it with, in the sample before `start_ns`.
+        distance: from the object that its atom compares it with, in the sample before `start_ns`, or at
+            `end_ns` if it was out of reach before.
         message: a sentence.
     """
 
@@ -159,12 +160,14 @@ class Departures:
             self._watches[group], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
         ):
             reach = max(watch.threshold, close)
-            if last - watch.threshold < reach or back - watch.threshold < watch.threshold:
+            was_near = last - watch.threshold < reach
+            if was_near or back - watch.threshold < watch.threshold:
                 start, end = Instant(absence.start_ns, 0), Instant(end_ns, 0)
-                away = f"it was {with_unit(last, self._unit)} away before"
+                distance, when = (last, "before") if was_near else (back, "after")
+                away = f"it was {with_unit(distance, self._unit)} away {when}"
                 text = f"; {away}, from {format_term(_without(watch.other, name))}"
                 message = Sentence(absence.why, " from ", start, " to ", end, text)
-                self.departures.append(Departure(name, absence.start_ns, end_ns, last, message))
+                self.departures.append(Departure(name, absence.start_ns, end_ns, distance, message))
                 return
 
 

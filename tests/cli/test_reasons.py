@@ -393,6 +393,7 @@ def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
     for k in range(60):
         objects = [seen("cart", 0.0, "robot"), seen("person_5", 0.7, "dog" if 41 <= k < 50 else "person")]
         objects += [] if 22 <= k < 38 else [seen("person_3", 0.6, "person"), seen("person_4", 9.0, "person")]
+        objects += [] if 30 <= k < 58 else [seen("person_6", 9.0 if k < 30 else 0.8, "person")]
         samples.append({"time_ns": k * 100_000_000, "objects": objects})
     (folder / "visits.jsonl").write_text("\n".join(map(json.dumps, samples)))
     (folder / "safe.spatial").write_text(
@@ -403,9 +404,11 @@ def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
     left = json.loads(capsys.readouterr().out)["log"]["left"]
     assert [departure["message"] for departure in left] == [
         "person_3 was not in the log from 2.200 s to 3.800 s; it was 0.6 away before, from cart",
+        "person_6 was not in the log from 3.000 s to 5.800 s; it was 0.8 away after, from cart",
         "person_5 was not of the class 'person' but 'dog' from 4.100 s to 5.000 s; it was 0.7 away before,"
         " from cart",
     ]
+    assert [departure["distance"] for departure in left] == [0.6, 0.8, 0.7]
     assert run([*arguments, "--fail-on", "left"]) == 1
     assert left[0]["message"] in capsys.readouterr().err
     assert run(["batch", "visits.jsonl", "--spec", "safe.spatial", "--fail-on", "left", "-o", "out"]) == 1
