@@ -309,6 +309,9 @@ def message_from_error(error: BaseException) -> str:
             return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
             path, what = context.command_path, error.format_message()
+            if isinstance(error, click.MissingParameter):
+                # its choices come one a line, after tabs
+                what = " ".join(what.split())
             if isinstance(error, click.NoSuchOption):
                 remedy = new_form(error.option_name, context.command)
                 what = f"no option {error.option_name}; {remedy}" if remedy else what

@@ -82,6 +82,10 @@ def test_a_group_without_a_command_prints_its_help_and_no_error(tmp_path: Path) 
         (("record", "vido", "-o", "a.mcap"), "no scenario is named 'vido'; did you mean 'video'?"),
         (("record", "run.csv", "-o", "a.mcap"), "'run.csv'; `record tracks FILE` records a file"),
         (("check",), "Missing argument 'SPEC'"),
+        (
+            ("record", "-o", "a.mcap"),
+            "Missing argument 'SCENARIO'. Choose from: push, pick-place, table-setting",
+        ),
         (("check", "a.spatial", "--loog", "x"), "No such option"),
         (("check", "missing.spatial"), "missing.spatial"),
         (("info", "missing.mcap"), "missing.mcap"),
