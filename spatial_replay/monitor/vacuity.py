@@ -21,7 +21,7 @@ from spatial_replay.monitor.online.codes import in_channels, joined_channels, lo
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.path import End, PathNode, deciding_path
+from spatial_replay.monitor.witness.path import DecidingPath, End, PathNode, deciding_atom, deciding_path
 from spatial_replay.spec.format import format_formula, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
@@ -157,7 +157,11 @@ def find_vacuous(
         path = deciding_path(done, 0, infinite)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         # -inf is the number of a missed goal, too
-        if node not in {part.node for part in found} and (infinite is End.LOW or leaves_out(nodes[node])):
+        is_idle = infinite is End.LOW or (
+            _leaves_all_out(done, path, evidence)
+            and is_tested_by_nothing(evidence, leaves, times_ns, Verdict.VIOLATED)
+        )
+        if is_idle and node not in {part.node for part in found}:
             found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
     return tuple(
         _part(each, nodes[each.node], evidence) for each in sorted(found, key=lambda each: each.node)
@@ -465,6 +469,22 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
             excluded = tuple(each for each in group.excluded if isinstance(each, TrackedName))
             whole = replace(group, excluded=excluded)
             yield replace(term, term=whole) if isinstance(term, Earlier) else whole
+
+
+def _leaves_all_out(done: OfflineNodes, path: DecidingPath, evidence: Evidence) -> bool:
+    """Return whether the last operator of a path leaves out all samples of its window, or all members."""
+    node, sample = path.steps[-1]
+    formula, operands = done.tree[node]
+    if isinstance(formula, Quantified):
+        scene = evidence.scene(int(done.times_ns[sample]))
+        return leaves_out(formula) and deciding_atom(scene, evidence.bound(formula), path.end) is None
+    if not isinstance(formula, Temporal):
+        return False
+    begin, end = windows_of(formula, done.times_ns)
+    window = range(int(begin[sample]), int(end[sample]))
+    return len(window) > 0 and any(
+        all(done.is_left_out(operand, place) for place in window) for operand in operands
+    )
 
 
 def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:

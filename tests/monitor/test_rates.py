@@ -163,6 +163,33 @@ def test_samples_without_rates_test_nothing_and_are_not_what_decides(
 
 
 @pytest.mark.parametrize(
+    ("formula", "reasons"),
+    [
+        ("F[0, 0] (speed(a) <= 5)", ["no rate"]),
+        ("(a dist b >= 0) U[0, 0] (speed(a) <= 5)", ["no rate"]),
+        ("F[0, 0] (exists p in all: speed(p) <= 5)", ["no rate"]),
+        ("not G[0, 0] (speed(a) <= 5)", ["no rate"]),
+        ("F[1, 2] (mode == 2 and speed(b) >= 0)", []),
+    ],
+)
+def test_violations_whose_samples_are_all_left_out_are_tested_by_nothing(
+    formula: str, reasons: list[str]
+) -> None:
+    samples = [replace(sample, signals={"mode": 1.0}) for sample in arrivals("ab ab abc")]
+    (result,) = evaluate(parse_specification(formula), Trace.from_samples(samples))
+    assert result.verdict == "violated"
+    assert result.tested == ("nothing" if reasons else "full")
+    assert [part.reason for part in result.untested] == reasons
+
+
+def test_an_empty_window_is_no_window_without_rates() -> None:
+    trace = Trace.from_samples(arrivals("a a a"))
+    for formula in ("F[5, 6] (speed(a) <= 5)", "G (F[1, 1] (speed(a) <= 5))"):
+        (result,) = evaluate(parse_specification(formula), trace)
+        assert "no sample lies in its window" in result.explain()
+
+
+@pytest.mark.parametrize(
     ("formula", "message", "hint"),
     [
         ("speed(a[-1]) <= 1", "a speed is from the report before to this one", "leave out the [-n]"),

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished
+from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished, windows_of
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
@@ -17,6 +17,7 @@ from spatial_replay.monitor.witness.path import (
     DecidingPath,
     End,
     MissedResponse,
+    PathNode,
     deciding_atom,
     deciding_path,
     failed_implication,
@@ -31,6 +32,7 @@ from spatial_replay.spec.formula import (
     BooleanOperator,
     Formula,
     Quantified,
+    Temporal,
     TrackedName,
     Variable,
     operands_of,
@@ -181,7 +183,7 @@ def find_witness(
     nodes = [evidence.bound(formula) for formula, _ in done.tree]
 
     def followed(found: DecidingPath) -> tuple[tuple[WitnessStep, ...], DecidingAtom | None]:
-        path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
+        path = tuple(_step(step, nodes[step.node], times_ns) for step in found.steps)
         leaf = nodes[path[-1].node]
         if not isinstance(leaf, Atom | Quantified):
             return path, None
@@ -312,6 +314,11 @@ def time_of_least(
     return int(times_ns[earliest + bisect_left(later, True, key=is_reached)])
 
 
-def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:
-    text = format_formula(formula)
-    return WitnessStep(node, operator_of(formula), formula.name, text, time_ns, leaves_out(formula))
+def _step(step: PathNode, formula: Formula, times_ns: Integers) -> WitnessStep:
+    text, time_ns = format_formula(formula), int(times_ns[step.sample])
+    is_empty = False
+    if isinstance(formula, Temporal):
+        begin, end = windows_of(formula, times_ns)
+        is_empty = bool(begin[step.sample] >= end[step.sample])
+    are_left_out = leaves_out(formula) and not is_empty
+    return WitnessStep(step.node, operator_of(formula), formula.name, text, time_ns, are_left_out)
