@@ -67,6 +67,7 @@ def test_every_result_is_explained_in_a_few_sentences(
         "`cube dist cup >= 0.5` is unknown at 0.000 s, where it could decide (within `apart`): "
         "cup is not in the sample.",
         "cup is missing in 2 of 4 samples, all before 1.000 s: --from 1.000s leaves them out.",
+        "Asked only while cup is in the samples, it is satisfied: write `G (present(cup) -> …)`.",
     ]
     _, far = said(capsys, *EXPLAIN, "--spec", "G (cube dist cup >= 2)")
     assert "No number in it makes that satisfied: samples that are unknown decide, too." in far
