@@ -118,9 +118,9 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessa
     grid, values = gradient.grid, gradient.values[turned.turn]
     colours = dict(zip(_COLOURS, np.moveaxis(cell_colours(values), -1, 0), strict=True))
     fields = {"robustness": values.astype("<f4"), **colours, **dict(_fields(turned, layers))}
-    cells = np.empty(values.shape, [(name, own.dtype.str) for name, own in fields.items()])
-    for name, own in fields.items():
-        cells[name] = own
+    cells = np.empty(values.shape, [(name, array.dtype.str) for name, array in fields.items()])
+    for name, array in fields.items():
+        cells[name] = array
     size = cells.dtype.itemsize
     message = GridMessage(
         frame_id=FRAME,
@@ -135,9 +135,9 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessa
     message.pose.orientation.w = 1.0
     message.cell_size.x = message.cell_size.y = grid.cell_size
     offset = 0
-    for name, own in fields.items():
-        message.fields.add(name=name, offset=offset, type=_FIELD_TYPES[own.dtype.str])
-        offset += own.dtype.itemsize
+    for name, array in fields.items():
+        message.fields.add(name=name, offset=offset, type=_FIELD_TYPES[array.dtype.str])
+        offset += array.dtype.itemsize
     return message
 
 
@@ -149,8 +149,8 @@ def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndar
     yield "clearance", _singles(gradient.clearance[turn])
     yield "room", _singles(gradient.made_of.now.room(room_from)[turn])
     varying = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
-    chosen = sorted(range(len(varying)), key=lambda place: not varying[place])[:MOST_LAYERS]
-    for place in sorted(chosen):
+    places = sorted(range(len(varying)), key=lambda place: not varying[place])[:MOST_LAYERS]
+    for place in sorted(places):
         # a number in front, so that no conjunct is named like another field
         name = f"{place + 1}: {layers.conjuncts[place]}"
         yield name, _singles(layers.robustness[place, turn])
@@ -257,7 +257,7 @@ class BlackBox:
         began = time.perf_counter()
         self.planner.observe(sample)
         self._sample = sample
-        tracked = self._object_moved()
+        tracked = self._moving_object()
         if tracked is not None:
             self._travelled.append(centre_of(tracked.footprint))
         self.planning_s += time.perf_counter() - began
@@ -277,11 +277,14 @@ class BlackBox:
             return step
         ended = self._ended_wait(step.time_ns)
         self._step = step
-        self._tracked = self._object_moved()
+        self._tracked = self._moving_object()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
         layers = _layers_of(step, self.planner)
         self._decision = explained_decision(step, self.planner, self._written[_MAPS], layers)
-        maps = [map_message(each, step.time_ns, layers[each.candidate]) for each in maps_of(step)]
+        maps = [
+            map_message(turned_map, step.time_ns, layers[turned_map.candidate])
+            for turned_map in maps_of(step)
+        ]
         path = path_message(step.target, self._tracked, step.time_ns)
         timings = [[_timing(step, took_s)]] if self._times else []
         messages = self._messages(step.time_ns, [*ended, self._decision], maps, [path], *timings)
@@ -301,15 +304,15 @@ class BlackBox:
         step, end_ns = self._step, self._sample.time_ns
         path = path_message(step.target, self._tracked, end_ns, self._travelled)
         self._step = None
-        self._write(self._messages(end_ns, [self._concluded(outcome, end_ns)], [], [path]))
+        self._write(self._messages(end_ns, [self._with_outcome(outcome, end_ns)], [], [path]))
 
     def _ended_wait(self, end_ns: int) -> list[PlanDecision]:
         """Return the last decision with its outcome if it was a wait."""
         if self._step is None or self._step.kind != "wait":
             return []
-        return [self._concluded(wait_outcome(self._step, self.planner.states), end_ns)]
+        return [self._with_outcome(wait_outcome(self._step, self.planner.states), end_ns)]
 
-    def _concluded(self, outcome: Outcome, end_ns: int) -> PlanDecision:
+    def _with_outcome(self, outcome: Outcome, end_ns: int) -> PlanDecision:
         """Return the last decision with its outcome."""
         message = PlanOutcome(
             end_ns=end_ns,
@@ -322,7 +325,7 @@ class BlackBox:
         self._decision.outcome.CopyFrom(message)
         return self._decision
 
-    def _object_moved(self) -> TrackedObject | None:
+    def _moving_object(self) -> TrackedObject | None:
         """Return the object that the last step moves, from the newest sample."""
         if self._step is None or self._step.target is None or self._sample is None:
             return None
@@ -386,8 +389,10 @@ def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, .
 
 
 def _layers_of(step: Step, planner: Planner) -> dict[Candidate, MapLayers]:
-    found = (each for edge in step.considered for each in edge.candidates)
-    return {each: map_layers(each.map, planner.settings, each.failed) for each in found}
+    candidates = (candidate for edge in step.considered for candidate in edge.candidates)
+    return {
+        candidate: map_layers(candidate.map, planner.settings, candidate.failed) for candidate in candidates
+    }
 
 
 def explained_decision(
@@ -403,8 +408,8 @@ def explained_decision(
     layers = layers or _layers_of(step, planner)
     message = decision_message(step, planner.automaton.name, first_map)
     for edge, of_edge in zip(step.considered, message.considered, strict=True):
-        for each, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            explain(of_candidate, each, layers[each], planner.settings)
+        for candidate, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
+            explain(of_candidate, candidate, layers[candidate], planner.settings)
     return message
 
 
@@ -418,7 +423,7 @@ def decision_message(step: Step, specification: str = "", first_map: int = 0) ->
         specification=specification,
         kind=PlanDecision.Kind.Value(f"KIND_{step.kind.upper().replace(' ', '_')}"),
         states=step.states,
-        considered=[_edge(each, numbers) for each in step.considered],
+        considered=[_edge(consideration, numbers) for consideration in step.considered],
         target=None if step.target is None else _target(step.target),
         pruned=pruned,
         reason=step.reason,
@@ -433,7 +438,7 @@ def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> Pla
         target=consideration.edge[1],
         progress=_guards(consideration.progress),
         constraints=_guards(consideration.constraints),
-        candidates=[_candidate(each, numbers) for each in consideration.candidates],
+        candidates=[_candidate(candidate, numbers) for candidate in consideration.candidates],
         pruned=str(consideration.pruned or ""),
         motions=map(_target, consideration.motions),
         joint=consideration.is_joint,
@@ -488,8 +493,8 @@ def path_message(
     lines: dict[str, list[LinePrimitive]] = {}
     if target is not None and tracked is not None:
         height = 0.0 if tracked.height is None else tracked.height[1]
-        there = moved_object(tracked, target.x, target.y, target.turn)
-        rings = [ring.tolist() for ring in outlines_of(there.footprint)]
+        at_target = moved_object(tracked, target.x, target.y, target.turn)
+        rings = [ring.tolist() for ring in outlines_of(at_target.footprint)]
         lines[_PATH] = [_line(target.waypoints, height, POSITIVE)]
         lines[_PATH] += [_line(ring, height, POSITIVE, LinePrimitive.LINE_LOOP) for ring in rings]
         if travelled:
@@ -544,7 +549,7 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
     yield f"  {decision.reason}"
     if decision.HasField("target"):
-        yield f"  {_target_text(decision.target)}{once_all_are_done(decision.considered[-1])}"
+        yield f"  {_target_text(decision.target)}{joint_suffix(decision.considered[-1])}"
     said: dict[tuple[str, ...], str] = {}
     for place, edge in enumerate(decision.considered, 1):
         yield from _edge_lines(edge, said, is_aim=place == len(decision.considered) and not edge.pruned)
@@ -558,7 +563,7 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
         yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 
 
-def once_all_are_done(edge: PlanEdge) -> str:
+def joint_suffix(edge: PlanEdge) -> str:
     """Return when a target has its robustness, of several motions for one edge."""
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
 
@@ -581,7 +586,7 @@ def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: boo
         yield f"    {_candidate_text(candidate)}"
         yield from rows
     if len(edge.motions) > 1:
-        yield f"    planned   {', then '.join(_place_text(each) for each in edge.motions)}"
+        yield f"    planned   {', then '.join(_place_text(motion) for motion in edge.motions)}"
     if edge.pruned:
         yield f"    given up: {Reason.from_text(edge.pruned).kind}"
 
@@ -596,7 +601,7 @@ def _candidate_text(candidate: PlanCandidate) -> str:
 
 def _maps(candidate: PlanCandidate) -> str:
     """Return the numbers of its messages on the topic of gradient maps."""
-    numbers = sorted(each.number for each in candidate.maps)
+    numbers = sorted(turned_map.number for turned_map in candidate.maps)
     if len(numbers) < 2:
         return "".join(f" (map {number})" for number in numbers)
     return f" (maps {numbers[0]} to {numbers[-1]})"
@@ -604,7 +609,7 @@ def _maps(candidate: PlanCandidate) -> str:
 
 def _length(target: PlanTarget) -> float:
     points = list(zip(target.waypoints[::2], target.waypoints[1::2], strict=True))
-    return sum(math.dist(one, other) for one, other in pairwise(points))
+    return sum(math.dist(start, end) for start, end in pairwise(points))
 
 
 def _target_text(target: PlanTarget) -> str:
@@ -629,10 +634,13 @@ def _some(texts: Sequence[str]) -> str:
 
 def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
     """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
-    limiting = sorted((each for each in candidate.conjuncts if each.limits), key=lambda each: -each.limits)
-    for each in limiting[:_MOST_LISTED]:
-        here = f", {each.at_target:.4g} at the target" if each.HasField("at_target") else ""
-        yield "limited by", f"{each.text} in {counted(each.limits, 'cell')}{here}"
+    limiting = sorted(
+        (conjunct for conjunct in candidate.conjuncts if conjunct.limits),
+        key=lambda conjunct: -conjunct.limits,
+    )
+    for conjunct in limiting[:_MOST_LISTED]:
+        at_target = f", {conjunct.at_target:.4g} at the target" if conjunct.HasField("at_target") else ""
+        yield "limited by", f"{conjunct.text} in {counted(conjunct.limits, 'cell')}{at_target}"
     for cause in candidate.causes[:_MOST_LISTED]:
         yield "blocked by", f"{cause_text(cause)} in {counted(cause.cells, 'cell')}"
     if candidate.HasField("room"):
@@ -666,13 +674,15 @@ def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
 def _write_numbers(row: dict[str, Any], message: Message) -> None:
     """Write numbers that protobuf writes as text, such as 64-bit integers, as in all our JSON."""
     for field, value in message.ListFields():
-        written = row[field.name]
+        json_value = row[field.name]
         if field.type == field.TYPE_FIXED64:
             row[field.name] = value
         elif field.type == field.TYPE_DOUBLE:
-            many = isinstance(written, list)
-            row[field.name] = [json_number(each) for each in value] if many else json_number(value)
+            many = isinstance(json_value, list)
+            row[field.name] = [json_number(number) for number in value] if many else json_number(value)
         elif field.type == field.TYPE_MESSAGE:
-            parts = zip(written, value, strict=True) if isinstance(written, list) else [(written, value)]
+            parts = (
+                zip(json_value, value, strict=True) if isinstance(json_value, list) else [(json_value, value)]
+            )
             for part, of_part in parts:
                 _write_numbers(part, of_part)

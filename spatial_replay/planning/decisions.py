@@ -99,7 +99,7 @@ class Target:
     @property
     def length(self) -> float:
         """Length of the path, in footprint units."""
-        return sum(math.dist(one, other) for one, other in pairwise(self.waypoints))
+        return sum(math.dist(start, end) for start, end in pairwise(self.waypoints))
 
 
 def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:

@@ -56,28 +56,32 @@ def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bo
         case Boolean(operator="not"):
             return alternatives(formula.operands[0], not wanted)
         case Boolean():
-            parts = [alternatives(each, wanted) for each in formula.operands]
+            parts = [alternatives(operand, wanted) for operand in formula.operands]
             if (formula.operator == "and") == wanted:
-                return _conjoined(parts)
-            return [each for part in parts for each in part][:MOST_ALTERNATIVES]
+                return _conjoin(parts)
+            return [conjunction for part in parts for conjunction in part][:MOST_ALTERNATIVES]
         case _:
             return [((formula, wanted),)]
 
 
 def demands_of(cube: Cube, formulas: Sequence[Formula], least: float) -> list[tuple[Demand, ...]]:
     """Return the ways to make a cube of propositions hold, as conjunctions of demands."""
-    parts = [alternatives(formulas[number], wanted) for number, wanted in cube]
-    return [tuple(Demand(*each, least) for each in one) for one in _conjoined(parts)]
+    parts = [alternatives(formulas[number], value) for number, value in cube]
+    return [tuple(Demand(*literal, least) for literal in conjunction) for conjunction in _conjoin(parts)]
 
 
-def _conjoined(
+def _conjoin(
     parts: Sequence[list[tuple[tuple[Formula, bool], ...]]],
 ) -> list[tuple[tuple[Formula, bool], ...]]:
     combined: list[tuple[tuple[Formula, bool], ...]] = [()]
     for part in parts:
-        combined = [(*one, *other) for one, other in product(combined, part)][:MOST_ALTERNATIVES]
-    unique = (dict.fromkeys(each) for each in combined)
-    return [tuple(each) for each in unique if not any((one, not wanted) in each for one, wanted in each)]
+        combined = [(*left, *right) for left, right in product(combined, part)][:MOST_ALTERNATIVES]
+    unique = (dict.fromkeys(conjunction) for conjunction in combined)
+    return [
+        tuple(literals)
+        for literals in unique
+        if not any((formula, not value) in literals for formula, value in literals)
+    ]
 
 
 def values_in(
@@ -105,7 +109,7 @@ class Budget:
         return self.left >= 0.0
 
 
-def with_moved(sample: Sample, poses: Mapping[str, Pose], later_ns: int = 0) -> Sample:
+def move_objects(sample: Sample, poses: Mapping[str, Pose], later_ns: int = 0) -> Sample:
     """Return a sample with objects moved to poses (x, y, turn)."""
     placed = {name: moved_object(sample.objects[name], *pose) for name, pose in poses.items()}
     return with_objects(sample, placed, later_ns)
@@ -172,10 +176,12 @@ def refuse_template(specification: Specification, name: str) -> None:
 def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str]]:
     """Return for each proposition the names of the innermost specs in a formula that it is part of."""
     parts = {
-        each.name: list(iter_formulas(each))[1:] for each in list(iter_formulas(formula))[1:] if each.name
+        spec.name: list(iter_formulas(spec))[1:] for spec in list(iter_formulas(formula))[1:] if spec.name
     }
-    innermost = {name: inner for name, inner in parts.items() if not any(each.name for each in inner)}
-    return [[name for name, inner in innermost.items() if each in inner] for each in propositions]
+    innermost = {name: inner for name, inner in parts.items() if not any(part.name for part in inner)}
+    return [
+        [name for name, inner in innermost.items() if proposition in inner] for proposition in propositions
+    ]
 
 
 class IdleTransitions(NamedTuple):
@@ -220,7 +226,10 @@ def consideration_of(
         symbol: the newest sample's propositions. The constraint set also leaves out the edge that these would
             take, unless acceptance is lost by it.
     """
-    states, edge = (path[0].source, *(each.target for each in path)), (path[0].source, path[0].target)
+    states, edge = (
+        (path[0].source, *(transition.target for transition in path)),
+        (path[0].source, path[0].target),
+    )
     others = _other_edges(automaton, edge, pruned, symbol)
     return Consideration(states, edge, _guards(automaton, path[:1]), _guards(automaton, others), ())
 
@@ -242,7 +251,7 @@ def equivalent_edges(
         transition = automaton.transition(*edge)
         if transition is not None and transition.guard == consideration.progress.cubes:
             others = _other_edges(automaton, edge, pruned, symbol)
-            if constraints <= {cube for each in others for cube in each.guard}:
+            if constraints <= {cube for rival in others for cube in rival.guard}:
                 yield edge
 
 
@@ -268,7 +277,7 @@ def _other_edges(
 
 
 def _guards(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:
-    cubes = tuple(cube for each in transitions for cube in each.guard)
+    cubes = tuple(cube for transition in transitions for cube in transition.guard)
     texts = tuple(
         " and ".join(automaton.propositions[number].literal(value) for number, value in cube) or "true"
         for cube in cubes
@@ -283,17 +292,17 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
         states: of the automaton before the sample.
         before, symbol: the propositions of the sample before, () if there is none, and of this one.
     """
-    taken = [
+    cubes = [
         cube
         for source in sorted(states)
         for target in automaton.successors[source]
         if target not in automaton.can_accept and (edge := automaton.transition(source, target)) is not None
         for cube in edge.guard
-        if all(symbol[number] is wanted for number, wanted in cube)
+        if all(symbol[number] is value for number, value in cube)
     ]
-    cube = min(taken, key=len, default=())
+    cube = min(cubes, key=len, default=())
     # what has just changed says more than what was so before
-    changed = [each for each in cube if before and before[each[0]] is not symbol[each[0]]]
+    changed = [literal for literal in cube if before and before[literal[0]] is not symbol[literal[0]]]
     return " and ".join(automaton.propositions[number].literal(value) for number, value in changed or cube)
 
 
@@ -301,8 +310,8 @@ def moved_later(
     path: Sequence[Transition], symbol: Symbol, formulas: Sequence[Formula], names: Iterable[str]
 ) -> frozenset[str]:
     """Return the objects that the rest of a path, without its first edge, may ask to be moved."""
-    literals = (literal for each in path[1:] for cube in each.guard for literal in cube)
-    unmet = {number for number, wanted in literals if symbol[number] is not wanted}
+    literals = (literal for transition in path[1:] for cube in transition.guard for literal in cube)
+    unmet = {number for number, value in literals if symbol[number] is not value}
     return frozenset(name for name in names if any(concerns(formulas[number], name) for number in unmet))
 
 
@@ -330,15 +339,17 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason],
             # the last failure of an edge says more than how often it was tried
             kind = str(reason) if reason.kind.startswith(_TRIED) else reason.kind
             edges.setdefault(kind, []).append(f"{source} -> {target}")
-    reasons = "; ".join(f"{_listed(each)}: {kind}" for kind, each in edges.items())
+    reasons = "; ".join(f"{_edges_text(texts)}: {kind}" for kind, texts in edges.items())
     later = [
-        each.detail for edge, each in sorted(pruned.items()) if edge[0] in reachable and each.kind == LATER
+        reason.detail
+        for edge, reason in sorted(pruned.items())
+        if edge[0] in reachable and reason.kind == LATER
     ]
     what = f"; what cannot be done: {why or later[0]}" if why or later else ""
     return f"no path left: every way from state {state} was given up ({reasons}){what}"
 
 
-def _listed(edges: Sequence[str]) -> str:
+def _edges_text(edges: Sequence[str]) -> str:
     more = f" and {len(edges) - _LISTED} more" if len(edges) > _LISTED else ""
     return ", ".join(edges[:_LISTED]) + more
 
@@ -390,13 +401,13 @@ class Attempts:
     def forgiven(self) -> Attempts:
         """Return the same attempts with only the refused motions as failures, so that others are repeated."""
         attempts = copy(self)
-        attempts._motions, attempts._places = [each for each in self._motions if each.refused], {}
+        attempts._motions, attempts._places = [motion for motion in self._motions if motion.refused], {}
         return attempts
 
-    def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
+    def why_not_again(self, edge: Edge, most_failed: int) -> Reason | None:
         """Return why an edge is not tried again; None if it may be."""
         if self._failed[edge] >= most_failed:
-            return Reason(_tried(self._failed[edge]), self._last.get(edge, ""))
+            return Reason(_count_text(self._failed[edge]), self._last.get(edge, ""))
         # a motion that succeeds clears the failures, so that G F … would go on without end
         return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
 
@@ -418,7 +429,7 @@ class Attempts:
             self._last[aim.edge] = "; ".join(filter(None, said))
             stayed = _stands(target.name, before, sample, settings)
             self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
-            # another place may help
+            # a motion that failed at its place may succeed at another one
             if outcome.at in (None, "place") and not (settings.skill == "push" and stayed):
                 self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
@@ -435,13 +446,14 @@ class Attempts:
     def needs_room(self, name: str) -> bool:
         """Return whether an object could not be moved to a place, perhaps for lack of room there."""
         return any(
-            each.target.name == name and each.stayed and each.at in (None, "place") for each in self._motions
+            motion.target.name == name and motion.stayed and motion.at in (None, "place")
+            for motion in self._motions
         )
 
     def failed_pick(self, name: str, sample: Sample, settings: Settings) -> bool:
         """Return whether an object could not be picked up while everything stood as in a sample."""
         return settings.skill == "place" and any(
-            each.at == "pick" for each in self._here(name, sample, settings)
+            motion.at == "pick" for motion in self._here(name, sample, settings)
         )
 
     def failed_here(self, name: str, sample: Sample, settings: Settings) -> tuple[Target, ...]:
@@ -449,34 +461,34 @@ class Attempts:
 
         After a push that did not move its object, only neighbours of the object are considered.
         """
-        return tuple(each.target for each in self._here(name, sample, settings))
+        return tuple(motion.target for motion in self._here(name, sample, settings))
 
     def _here(self, name: str, sample: Sample, settings: Settings) -> Iterator[FailedMotion]:
         """Yield the failed motions of an object that began with everything as in a sample."""
-        for each in self._motions:
-            if each.target.name == name and _is_same_scene(each, sample, settings):
-                yield each
+        for motion in self._motions:
+            if motion.target.name == name and _is_same_scene(motion, sample, settings):
+                yield motion
 
 
-def _tried(count: int) -> str:
+def _count_text(count: int) -> str:
     return f"{_TRIED}{count} times" if count > 1 else f"{_TRIED}once"
 
 
 def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:
     """Return whether nothing that a failed motion began with is elsewhere in a sample."""
-    name, before = motion.target.name, motion.before
-    tracked = before.objects[name]
-    names = list(dict.fromkeys([name, *before.objects, *sample.objects]))
+    moved_name, before = motion.target.name, motion.before
+    tracked = before.objects[moved_name]
+    names = list(dict.fromkeys([moved_name, *before.objects, *sample.objects]))
     if settings.skill == "push":
         if not motion.stayed:
             return False
         near = BESIDE * radius_of(tracked)
         names = [
-            each
-            for each in names
-            if min(_away(tracked, one.objects.get(each)) for one in (before, sample)) <= near
+            neighbour
+            for neighbour in names
+            if min(_away(tracked, scene.objects.get(neighbour)) for scene in (before, sample)) <= near
         ]
-    return all(_stands(each, before, sample, settings) for each in names)
+    return all(_stands(name, before, sample, settings) for name in names)
 
 
 def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:

@@ -37,10 +37,10 @@ from spatial_replay.planning.edges import (
     demands_of,
     equivalent_edges,
     idle_transitions,
+    move_objects,
     moved_later,
     surplus,
     values_in,
-    with_moved,
     with_objects,
 )
 from spatial_replay.planning.maps import (
@@ -59,7 +59,7 @@ from spatial_replay.planning.motions import (
     Ordered,
     PredictedState,
     by_cost,
-    with_chosen,
+    choose_candidate,
 )
 from spatial_replay.planning.settings import Grid, Settings, Workspace
 from spatial_replay.planning.targets import nearest_meeting
@@ -135,11 +135,11 @@ class Arranger:
         self._grid = settings.workspace.grid
         order = sorted(sample.objects) if settings.movable is None else settings.movable
         self._movable = {name: sample.objects[name] for name in order if name in sample.objects}
-        self._about = {each: self._names(each) for each in self._demands}
+        self._about = {demand: self._names(demand) for demand in self._demands}
         self._fields: dict[str, _Field] = {}
         self._stencils: dict[tuple[object, ...], Floats] = {}
         self._visits = 0
-        # what an object at the best place of its cell may gain on each demand
+        # by how much a demand may be missed in the middle of a cell that meets it elsewhere
         self._slack = 0.0
         self._is_placed = settings.refine and settings.skill == "place"
 
@@ -149,11 +149,11 @@ class Arranger:
     @cached_property
     def _unmet(self) -> tuple[Demand, ...]:
         met = zip(self._demands, self._surplus_in(self._sample), strict=True)
-        return tuple(each for each, value in met if value < 0.0)
+        return tuple(demand for demand, value in met if value < 0.0)
 
     def _surplus_in(self, sample: Sample) -> list[float]:
         """Return by how much a sample meets each demand."""
-        values = values_in(sample, [each.formula for each in self._demands], self._regions)
+        values = values_in(sample, [demand.formula for demand in self._demands], self._regions)
         return list(map(surplus, *values, self._demands))
 
     def why_hopeless(self) -> str:
@@ -162,13 +162,17 @@ class Arranger:
             if not self._about[demand]:
                 return "no object that can be moved matters to it"
         for name in self._movable:
-            own = [each for each in self._demands if self._about[each] == (name,)]
-            if own and any(each in self._unmet for each in own) and (field := self._field(name)) is not None:
-                met = np.minimum.reduce([field.surplus[each] for each in own])
+            demands = [demand for demand in self._demands if self._about[demand] == (name,)]
+            if (
+                demands
+                and any(demand in self._unmet for demand in demands)
+                and (field := self._field(name)) is not None
+            ):
+                met = np.minimum.reduce([field.surplus[demand] for demand in demands])
                 least = -self._in_cell if self._is_placed else 0.0
                 if not ((field.clearance > least) & (met >= least)).any():
                     if (met >= 0.0).any():
-                        stands = _listed(self._standing(field, met >= 0.0))
+                        stands = _standing_text(self._standing(field, met >= 0.0))
                         return f"{stands or 'the robot does not reach'} wherever {name} would have to be"
                     missing = -float(met[field.clearance > 0.0].max(initial=-math.inf))
                     return f"{name}: nowhere would all of it hold, {missing:.4g} is missing at best"
@@ -183,16 +187,16 @@ class Arranger:
         """Return what cannot be moved and stands where objects could go, as a sentence; "" for nothing."""
         names: dict[str, None] = {}
         for name, field in self._fields.items():
-            wanted = self._met(field, name, tuple(self._movable))
-            if not wanted.all():
-                names |= dict.fromkeys(self._standing(field, wanted))
-        return f"{_listed(list(names))} there" if names else ""
+            cells = self._meeting_cells(field, name, tuple(self._movable))
+            if not cells.all():
+                names |= dict.fromkeys(self._standing(field, cells))
+        return f"{_standing_text(list(names))} there" if names else ""
 
-    def _standing(self, field: _Field, wanted: Booleans) -> list[str]:
+    def _standing(self, field: _Field, cells: Booleans) -> list[str]:
         """Return what cannot be moved and stands in some cells, what is in most of them first."""
         clearance = self._settings.workspace.clearance
-        counts = {each: int((wanted & (away <= clearance)).sum()) for each, away in field.standing.items()}
-        return sorted((each for each in counts if counts[each]), key=lambda each: -counts[each])
+        counts = {name: int((cells & (away <= clearance)).sum()) for name, away in field.standing.items()}
+        return sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
 
     def arrangements(self, most: int) -> Iterator[dict[str, Pose]]:
         """Yield arrangements of the least sets of objects first, places between cells if there are no others.
@@ -200,10 +204,10 @@ class Arranger:
         Args:
             most: the most objects that are moved.
         """
-        found = None
-        for found in self._over_cells(most):
-            yield found
-        if found is None and self._is_placed:
+        poses = None
+        for poses in self._over_cells(most):
+            yield poses
+        if poses is None and self._is_placed:
             yield from self._between_cells(most)
 
     def cell_hint(self, most: int) -> str:
@@ -219,33 +223,34 @@ class Arranger:
             self._slack = 0.0
 
     def _over_cells(self, most: int) -> Iterator[dict[str, Pose]]:
-        queue = [(len(each), number, each) for number, each in enumerate(self._bases(most))]
+        queue = [(len(group), number, group) for number, group in enumerate(self._bases(most))]
         heapq.heapify(queue)
-        seen = {each for *_, each in queue}
+        seen = {group for *_, group in queue}
         count = len(queue)
-        most_sets, most_found = (_MOST_BETWEEN,) * 2 if self._slack else (_MOST_SETS, _MOST_SOLUTIONS)
+        most_sets, most_effort = (_MOST_BETWEEN,) * 2 if self._slack else (_MOST_SETS, _MOST_SOLUTIONS)
         for _ in range(most_sets):
             if not queue:
                 return
-            *_, chosen = heapq.heappop(queue)
-            domains = self._domains(chosen)
-            if domains is not None and all(each.any() for each in domains.values()):
+            *_, group = heapq.heappop(queue)
+            domains = self._domains(group)
+            if domains is not None and all(domain.any() for domain in domains.values()):
                 self._visits = 0
-                stencils = self._conflicts(chosen, domains)
-                found = 0
-                for cells in self._placed({}, domains, stencils):
+                stencils = self._conflicts(group, domains)
+                effort = 0
+                for cells in self._placements({}, domains, stencils):
                     poses: dict[str, Pose] | None = {name: self._pose(name, cells[name]) for name in cells}
                     if self._slack and poses:
-                        poses = self._settled(poses)
-                        found += 1
-                    if poses is not None and self.meets(with_moved(self._sample, poses)):
+                        poses = self._settle(poses)
+                        # an attempt that fails spends maps, too
+                        effort += 1
+                    if poses is not None and self.meets(move_objects(self._sample, poses)):
                         yield poses
-                        found += 1
-                    if found >= most_found:
+                        effort += 1
+                    if effort >= most_effort:
                         break
-            if len(chosen) < most and chosen:
-                for name in self._in_the_way(chosen):
-                    wider = tuple(each for each in self._movable if each in chosen or each == name)
+            if len(group) < most and group:
+                for name in self._in_the_way(group):
+                    wider = tuple(movable for movable in self._movable if movable in group or movable == name)
                     if wider not in seen:
                         seen.add(wider)
                         count += 1
@@ -256,12 +261,12 @@ class Arranger:
         sets: dict[tuple[str, ...], None] = {(): None}
         for demand in self._unmet:
             wider: dict[tuple[str, ...], None] = {}
-            for each in sets:
-                if any(name in each for name in self._about[demand]):
-                    wider[each] = None
+            for group in sets:
+                if any(name in group for name in self._about[demand]):
+                    wider[group] = None
                     continue
                 for name in self._about[demand]:
-                    both = tuple(one for one in self._movable if one in each or one == name)
+                    both = tuple(movable for movable in self._movable if movable in group or movable == name)
                     if len(both) <= most:
                         wider[both] = None
             sets = dict(list(wider.items())[:_MOST_SETS])
@@ -269,49 +274,54 @@ class Arranger:
 
     def _in_the_way(self, chosen: tuple[str, ...]) -> list[str]:
         """Return other objects, those first that stand where the chosen ones could go."""
-        counts = dict.fromkeys((each for each in self._movable if each not in chosen), 0)
+        counts = dict.fromkeys((movable for movable in self._movable if movable not in chosen), 0)
         for name in chosen:
             if (field := self._field(name)) is None:
                 return []
             is_open = field.clearance > -self._slack
-            wanted = is_open & self._met(field, name, chosen)
-            if not wanted.any():
-                # nothing that is moved away would make room; a demand about two may be met by the other one
-                wanted = is_open
-            for other, apart in field.apart.items():
-                if other in counts:
-                    counts[other] += int((wanted & (apart <= 0.0)).sum())
-        tied = {name for each in self._unmet for name in self._about[each]}
-        useful = [each for each, count in counts.items() if count or each in tied]
-        return sorted(useful, key=lambda each: (each not in tied, -counts[each]))[:4]
+            cells = is_open & self._meeting_cells(field, name, chosen)
+            if not cells.any():
+                # no cell would do with all others away, but moving the other may meet a demand about two
+                cells = is_open
+            for neighbour, apart in field.apart.items():
+                if neighbour in counts:
+                    counts[neighbour] += int((cells & (apart <= 0.0)).sum())
+        tied = {name for demand in self._unmet for name in self._about[demand]}
+        useful = [movable for movable, count in counts.items() if count or movable in tied]
+        return sorted(useful, key=lambda movable: (movable not in tied, -counts[movable]))[:4]
 
     def _field(self, name: str) -> _Field | None:
         if name not in self._fields:
             if not self._budget.spend():
                 return None
-            self._fields[name] = self._measured(name)
+            self._fields[name] = self._measure_field(name)
         return self._fields[name]
 
-    def _measured(self, name: str) -> _Field:
+    def _measure_field(self, name: str) -> _Field:
         workspace = self._settings.workspace
-        others = [each for each in self._movable if each != name and each not in workspace.supports]
-        about = [each for each in self._demands if name in self._about[each]]
-        formulas = [*(each.formula for each in about), *(distance_between(name, each) for each in others)]
+        others = [
+            movable for movable in self._movable if movable != name and movable not in workspace.supports
+        ]
+        about = [demand for demand in self._demands if name in self._about[demand]]
+        formulas = [
+            *(demand.formula for demand in about),
+            *(distance_between(name, neighbour) for neighbour in others),
+        ]
         free = replace(workspace, supports=workspace.supports | set(others))
         maps = proposition_maps(formulas, self._regions, self._sample, name, free)
         met = dict(zip(about, map(surplus, maps.lower, maps.upper, about), strict=True))
         measured = zip(others, maps.lower[len(about) :], strict=True)
-        apart = {other: low - workspace.clearance for other, low in measured}
+        apart = {neighbour: low - workspace.clearance for neighbour, low in measured}
         reached = np.broadcast_to(workspace.within_reach(maps.grid), maps.clearance.shape)
         clearance = np.where(reached, maps.clearance - workspace.clearance, -np.inf)
         standing = dict(zip(maps.obstacles, maps.distances, strict=True))
         return _Field(maps.turns, clearance, standing, apart, met)
 
-    def _met(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
+    def _meeting_cells(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
         """Return the cells where the demands hold that no other chosen object matters to."""
         met = np.ones(field.clearance.shape, np.bool_)
         for demand, values in field.surplus.items():
-            if all(each == name or each not in chosen for each in self._about[demand]):
+            if all(movable == name or movable not in chosen for movable in self._about[demand]):
                 met &= values >= -self._slack
         return met
 
@@ -321,9 +331,9 @@ class Arranger:
         for name in chosen:
             if (field := self._field(name)) is None:
                 return None
-            domain = (field.clearance > -self._slack) & self._met(field, name, chosen)
-            for other, apart in field.apart.items():
-                if other not in chosen:
+            domain = (field.clearance > -self._slack) & self._meeting_cells(field, name, chosen)
+            for neighbour, apart in field.apart.items():
+                if neighbour not in chosen:
                     domain = domain & (apart > -self._slack)
             domains[name] = domain
         return domains
@@ -338,26 +348,28 @@ class Arranger:
         # turns without any cell need not be measured
         used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
         for first, second in combinations(chosen, 2):
-            if (found := self._stencil(first, second, chosen, used)) is not None:
-                conflicts[first, second] = there = found < -2.0 * self._slack
-                conflicts[second, first] = there.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
+            if (stencil := self._stencil(first, second, chosen, used)) is not None:
+                conflicts[first, second] = is_conflict = stencil < -2.0 * self._slack
+                conflicts[second, first] = is_conflict.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
         return conflicts
 
     def _stencil(
         self, first: str, second: str, chosen: tuple[str, ...], used: Mapping[str, Booleans]
     ) -> Floats | None:
-        """Return by how much what is about two objects is met; -inf for turns that are not measured."""
+        """Return the least surplus of the demands about two objects; -inf for turns that are not measured."""
         demands = [
-            each
-            for each in self._demands
-            if set(self._about[each]) & set(chosen) == {first, second}
-            and _is_of(each.formula, (first, second))
+            demand
+            for demand in self._demands
+            if set(self._about[demand]) & set(chosen) == {first, second}
+            and _is_of(demand.formula, (first, second))
         ]
-        one, two = self._movable[first], self._movable[second]
+        first_object, second_object = self._movable[first], self._movable[second]
         size, grid = self._grid.cell_size, self._grid
         supports = self._settings.workspace.supports
         apart = first not in supports and second not in supports
-        reach = (radius_of(one) + radius_of(two) + self._settings.workspace.clearance) / size + 1.0
+        reach = (
+            radius_of(first_object) + radius_of(second_object) + self._settings.workspace.clearance
+        ) / size + 1.0
         half = max(grid.shape) - 1 if demands else min(math.ceil(reach), max(grid.shape) - 1)
         turns, side = self._fields[first].turns, 2 * half + 1
         cells = side * side * int(used[first].sum()) * int(used[second].sum())
@@ -367,18 +379,18 @@ class Arranger:
         if key in self._stencils:
             return self._stencils[key]
         local = Grid(-(half + 0.5) * size, -(half + 0.5) * size, size, side, side)
-        formulas = [each.formula for each in demands]
+        formulas = [demand.formula for demand in demands]
         workspace, measured = self._turned_in(local, used[second])
         met = np.full((len(turns), len(used[second]), side, side), -np.inf)
         for number in np.flatnonzero(used[first]).tolist():
             turn = float(turns[number])
-            objects = {first: moved_object(one, 0.0, 0.0, turn), second: two}
+            objects = {first: moved_object(first_object, 0.0, 0.0, turn), second: second_object}
             sample = Sample(self._sample.time_ns, objects, self._sample.signals)
             maps = proposition_maps(formulas, self._regions, sample, second, workspace)
-            own = list(map(surplus, maps.lower, maps.upper, demands))
+            surpluses = list(map(surplus, maps.lower, maps.upper, demands))
             if apart:
-                own.append(maps.clearance - self._settings.workspace.clearance - _STRICTLY)
-            met[number, measured] = np.minimum.reduce(own)
+                surpluses.append(maps.clearance - self._settings.workspace.clearance - _STRICTLY)
+            met[number, measured] = np.minimum.reduce(surpluses)
         self._stencils[key] = met
         return met
 
@@ -389,12 +401,12 @@ class Arranger:
             return Workspace(grid, () if keeps else yaws), [0]
         first = int(keeps)
         numbers = [number for number in range(first, len(used)) if used[number]]
-        chosen = tuple(yaws[number - first] for number in numbers)
-        return Workspace(grid, chosen, keeps_yaw=keeps), [*range(first), *numbers]
+        used_yaws = tuple(yaws[number - first] for number in numbers)
+        return Workspace(grid, used_yaws, keeps_yaw=keeps), [*range(first), *numbers]
 
     # ----------------------------------------------------------------------------------------- search
 
-    def _placed(
+    def _placements(
         self,
         cells: dict[str, Cell],
         domains: Mapping[str, Booleans],
@@ -403,18 +415,18 @@ class Arranger:
         if not domains:
             yield cells
             return
-        name = min(domains, key=lambda each: int(domains[each].sum()))
-        others = {each: domain for each, domain in domains.items() if each != name}
+        name = min(domains, key=lambda movable: int(domains[movable].sum()))
+        others = {movable: domain for movable, domain in domains.items() if movable != name}
         for cell in self._choices(name, domains[name], others, stencils):
             if self._visits >= _MOST_VISITS:
                 return
             self._visits += 1
             left = {
-                each: domain & ~_conflicts(stencils.get((name, each)), cell, domain.shape)
-                for each, domain in others.items()
+                movable: domain & ~_conflicts(stencils.get((name, movable)), cell, domain.shape)
+                for movable, domain in others.items()
             }
-            if all(each.any() for each in left.values()):
-                yield from self._placed({**cells, name: cell}, left, stencils)
+            if all(domain.any() for domain in left.values()):
+                yield from self._placements({**cells, name: cell}, left, stencils)
 
     def _choices(
         self,
@@ -426,25 +438,25 @@ class Arranger:
         """Yield some cells: the most robust one, the one that leaves most to the others, and corners."""
         score = self._score(name)
         left = np.ones(domain.shape)
-        for other, cells in others.items():
-            if (stencil := stencils.get((name, other))) is not None:
-                left = np.minimum(left, 1.0 - _lost(cells, stencil) / max(int(cells.sum()), 1))
+        for movable, cells in others.items():
+            if (stencil := stencils.get((name, movable))) is not None:
+                left = np.minimum(left, 1.0 - _count_losses(cells, stencil) / max(int(cells.sum()), 1))
         ranked = [(domain & (left >= _ENOUGH), score), (domain & (left > 0.0), left), (domain, score)]
-        chosen = [_best(among, values, score) for among, values in ranked if among.any()]
+        choices = [_best(among, values, score) for among, values in ranked if among.any()]
         rows, columns = np.indices(domain.shape, np.float64)[1:]
         among = domain & (left > 0.0)
         if among.any():
-            chosen += [_best(among, each, left) for each in (rows, -rows, columns, -columns)]
-        yield from dict.fromkeys(chosen)
+            choices += [_best(among, coordinate, left) for coordinate in (rows, -rows, columns, -columns)]
+        yield from dict.fromkeys(choices)
 
     def _score(self, name: str) -> Floats:
         """Return how good each cell of an object is, the other ones aside."""
         field, settings = self._fields[name], self._settings
         gaps = np.minimum.reduce([field.clearance, *field.apart.values()])
         room = gaps + settings.workspace.clearance
-        own = [field.surplus[each] for each in field.surplus if self._about[each] == (name,)]
-        if own:
-            score: Floats = np.minimum.reduce(own)
+        surpluses = [field.surplus[demand] for demand in field.surplus if self._about[demand] == (name,)]
+        if surpluses:
+            score: Floats = np.minimum.reduce(surpluses)
             # cells with too little room come after all others, and so do turns of what is pushed
             is_last = room < settings.room
             is_last[1:] |= settings.workspace.keeps_yaw
@@ -462,7 +474,7 @@ class Arranger:
         x, y = self._grid.centre(cell[1], cell[2])
         return x, y, float(self._fields[name].turns[cell[0]])
 
-    def _settled(self, poses: Mapping[str, Pose]) -> dict[str, Pose] | None:
+    def _settle(self, poses: Mapping[str, Pose]) -> dict[str, Pose] | None:
         """Return poses near others that meet all demands, and are clear of everything; None if none is found.
 
         Each step goes to the nearest places that meet the demands, linear as here and in the steps before.
@@ -470,17 +482,21 @@ class Arranger:
         """
         workspace, size = self._settings.workspace, self._grid.cell_size
         obstacles = {
-            f"obstacle {number}": TrackedObject(each) for number, each in enumerate(workspace.obstacles)
+            f"obstacle {number}": TrackedObject(obstacle)
+            for number, obstacle in enumerate(workspace.obstacles)
         }
         sample = with_objects(self._sample, obstacles)
-        others = [each for each in sample.objects if each not in workspace.supports]
+        others = [name for name in sample.objects if name not in workspace.supports]
         pairs = {
-            frozenset((name, other)) for name in poses for other in others if name not in workspace.supports
+            frozenset((name, neighbour))
+            for name in poses
+            for neighbour in others
+            if name not in workspace.supports
         }
         apart = [
-            Demand(distance_between(*sorted(each)), True, workspace.clearance)
-            for each in sorted(pairs, key=sorted)
-            if len(each) == 2
+            Demand(distance_between(*sorted(pair)), True, workspace.clearance)
+            for pair in sorted(pairs, key=sorted)
+            if len(pair) == 2
         ]
         demands = [*self._demands, *apart]
         start = np.array([pose[:2] for pose in poses.values()])
@@ -503,7 +519,7 @@ class Arranger:
                 normals = slopes[near].reshape(-1, places.size)
                 least = normals @ places.ravel() - met[near] + towards * size
                 cuts = [*cuts, (normals, least)][-_OLDEST_CUTS:]
-                every = (np.concatenate(each) for each in zip(*cuts, strict=True))
+                every = (np.concatenate(arrays) for arrays in zip(*cuts, strict=True))
                 places = nearest_meeting(places.ravel(), *every).reshape(-1, 2)
         return None
 
@@ -512,17 +528,21 @@ class Arranger:
     ) -> tuple[Floats, Floats]:
         """Return (D,) by how much demands are met with objects at places (N, 2), and (D, N, 2) its slopes."""
         step = 1e-4 * self._grid.cell_size
-        moved = [places, *(places + step * each.reshape(-1, 2) for each in np.eye(places.size))]
+        moved = [places, *(places + step * direction.reshape(-1, 2) for direction in np.eye(places.size))]
         samples = [
-            with_moved(
-                sample, {n: (*at, poses[n][2]) for n, at in zip(poses, each.tolist(), strict=True)}, number
+            move_objects(
+                sample,
+                {n: (*at, poses[n][2]) for n, at in zip(poses, positions.tolist(), strict=True)},
+                number,
             )
-            for number, each in enumerate(moved)
+            for number, positions in enumerate(moved)
         ]
         trace = Trace.from_samples(samples)
-        leaves = leaf_values(TraceScene(trace, self._regions), [each.formula for each in demands], {})
-        values = np.stack([leaves[0][n] if each.wanted else -leaves[-1][n] for n, each in enumerate(demands)])
-        values -= np.array([[each.least] for each in demands])
+        leaves = leaf_values(TraceScene(trace, self._regions), [demand.formula for demand in demands], {})
+        values = np.stack(
+            [leaves[0][n] if demand.wanted else -leaves[-1][n] for n, demand in enumerate(demands)]
+        )
+        values -= np.array([[demand.least] for demand in demands])
         return values[:, 0], ((values[:, 1:] - values[:, :1]) / step).reshape(-1, *places.shape)
 
     def meets(self, sample: Sample) -> bool:
@@ -530,9 +550,9 @@ class Arranger:
         return all(value >= 0.0 for value in self._surplus_in(sample))
 
 
-def _listed(names: Sequence[str]) -> str:
+def _standing_text(names: Sequence[str]) -> str:
     """Return the first of some things as the beginning of a sentence about what cannot be moved."""
-    said = [each or "an obstacle of the workspace" for each in names[:_MOST_NAMED]]
+    said = [name or "an obstacle of the workspace" for name in names[:_MOST_NAMED]]
     verb = "stand" if len(said) > 1 else "stands"
     return f"{' and '.join(said)}, which cannot be moved, {verb}" if said else ""
 
@@ -562,7 +582,7 @@ def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> 
     return conflicts
 
 
-def _lost(cells: Booleans, stencil: Booleans) -> Floats:
+def _count_losses(cells: Booleans, stencil: Booleans) -> Floats:
     """Return (A, rows, columns): how many cells of the second object each cell of the first takes away."""
     half = stencil.shape[2] // 2
     rows, columns = cells.shape[1:]
@@ -576,10 +596,10 @@ def _lost(cells: Booleans, stencil: Booleans) -> Floats:
 
 def _is_of(formula: Formula, names: Sequence[str]) -> bool:
     """Return whether a formula is about some objects alone, whatever stands elsewhere."""
-    for each in iter_formulas(formula):
-        if isinstance(each, Quantified):
+    for part in iter_formulas(formula):
+        if isinstance(part, Quantified):
             return False
-        terms = terms_of(each.expression) if isinstance(each, Atom) else ()
+        terms = terms_of(part.expression) if isinstance(part, Atom) else ()
         for term in terms:
             base = base_of(term)
             if not (isinstance(base, TrackedName) and base.name in names):
@@ -644,21 +664,21 @@ class Lookahead:
             return consideration
         self._pruned = set(pruned)
         self._why.clear()
-        for found in islice(self._joint(self._first, path, consideration), 4) if together else ():
-            if (rest := self._ahead(found.scene, found.state)) is not None:
-                return self._begun(consideration, found.motions, rest)
+        for sequence in islice(self._joint(self._first, path, consideration), 4) if together else ():
+            if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
+                return self._with_first_motion(consideration, sequence.motions, rest)
         order = by_cost(consideration.candidates, self._settings)
         for number, target in order.items():
             if (rest := self._after(target, path[0])) is None:
                 continue
-            names = [target.name, *(each.name for each in rest)]
+            names = [target.name, *(motion.name for motion in rest)]
             if together or len(set(names)) == len(names):
-                return with_chosen(consideration, number, (target, *rest))
+                return choose_candidate(consideration, number, (target, *rest))
         if not order:
             return consideration
         why = "; ".join(islice(self._why, 3)) or "no sequence of motions was found"
         reason = Reason(LATER, why if together else f"not by one motion: {why}")
-        return replace(with_chosen(consideration, None), pruned=reason)
+        return replace(choose_candidate(consideration, None), pruned=reason)
 
     # ------------------------------------------------------------------------------------ one at a time
 
@@ -669,10 +689,10 @@ class Lookahead:
         key = state, scene.moved
         if key not in self._known:
             self._known[key] = None
-            self._known[key] = self._found(scene, state)
+            self._known[key] = self._search(scene, state)
         return self._known[key]
 
-    def _found(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
+    def _search(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
         automaton, symbol = self._automaton, self._expected.symbol(scene)
         idle = idle_transitions(automaton, state, symbol)
         pruned = self._pruned - idle.edges
@@ -684,18 +704,18 @@ class Lookahead:
             if ahead := idle.along(path):
                 return self._ahead(scene, ahead[-1])
             consideration = consideration_of(automaton, path, pruned, symbol)
-            for found in self._ways(scene, path, consideration):
-                if (rest := self._ahead(found.scene, found.state)) is not None:
-                    return (*found.motions, *rest)
+            for sequence in self._ways(scene, path, consideration):
+                if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
+                    return (*sequence.motions, *rest)
             looked_into.append((path, consideration))
             pruned.add(consideration.edge)
             pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
-        # edges that nothing can take are worked out when one motion after the other does not lead on
+        # only once single motions lead nowhere: finding edges that no arrangement takes costs maps
         self._ruled_out = self._hopeless
         for path, consideration in looked_into:
-            for found in islice(self._joint(scene, path, consideration), 2):
-                if (rest := self._ahead(found.scene, found.state)) is not None:
-                    return (*found.motions, *rest)
+            for sequence in islice(self._joint(scene, path, consideration), 2):
+                if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
+                    return (*sequence.motions, *rest)
         return None
 
     def _ways(
@@ -713,8 +733,8 @@ class Lookahead:
             after = scene.after(target.name, target.pose)
             if self._expected.states_after(after, path[0].source) == {path[0].target}:
                 yield Ordered((target,), after, path[0].target)
-        if not any(each.target for each in candidates):
-            causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
+        if not any(candidate.target for candidate in candidates):
+            causes = "; ".join(f"{candidate.name}: {candidate.rejected}" for candidate in candidates)
             self._why[f"{consideration.progress}: {causes or 'nothing that can be moved matters to it'}"] = (
                 None
             )
@@ -735,40 +755,40 @@ class Lookahead:
             return
         for length in dict.fromkeys((len(path), 1)):
             aims = path[:length]
-            if any((each.source, each.target) in self._ruled_out for each in aims):
+            if any((aim.source, aim.target) in self._ruled_out for aim in aims):
                 continue
             for demands in self._demands_of(scene, aims):
-                # other edges need maps, too
+                # this edge leaves a share of the maps to other edges
                 least = self._expected.budget.left * (1.0 - _JOINT_SHARE)
                 about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
                 if self._expected.budget.left <= 0 or about.why_hopeless():
                     continue
-                found: Iterable[dict[str, Pose]] = islice(
+                arrangements: Iterable[dict[str, Pose]] = islice(
                     about.arrangements(self._settings.motions), _MOST_ORDERED
                 )
                 if self._expected.attempts.are_any:
                     # a motion may fail by chance: places where one did come again, after all others
-                    found = sorted(found, key=self._is_near_failure)
-                for poses in found:
+                    arrangements = sorted(arrangements, key=self._is_near_failure)
+                for poses in arrangements:
                     yield from self._ordered_from(scene, aims, consideration, about, poses, least)
 
     def _demands_of(self, scene: PredictedState, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
         """Yield what has to hold for some edges to be taken, as conjunctions: all progress, no trap."""
         never = self._expected.traps(aims[0].source)
-        kept: list[Demand] = []
+        safety_demands: list[Demand] = []
         least = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
         for cube in never:
             if len(cube) == 1:
-                ((number, wanted),) = cube
-                ways = alternatives(self._formulas[number], not wanted)
+                ((number, value),) = cube
+                ways = alternatives(self._formulas[number], not value)
                 if len(ways) == 1:
-                    kept += (Demand(*each, least) for each in ways[0])
-        for cubes in islice(product(*(each.guard for each in aims)), 8):
+                    safety_demands += (Demand(*literal, least) for literal in ways[0])
+        for cubes in islice(product(*(aim.guard for aim in aims)), 8):
             literals = tuple(dict.fromkeys(literal for cube in cubes for literal in cube))
-            if any((number, not wanted) in literals for number, wanted in literals):
+            if any((number, not value) in literals for number, value in literals):
                 continue
             for demands in demands_of(literals, self._formulas, self._settings.margin):
-                yield (*demands, *kept)
+                yield (*demands, *safety_demands)
 
     def _is_near_failure(self, poses: Mapping[str, Pose]) -> bool:
         """Return whether an arrangement brings an object near a place where that failed."""
@@ -790,11 +810,11 @@ class Lookahead:
     ) -> Iterator[Ordered]:
         """Yield the motions to an arrangement, in an order in which each is possible."""
         poses = self._without_staying(scene, about, poses)
-        robustness = self._expected.robustness(with_moved(scene.sample, poses), aims[0].guard)
+        robustness = self._expected.robustness(move_objects(scene.sample, poses), aims[0].guard)
         never = consideration.constraints.cubes
         order = MotionOrder(self._expected, scene, aims, never, poses, robustness, least)
-        if (found := order.found()) is not None:
-            yield found
+        if (sequence := order.find()) is not None:
+            yield sequence
         elif scene is self._first and len(poses) > 1 and not self._unordered:
             self._unordered = " and ".join(sorted(poses))
 
@@ -804,14 +824,14 @@ class Lookahead:
         """Return an arrangement without the objects that may as well stay where they are."""
         for name in list(poses):
             x, y, turn = poses[name]
-            others = {other: pose for other, pose in poses.items() if other != name}
+            others = {moved: pose for moved, pose in poses.items() if moved != name}
             away = math.dist((x, y), centre_of(scene.sample.objects[name].footprint))
             is_still = away <= self._settings.workspace.grid.cell_size and abs(turn) <= _STILL_TURN
-            if is_still and about.meets(with_moved(scene.sample, others)):
+            if is_still and about.meets(move_objects(scene.sample, others)):
                 poses = others
         return poses
 
-    def _begun(
+    def _with_first_motion(
         self,
         consideration: Consideration,
         motions: tuple[Target, ...],
@@ -819,32 +839,34 @@ class Lookahead:
     ) -> Consideration:
         """Return an edge with the first of several motions as its chosen candidate."""
         first, sample = motions[0], self._first.sample
-        # what is parked first goes to its own place later
-        poses = {each.name: each.pose for each in motions[1:] if each.name != first.name}
+        # an object that is parked first goes to its own place later
+        poses = {motion.name: motion.pose for motion in motions[1:] if motion.name != first.name}
         settings, now = self._settings, self.movables.maps_of(first.name)
         then = proposition_maps(
             self._formulas,
             self._regions,
-            with_moved(sample, poses),
+            move_objects(sample, poses),
             first.name,
             settings.workspace,
             now.grid,
         )
         cubes = consideration.progress.cubes, consideration.constraints.cubes
         gradient = gradient_map(now, *cubes, settings.workspace, settings.constraint_margin, then)
-        there = with_moved(sample, {**poses, first.name: first.pose})
-        target = replace(first, robustness=self._expected.robustness(there, consideration.progress.cubes))
-        if all(each.name != first.name for each in motions[1:]):
-            target = self._refined(target, consideration, poses, (*motions[1:], *rest))
+        final_sample = move_objects(sample, {**poses, first.name: first.pose})
+        target = replace(
+            first, robustness=self._expected.robustness(final_sample, consideration.progress.cubes)
+        )
+        if all(motion.name != first.name for motion in motions[1:]):
+            target = self._refine(target, consideration, poses, (*motions[1:], *rest))
         candidate = Candidate(first.name, gradient, target, is_chosen=True)
-        kept = (each for each in consideration.candidates if each.name != first.name)
-        others = tuple(replace(each, is_chosen=False) for each in kept)
+        rivals = (rival for rival in consideration.candidates if rival.name != first.name)
+        others = tuple(replace(rival, is_chosen=False) for rival in rivals)
         planned = (target, *motions[1:], *rest)
         return replace(
             consideration, candidates=(*others, candidate), pruned=None, motions=planned, is_joint=True
         )
 
-    def _refined(
+    def _refine(
         self,
         target: Target,
         consideration: Consideration,
@@ -852,22 +874,22 @@ class Lookahead:
         rest: tuple[Target, ...],
     ) -> Target:
         """Return the first of several motions with a refined target, if the others lead on as before."""
-        here, *way, there = target.waypoints
+        start, *way, end = target.waypoints
         way = way if self._settings.skill == "push" else []
-        straight = replace(target, waypoints=(here, *way, there))
-        found = self.movables.refined(straight, consideration, None, poses)
-        ways = self.movables.with_way(found, consideration.constraints.cubes)
-        if isinstance(ways, str) or self.movables.is_repeated(ways) or found.robustness <= target.robustness:
+        straight = replace(target, waypoints=(start, *way, end))
+        better = self.movables.refine(straight, consideration, None, poses)
+        ways = self.movables.with_way(better, consideration.constraints.cubes)
+        if isinstance(ways, str) or self.movables.is_repeated(ways) or better.robustness <= target.robustness:
             return target
         state = consideration.edge[0]
-        before, after = (self._states_along((each, *rest), state) for each in (target, ways))
+        before, after = (self._states_along((first, *rest), state) for first in (target, ways))
         return ways if before == after else target
 
     def _states_along(self, motions: Sequence[Target], state: int) -> list[frozenset[int]]:
         """Return the states after each of some motions, from the newest sample on."""
         scene, states, visited = self._first, frozenset({state}), []
-        for each in motions:
-            scene = scene.after(each.name, each.pose)
+        for motion in motions:
+            scene = scene.after(motion.name, motion.pose)
             states = self._automaton.step_set(states, self._expected.symbol(scene))
             visited.append(states)
         return visited
@@ -884,9 +906,9 @@ class Lookahead:
         if not self._automaton.is_listable:
             return frozenset()
         return frozenset(
-            (each.source, each.target)
-            for each in self._automaton.transitions
-            if all(any(literal in literals for literal in cube) for cube in each.guard)
+            (transition.source, transition.target)
+            for transition in self._automaton.transitions
+            if all(any(literal in literals for literal in cube) for cube in transition.guard)
         )
 
     @cached_property
@@ -896,16 +918,19 @@ class Lookahead:
             return ()
         symbol = self._expected.symbol(self._first)
         literals = {
-            literal for each in self._automaton.transitions for cube in each.guard for literal in cube
+            literal
+            for transition in self._automaton.transitions
+            for cube in transition.guard
+            for literal in cube
         }
         hopeless: list[tuple[int, bool]] = []
         budget = Budget(self._expected.budget.left * _HOPELESS_SHARE)
-        for number, wanted in sorted(literals):
-            if symbol[number] is (not wanted) and budget.left > 0:
-                why = self._why_hopeless(self._first.sample, number, wanted, budget)
+        for number, value in sorted(literals):
+            if symbol[number] is (not value) and budget.left > 0:
+                why = self._why_hopeless(self._first.sample, number, value, budget)
                 if why:
-                    hopeless.append((number, wanted))
-                    self._why[f"{self._automaton.propositions[number].literal(wanted)}: {why}"] = None
+                    hopeless.append((number, value))
+                    self._why[f"{self._automaton.propositions[number].literal(value)}: {why}"] = None
         self._expected.budget.spend(self._expected.budget.left * _HOPELESS_SHARE - budget.left)
         return tuple(hopeless)
 
@@ -926,14 +951,14 @@ class Lookahead:
         budget = Budget(_MOST_WHY_NOT)
         every = demands_of((literal,), self._formulas, self._settings.margin)
         demands = next(iter(every), ())
-        # without any of those that are left, the others could hold
+        # leave out what the contradiction does not need, so that the reason names few demands
         core = list(demands)
-        for each in reversed(demands):
-            fewer = tuple(other for other in core if other != each)
+        for demand in reversed(demands):
+            fewer = tuple(member for member in core if member != demand)
             if fewer and budget.left > 0 and self._why_impossible(sample, fewer, budget):
                 core = list(fewer)
         about = Arranger(sample, self._regions, self._settings, core, budget)
-        what = " and ".join(literal_text(each.formula, each.wanted) for each in core)
+        what = " and ".join(literal_text(demand.formula, demand.wanted) for demand in core)
         if why := about.why_hopeless():
             return f"{what}: {'; '.join(filter(None, (why, about.cell_hint(self._settings.motions))))}"
         stands = about.what_stands()
@@ -944,8 +969,8 @@ class Lookahead:
         """Return why demands hold in no arrangement, as far as that is looked for; "" if they do."""
         about = Arranger(sample, self._regions, self._settings, demands, budget)
         why = about.why_hopeless()
-        found = None if why else next(about.arrangements(self._settings.motions), None)
-        return why or (_NOT_FOUND if found is None else "")
+        arrangement = None if why else next(about.arrangements(self._settings.motions), None)
+        return why or (_NOT_FOUND if arrangement is None else "")
 
     def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
         why = "it never holds"

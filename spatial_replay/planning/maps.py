@@ -147,8 +147,8 @@ def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
 
 def _greatest(positive: Floats, negative: Floats, cubes: Cubes, shape: tuple[int, ...]) -> Floats:
     """Return the greatest robustness of a cube (see `cube_robustness`); -inf without cubes."""
-    each = (cube_robustness(positive, negative, cube, shape) for cube in cubes)
-    return reduce(np.maximum, each, np.full(shape, -np.inf))
+    cube_values = (cube_robustness(positive, negative, cube, shape) for cube in cubes)
+    return reduce(np.maximum, cube_values, np.full(shape, -np.inf))
 
 
 def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
@@ -157,8 +157,8 @@ def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple
     Args:
         positive, negative: bounds of propositions, for those that have to hold, and that must not.
     """
-    each = (positive[number] if wanted else -negative[number] for number, wanted in cube)
-    return reduce(np.minimum, each, np.full(shape, np.inf))
+    literal_values = (positive[number] if value else -negative[number] for number, value in cube)
+    return reduce(np.minimum, literal_values, np.full(shape, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +188,8 @@ class PropositionMaps:
 
     def room(self, others: Collection[str] | None) -> Floats:
         """Return (A, rows, columns): the distance to the nearest of some objects; of all for None."""
-        kept = [others is None or name in others for name in self.obstacles]
-        return np.asarray(self.distances[kept].min(axis=0, initial=np.inf))
+        mask = [others is None or name in others for name in self.obstacles]
+        return np.asarray(self.distances[mask].min(axis=0, initial=np.inf))
 
 
 class MapSubject(NamedTuple):
@@ -232,24 +232,28 @@ def proposition_maps(
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
     cells = workspace.grid if grid is None else grid
     turns = workspace.turns(tracked.yaw)
-    moves = np.array([concerns(each, name) for each in propositions], np.bool_)
-    concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
-    others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
-    obstacles = [each for each in sorted(sample.objects) if each not in (name, *workspace.supports)]
+    moves = np.array([concerns(proposition, name) for proposition in propositions], np.bool_)
+    concerned = [proposition for proposition, is_moving in zip(propositions, moves, strict=True) if is_moving]
+    others = [
+        proposition for proposition, is_moving in zip(propositions, moves, strict=True) if not is_moving
+    ]
+    obstacles = [
+        obstacle for obstacle in sorted(sample.objects) if obstacle not in (name, *workspace.supports)
+    ]
     formulas = [*concerned, *_obstacle_distances(propositions, name, obstacles)]
-    here, centres = Trace.from_samples([sample]), cells.centres()
+    trace, centres = Trace.from_samples([sample]), cells.centres()
     shape = len(turns), len(centres)
     to_obstacles: Floats = np.empty((len(obstacles) + 1, *shape))
     pieces: list[tuple[slice, Floats]] = []
     for places in _slices(len(centres), math.prod(shape) * len(formulas)):
-        posed = _trace_over_poses(here, tracked, name, centres[places], turns)
+        posed = _trace_over_poses(trace, tracked, name, centres[places], turns)
         static = _static_distance(posed, name, workspace.obstacles).reshape(len(turns), -1)
         values = leaf_values(TraceScene(posed, regions), formulas, {})[:2]
         values = values.reshape(*values.shape[:2], *static.shape)
         to_obstacles[:, :, places] = [*values[0, len(concerned) :], static]
         pieces.append((places, values[:, : len(concerned)]))
     # propositions that do not depend on the object have the same value in every cell
-    fixed = leaf_values(TraceScene(here, regions), others, {})[:2, :, :, None]
+    fixed = leaf_values(TraceScene(trace, regions), others, {})[:2, :, :, None]
     # where all is known, as in most maps, both ends are one array
     ends = max(len(fixed), *(len(values) for _, values in pieces))
     bounds: Floats = np.empty((ends, len(propositions), *shape))
@@ -264,7 +268,7 @@ def proposition_maps(
 
 
 def _slices(count: int, values: int) -> Iterator[slice]:
-    """Iterate over slices of so many places, which have so many values in all."""
+    """Yield slices of `count` places, which have `values` values in all, of a bounded size each."""
     size = max(1, count * _AT_ONCE // max(values, 1))
     yield from (slice(first, first + size) for first in range(0, count, size))
 
@@ -275,16 +279,18 @@ def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: S
     A distance is at most 0 exactly if the object's centre lies in the Minkowski sum of the other object and
     the mirrored one, the usual configuration-space obstacle.
     """
-    atoms_read = (each for one in propositions for each in iter_formulas(one) if isinstance(each, Atom))
-    measured = {part for each in atoms_read for part in iter_expressions(each.expression)}
-    pairs = ((distance_between(name, other), distance_between(other, name)) for other in obstacles)
+    atoms_read = (
+        part for proposition in propositions for part in iter_formulas(proposition) if isinstance(part, Atom)
+    )
+    measured = {part for atom in atoms_read for part in iter_expressions(atom.expression)}
+    pairs = ((distance_between(name, obstacle), distance_between(obstacle, name)) for obstacle in obstacles)
     # in the order of a proposition's own measurement, so that the kernel computes it only once
-    return [swapped if swapped.expression in measured else each for each, swapped in pairs]
+    return [swapped if swapped.expression in measured else atom for atom, swapped in pairs]
 
 
-def distance_between(one: str, other: str) -> Atom:
+def distance_between(first: str, second: str) -> Atom:
     """Return the atom whose robustness is the signed distance of two objects."""
-    return Atom("", "dist", SignedDistance(TrackedName(one), TrackedName(other)))
+    return Atom("", "dist", SignedDistance(TrackedName(first), TrackedName(second)))
 
 
 def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) -> Floats:
@@ -298,33 +304,33 @@ def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) ->
 
 
 def _trace_over_poses(
-    here: Trace, tracked: TrackedObject, name: str, centres: Floats, turns: Floats
+    trace: Trace, tracked: TrackedObject, name: str, centres: Floats, turns: Floats
 ) -> Trace:
-    """Return a trace with the sample of `here` for each turn and position, the object moved there."""
-    footprints = with_poses(here.footprints, tracked, centres, turns)
-    count, column = len(footprints) - len(here.footprints), here.names.index(name)
-    own = np.full(count, here.rows[0, column])
-    rows = np.repeat(here.rows, count, axis=0)
-    rows[:, column] = len(here.footprints) + np.arange(count)
+    """Return a trace with the one sample of a trace for each turn and position, the object moved there."""
+    footprints = with_poses(trace.footprints, tracked, centres, turns)
+    count, column = len(footprints) - len(trace.footprints), trace.names.index(name)
+    object_rows = np.full(count, trace.rows[0, column])
+    rows = np.repeat(trace.rows, count, axis=0)
+    rows[:, column] = len(trace.footprints) + np.arange(count)
     return Trace(
         times_ns=np.arange(count, dtype=np.int64),
-        names=here.names,
+        names=trace.names,
         rows=rows,
         footprints=footprints,
-        yaw=np.concatenate((here.yaw, here.yaw[own] + np.repeat(turns, count // len(turns)))),
-        uncertainty=np.concatenate((here.uncertainty, here.uncertainty[own])),
-        class_code=np.concatenate((here.class_code, here.class_code[own])),
-        classes=here.classes,
-        signals={signal: np.repeat(values, count) for signal, values in here.signals.items()},
+        yaw=np.concatenate((trace.yaw, trace.yaw[object_rows] + np.repeat(turns, count // len(turns)))),
+        uncertainty=np.concatenate((trace.uncertainty, trace.uncertainty[object_rows])),
+        class_code=np.concatenate((trace.class_code, trace.class_code[object_rows])),
+        classes=trace.classes,
+        signals={signal: np.repeat(values, count) for signal, values in trace.signals.items()},
     )
 
 
 def concerns(formula: Formula, name: str) -> bool:
     """Return whether a formula depends on the pose of an object."""
     return any(
-        isinstance(each, Quantified)
-        or (isinstance(each, Atom) and any(_is_about(term, name) for term in terms_of(each.expression)))
-        for each in iter_formulas(formula)
+        isinstance(part, Quantified)
+        or (isinstance(part, Atom) and any(_is_about(term, name) for term in terms_of(part.expression)))
+        for part in iter_formulas(formula)
     )
 
 
@@ -342,15 +348,15 @@ def refuse_delays(propositions: Sequence[Formula]) -> None:
         UsageError: one looks at earlier samples, which moving an object now does not change.
     """
     for proposition in propositions:
-        for each in iter_formulas(proposition):
-            if is_about_having_rates(each):
-                # the rate itself comes after it
+        for part in iter_formulas(proposition):
+            if is_about_having_rates(part):
+                # it asks whether a rate exists; the rate itself follows, and is refused
                 continue
-            terms = list(terms_of(each.expression)) if isinstance(each, Atom) else []
-            terms += [each.group] if isinstance(each, Quantified) else []
+            terms = list(terms_of(part.expression)) if isinstance(part, Atom) else []
+            terms += [part.group] if isinstance(part, Quantified) else []
             if any(map(looks_back, terms)):
                 raise UsageError(
-                    f"{format_formula(each)} looks at earlier samples, so there is no map of it; plan "
+                    f"{format_formula(part)} looks at earlier samples, so there is no map of it; plan "
                     "without it, and evaluate it with replay"
                 )
 
@@ -363,7 +369,9 @@ def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[
     """
     faults = []
     for name in names:
-        if name not in sample.objects and not any(concerns(each, name) for each in propositions):
+        if name not in sample.objects and not any(
+            concerns(proposition, name) for proposition in propositions
+        ):
             hint = nearest_hint(name, sample.objects)
             faults.append(
                 f"{name!r} is movable, but neither the specification nor the first sample has it; "
@@ -443,19 +451,19 @@ def map_layers(
     """
     parts, shape = gradient.made_of, gradient.blocked.shape
     formulas = parts.then.about.propositions
-    cubes = [[_Part.of(formulas[number], wanted) for number, wanted in cube] for cube in parts.progress]
-    leaves = tuple(dict.fromkeys(leaf for cube in cubes for each in cube for leaf in each.leaves()))
-    lower, upper = _measured(parts.then, [each.formula for each in leaves])
+    cubes = [[_Part.of(formulas[number], value) for number, value in cube] for cube in parts.progress]
+    leaves = tuple(dict.fromkeys(leaf for cube in cubes for part in cube for leaf in part.leaves()))
+    lower, upper = _bounds_of(parts.then, [leaf.formula for leaf in leaves])
     layers = np.empty((len(leaves), *shape))
     for place, leaf in enumerate(leaves):
         layers[place] = lower[place] if leaf.wanted else -upper[place]
     places = {leaf: place for place, leaf in enumerate(leaves)}
     limits = (
-        _limit_of([each.limit(layers, places) for each in cube], shape, is_every=True) for cube in cubes
+        _limit_of([part.limit(layers, places) for part in cube], shape, is_every=True) for cube in cubes
     )
     _, limiting = _limit_of(limits, shape, is_every=False)
     causes, blocked_by = _causes(gradient, avoided_cells(gradient, settings, failed))
-    texts = tuple(each.text for each in leaves)
+    texts = tuple(leaf.text for leaf in leaves)
     return MapLayers(texts, layers, limiting, causes, blocked_by)
 
 
@@ -485,7 +493,7 @@ class _Part(NamedTuple):
     def members(self) -> list[_Part]:
         """The parts that it is made of; none of a relation."""
         operands = self.formula.operands if isinstance(self.formula, Boolean) else ()
-        return [_Part.of(each, self.wanted) for each in operands]
+        return [_Part.of(operand, self.wanted) for operand in operands]
 
     @property
     def is_every(self) -> bool:
@@ -495,18 +503,20 @@ class _Part(NamedTuple):
     def leaves(self) -> Iterator[_Part]:
         """Iterate over the relations that it is made of."""
         members = self.members
-        yield from chain.from_iterable(each.leaves() for each in members) if members else (self,)
+        yield from chain.from_iterable(member.leaves() for member in members) if members else (self,)
 
     def options(self) -> Iterator[_Part]:
         """Iterate over parts of which any one has to hold for this to hold."""
-        yield from (self,) if self.is_every else chain.from_iterable(each.options() for each in self.members)
+        yield from (
+            (self,) if self.is_every else chain.from_iterable(member.options() for member in self.members)
+        )
 
     def limit(self, layers: Floats, places: Mapping[_Part, int]) -> _Limit:
         """Return its robustness, and which of its relations has it, by layers of these."""
         shape = layers.shape[1:]
         if (place := places.get(self)) is not None:
             return layers[place], np.full(shape, place, np.int64)
-        limits = (each.limit(layers, places) for each in self.members)
+        limits = (member.limit(layers, places) for member in self.members)
         return _limit_of(limits, shape, is_every=self.is_every)
 
 
@@ -518,22 +528,22 @@ def literal_text(formula: Formula, wanted: bool) -> str:
 
 def _limit_of(parts: Iterable[_Limit], shape: tuple[int, ...], *, is_every: bool) -> _Limit:
     value, limiting = np.full(shape, np.inf if is_every else -np.inf), np.full(shape, -1, np.int64)
-    for other, its_limiting in parts:
-        better = other < value if is_every else other > value
-        value, limiting = np.where(better, other, value), np.where(better, its_limiting, limiting)
+    for part_value, part_limiting in parts:
+        better = part_value < value if is_every else part_value > value
+        value, limiting = np.where(better, part_value, value), np.where(better, part_limiting, limiting)
     return value, limiting
 
 
-def _measured(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floats, Floats]:
+def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floats, Floats]:
     """Return bounds (N, A, rows, columns) of the robustness of formulas in the cells of maps."""
     about = maps.about
     tracked = about.sample.objects[maps.name]
-    here = tracked.yaw or 0.0 if isinstance(tracked, TrackedObject) else 0.0
-    # what stands in the way was measured already
+    yaw = tracked.yaw or 0.0 if isinstance(tracked, TrackedObject) else 0.0
+    # with all objects as supports, obstacles are not measured a second time
     everything = frozenset(about.sample.objects)
-    free = Workspace(maps.grid, yaws=tuple((maps.turns + here).tolist()), supports=everything)
-    found = proposition_maps(formulas, about.regions, about.sample, maps.name, free)
-    return found.lower, found.upper
+    free = Workspace(maps.grid, yaws=tuple((maps.turns + yaw).tolist()), supports=everything)
+    part_maps = proposition_maps(formulas, about.regions, about.sample, maps.name, free)
+    return part_maps.lower, part_maps.upper
 
 
 def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
@@ -550,11 +560,13 @@ def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, 
         texts, which = most_dangerous(gradient.made_of, blocked.shape)
         codes[held] += which[held]
     codes[(blocked == FREE) & avoided] = _FAILED * _NUMBERS
-    found, counts = np.unique(codes[codes >= 0], return_counts=True)
+    unique_codes, counts = np.unique(codes[codes >= 0], return_counts=True)
     order = np.argsort(-counts, kind="stable")
     causes = []
     blocked_by = np.full(blocked.shape, -1, np.int64)
-    for place, (code, count) in enumerate(zip(found[order].tolist(), counts[order].tolist(), strict=True)):
+    for place, (code, count) in enumerate(
+        zip(unique_codes[order].tolist(), counts[order].tolist(), strict=True)
+    ):
         kind, number = _KINDS[code // _NUMBERS], code % _NUMBERS
         name = texts[number] if kind == "constraint" else maps.obstacles[number] if kind == "object" else ""
         if kind == "object" and not name:
@@ -572,19 +584,21 @@ def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, 
     formulas = parts.now.about.propositions
     guards: list[tuple[_Part, ...]] = []
     for cube in parts.constraints:
-        literals = tuple(_Part(formulas[number], wanted) for number, wanted in cube)
-        guards += [(each,) for each in _Part.of(*literals[0]).options()] if len(literals) == 1 else [literals]
+        literals = tuple(_Part(formulas[number], value) for number, value in cube)
+        guards += (
+            [(option,) for option in _Part.of(*literals[0]).options()] if len(literals) == 1 else [literals]
+        )
     guards = list(dict.fromkeys(guards))
-    members = list(dict.fromkeys(each for guard in guards for each in guard))
-    lower, upper = _measured(parts.now, [each.formula for each in members])
-    places = {each: place for place, each in enumerate(members)}
+    members = list(dict.fromkeys(part for guard in guards for part in guard))
+    lower, upper = _bounds_of(parts.now, [member.formula for member in members])
+    places = {member: place for place, member in enumerate(members)}
     which, danger = np.zeros(shape, np.int64), np.full(shape, -np.inf)
     for number, guard in enumerate(guards):
-        cube = tuple((places[each], each.wanted) for each in guard)
+        cube = tuple((places[part], part.wanted) for part in guard)
         robustness = cube_robustness(upper, lower, cube, shape)
         which[robustness > danger] = number
         np.maximum(danger, robustness, out=danger)
-    return tuple(" and ".join(each.text for each in guard) for guard in guards), which
+    return tuple(" and ".join(part.text for part in guard) for guard in guards), which
 
 
 def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:

@@ -27,8 +27,8 @@ from spatial_replay.planning.edges import (
     Symbol,
     demands_of,
     idle_transitions,
+    move_objects,
     values_in,
-    with_moved,
     with_objects,
 )
 from spatial_replay.planning.maps import (
@@ -56,7 +56,7 @@ from spatial_replay.planning.targets import (
     find_target,
     is_repeated,
     nearest_target,
-    refined,
+    refine_target,
     target_in,
 )
 from spatial_replay.spec.formula import Formula, Outline
@@ -122,13 +122,13 @@ class Movables:
             room = gradient.made_of.now.room(room_from)
             target = find_target(gradient, tracked, settings, room, failed, self.failed_here(name))
         if isinstance(target, Target) and refine:
-            target = self.refined(target, consideration, room_from)
+            target = self.refine(target, consideration, room_from)
         if isinstance(target, Target):
             target = self.with_way(target, consideration.constraints.cubes)
         if isinstance(target, Target) and self.is_repeated(target):
             target = "it was tried wherever it would hold, and nothing has changed since"
-        found, why = (None, target) if isinstance(target, str) else (target, "")
-        return Candidate(name, gradient, found, why, failed=failed, room_from=_tuple(room_from))
+        possible_target, why = (None, target) if isinstance(target, str) else (target, "")
+        return Candidate(name, gradient, possible_target, why, failed=failed, room_from=_tuple(room_from))
 
     def failed_here(self, name: str) -> tuple[Target, ...]:
         """Return the targets for which motions of an object failed while everything stood as it does."""
@@ -143,7 +143,7 @@ class Movables:
             return is_repeated(target, failures, self.settings)
         return begins_as(target, failures, self.sample.objects[target.name])
 
-    def refined(
+    def refine(
         self,
         target: Target,
         consideration: Consideration,
@@ -160,10 +160,10 @@ class Movables:
         if not settings.refine:
             return target
         failures = () if settings.skill == "push" else self.failed_here(name)
-        measured = self._measures(name, consideration, room_from, then)
-        found = refined(target, self.sample.objects[name], settings, measured, failures)
-        is_kept = settings.skill == "place" or self._is_pushed_to(found, consideration.constraints.cubes)
-        return found if is_kept else target
+        measure = self._measures(name, consideration, room_from, then)
+        better = refine_target(target, self.sample.objects[name], settings, measure, failures)
+        is_kept = settings.skill == "place" or self._is_pushed_to(better, consideration.constraints.cubes)
+        return better if is_kept else target
 
     def _measures(
         self,
@@ -172,12 +172,12 @@ class Movables:
         room_from: Collection[str] | None,
         then: Mapping[str, Pose] | None = None,
     ) -> Measured:
-        """Return what measures maps of an object for an edge over any grid; see `refined`."""
+        """Return what measures maps of an object for an edge over any grid; see `refine_target`."""
         settings = self.settings
         progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
-        later = self.sample if then is None else with_moved(self.sample, then)
+        later = self.sample if then is None else move_objects(self.sample, then)
 
-        def measured(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
+        def measure(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
             workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
             about = self.propositions, self.regions
             now = proposition_maps(*about, self.sample, name, workspace, grid)
@@ -188,13 +188,13 @@ class Movables:
             gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
             return gradient, np.minimum(now.room(room_from), after.room(room_from))
 
-        return measured
+        return measure
 
     def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
         """Return whether nothing is in the way on the last stretch of a path, and while turning there."""
         gradient = self.gradient(target.name, ((),), constraints)
         size = gradient.grid.cell_size
-        last = (gradient.grid.cell(*each) for each in points_along(target.waypoints[-2:], size / 2))
+        last = (gradient.grid.cell(*point) for point in points_along(target.waypoints[-2:], size / 2))
         if any(gradient.blocked[0][cell] != FREE for cell in last):
             return False
         spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
@@ -214,26 +214,26 @@ class Movables:
         danger, grid, parts = self._danger_on_the_way(target, constraints, about)
         away = distance_to([settings.workspace.base], grid)
         reached = (away >= settings.workspace.nearest) & (away <= settings.workspace.farthest)
-        (here, there), goals = target.waypoints, np.zeros(grid.shape, np.bool_)
-        goals[grid.cell(*there)] = True
+        (start, end), goals = target.waypoints, np.zeros(grid.shape, np.bool_)
+        goals[grid.cell(*end)] = True
         margin = settings.constraint_margin
         for distance in (margin + grid.cell_size / math.sqrt(2.0), margin, 0.0):
-            path = shortest_path(reached & (danger < -distance), grid.cell(*here), goals)
+            path = shortest_path(reached & (danger < -distance), grid.cell(*start), goals)
             if path is not None:
-                turns = [grid.centre(*each) for each in path.cells[1:-1].tolist()]
-                # a way of two points is one that does not matter
-                middle = ((here[0] + there[0]) / 2.0, (here[1] + there[1]) / 2.0)
-                return replace(target, waypoints=(here, *(turns or [middle]), there))
-        # what is crossed by the shortest way of all
-        path = shortest_path(reached, grid.cell(*here), goals)
+                turns = [grid.centre(*cell) for cell in path.cells[1:-1].tolist()]
+                # two waypoints mean that the way does not matter, so a straight way has its middle, too
+                middle = ((start[0] + end[0]) / 2.0, (start[1] + end[1]) / 2.0)
+                return replace(target, waypoints=(start, *(turns or [middle]), end))
+        # the reason names the constraints that the shortest way crosses
+        path = shortest_path(reached, grid.cell(*start), goals)
         if path is None:
             return "the robot does not reach all of any way there"
-        centres = [grid.centre(*each) for each in path.cells.tolist()]
-        crossed = [grid.cell(*each) for each in points_along(centres, grid.cell_size)]
+        centres = [grid.centre(*cell) for cell in path.cells.tolist()]
+        crossed = [grid.cell(*point) for point in points_along(centres, grid.cell_size)]
         texts, which = most_dangerous(parts, (1, *grid.shape))
-        numbers = dict.fromkeys(int(which[0][each]) for each in crossed if danger[each] >= 0.0)
+        numbers = dict.fromkeys(int(which[0][cell]) for cell in crossed if danger[cell] >= 0.0)
         named = sorted((texts[number] for number in numbers), key=len)
-        said = " and ".join(each for each in named[:_MOST_NAMED] if len(each) <= _LONGEST_NAME)
+        said = " and ".join(text for text in named[:_MOST_NAMED] if len(text) <= _LONGEST_NAME)
         return f"on every way there a constraint would hold{said and ', on the shortest one ' + said}"
 
     def _danger_on_the_way(
@@ -247,17 +247,17 @@ class Movables:
         if tracked.height is not None and settings.lift:
             low, high = tracked.height
             tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
-        here = centre_of(tracked.footprint)
-        grid = settings.workspace.grid.reaching(*here)
-        # nothing that is carried over stands in the way
+        centre = centre_of(tracked.footprint)
+        grid = settings.workspace.grid.reaching(*centre)
+        # an object that is carried above the others has no obstacles
         free = Workspace(grid, supports=frozenset(self.sample.objects))
         formulas = [self.propositions[number] for number in about]
         places = {number: place for place, number in enumerate(about)}
-        cubes = tuple(tuple((places[n], wanted) for n, wanted in cube) for cube in constraints)
-        moved = (moved_object(tracked, *here, turn) for turn in dict.fromkeys((0.0, target.turn)))
-        samples = (with_objects(self.sample, {target.name: each}) for each in moved)
-        maps = [proposition_maps(formulas, self.regions, each, target.name, free) for each in samples]
-        danger = np.maximum.reduce([danger_of(each, cubes)[0] for each in maps])
+        cubes = tuple(tuple((places[n], value) for n, value in cube) for cube in constraints)
+        moved = (moved_object(tracked, *centre, turn) for turn in dict.fromkeys((0.0, target.turn)))
+        samples = (with_objects(self.sample, {target.name: carried}) for carried in moved)
+        maps = [proposition_maps(formulas, self.regions, sample, target.name, free) for sample in samples]
+        danger = np.maximum.reduce([danger_of(turned, cubes)[0] for turned in maps])
         return danger, grid, MapParts(maps[-1], maps[-1], (), cubes)
 
     def gradient(self, name: str, progress: Cubes, constraints: Cubes) -> GradientMap:
@@ -271,8 +271,8 @@ class Movables:
             workspace = self.settings.workspace
             pushes = self.settings.skill == "push"
             # a pushed object crosses all cells from where it lies, which may be outside the workspace
-            here = centre_of(self.sample.objects[name].footprint)
-            grid = workspace.grid.reaching(*here) if pushes else workspace.grid
+            centre = centre_of(self.sample.objects[name].footprint)
+            grid = workspace.grid.reaching(*centre) if pushes else workspace.grid
             about = self.propositions, self.regions, self.sample, name
             self._maps[name] = proposition_maps(*about, workspace, grid)
         return self._maps[name]
@@ -292,18 +292,19 @@ def with_choice(
     """
     order = by_cost(candidates, settings)
     if not order:
-        causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
+        causes = "; ".join(f"{candidate.name}: {candidate.rejected}" for candidate in candidates)
         kind = "no object can do it" if causes else "no object that can be moved matters to it"
         return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
-    return with_chosen(replace(consideration, candidates=tuple(candidates)), next(iter(order)))
+    return choose_candidate(replace(consideration, candidates=tuple(candidates)), next(iter(order)))
 
 
-def with_chosen(
+def choose_candidate(
     consideration: Consideration, number: int | None, motions: tuple[Target, ...] = ()
 ) -> Consideration:
     """Return an edge with one of its candidates or none chosen, and the motions planned with that."""
     marked = tuple(
-        replace(each, is_chosen=place == number) for place, each in enumerate(consideration.candidates)
+        replace(candidate, is_chosen=place == number)
+        for place, candidate in enumerate(consideration.candidates)
     )
     return replace(consideration, candidates=marked, motions=motions)
 
@@ -311,8 +312,12 @@ def with_chosen(
 def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Target]:
     """Return the targets of those candidates that have one, by number, the best first."""
     pushes = settings.skill == "push"
-    found = [(number, each.target) for number, each in enumerate(candidates) if each.target is not None]
-    return dict(sorted(found, key=lambda each: each[1].length if pushes else -each[1].robustness))
+    targets = [
+        (number, candidate.target)
+        for number, candidate in enumerate(candidates)
+        if candidate.target is not None
+    ]
+    return dict(sorted(targets, key=lambda item: item[1].length if pushes else -item[1].robustness))
 
 
 # ----------------------------------------------------------------------------------------------- expectations
@@ -340,7 +345,7 @@ class PredictedState(NamedTuple):
         (x, y, turn), moved = pose, dict(self.moved)
         *_, turned = moved.get(name, (0.0, 0.0, 0.0))
         moved[name] = x, y, turned + turn
-        return PredictedState(with_moved(self.sample, {name: pose}), tuple(sorted(moved.items())))
+        return PredictedState(move_objects(self.sample, {name: pose}), tuple(sorted(moved.items())))
 
 
 @dataclass(eq=False)
@@ -379,7 +384,7 @@ class Expectations:
     def clearances(self, sample: Sample, name: str, others: Collection[str]) -> list[float]:
         """Return the distance of an object of a sample to each of others."""
         self.budget.spend(_LOOK)
-        apart = [distance_between(name, each) for each in others]
+        apart = [distance_between(name, neighbour) for neighbour in others]
         return values_in(sample, apart, self.regions)[0] if apart else []
 
     def movables(self, scene: PredictedState) -> Movables:
@@ -400,20 +405,22 @@ class Expectations:
 
     def relations(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
         """Return relations of which no conjunction must hold."""
-        return [each for cube in constraints for each in demands_of(cube, self.formulas, 0.0)]
+        return [conjunction for cube in constraints for conjunction in demands_of(cube, self.formulas, 0.0)]
 
     def relations_about(self, name: str, constraints: Cubes) -> tuple[list[Formula], Cubes]:
         """Return relations, and the conjunctions of them about an object of which none must hold."""
-        return _cubes_of([each for each in self.relations(constraints) if _concerned(each, [name])])
+        return _cubes_of(
+            [conjunction for conjunction in self.relations(constraints) if _subjects_of(conjunction, [name])]
+        )
 
     def traps(self, state: int) -> Cubes:
         """Return the guards of the transitions by which acceptance is lost."""
-        lost = (self.automaton.transition(state, each) for each in self.automaton.successors[state])
+        lost = (self.automaton.transition(state, target) for target in self.automaton.successors[state])
         return tuple(
             cube
-            for each in lost
-            if each is not None and each.target not in self.automaton.can_accept
-            for cube in each.guard
+            for transition in lost
+            if transition is not None and transition.target not in self.automaton.can_accept
+            for cube in transition.guard
         )
 
 
@@ -466,14 +473,14 @@ class MotionOrder:
         symbol = self.expected.symbol(self.begin)
         self._idle = idle_transitions(self.expected.automaton, self.aims[0].source, symbol).states
 
-    def found(self) -> Ordered | None:
+    def find(self) -> Ordered | None:
         """Return the first order found, with as few objects brought aside as possible; None without one."""
         for self._most_parked in range(_MOST_PARKED + 1):
             self._dead.clear()
             self._has_parked = self._most_parked == 0
-            found = self._motions(self.begin, self.aims[0].source, frozenset(self.places))
-            if found is not None or not self._has_parked:
-                return found
+            sequence = self._motions(self.begin, self.aims[0].source, frozenset(self.places))
+            if sequence is not None or not self._has_parked:
+                return sequence
         return None
 
     def _motions(
@@ -488,25 +495,25 @@ class MotionOrder:
         for name in sorted(left):
             key = scene.moved, state, name
             if key not in self._targets:
-                # where the automaton goes is known sooner than how the object gets there
-                there = scene.after(name, self._place_of(scene, name))
-                leads_on = self._reached(there, state, is_first) >= 0
+                # the next state of the automaton costs less than the path of the object
+                after = scene.after(name, self._place_of(scene, name))
+                leads_on = self._next_state(after, state, is_first) >= 0
                 self._targets[key] = self._target(scene, state, name, is_first) if leads_on else None
             target = self._targets[key]
-            still = tuple(each for each in parked if each != name)
-            if (found := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
-                return found
+            still = tuple(parked_name for parked_name in parked if parked_name != name)
+            if (sequence := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
+                return sequence
         if len(parked) < self._most_parked:
-            # what stands elsewhere does not keep an object from taking another edge
-            places = {each: scene.after(each, self._place_of(scene, each)) for each in sorted(left)}
-            able = [each for each in places if self._reached(places[each], state, is_first) != _ASTRAY]
+            # parking others does not help an object whose motion takes another edge
+            places = {mover: scene.after(mover, self._place_of(scene, mover)) for mover in sorted(left)}
+            able = [mover for mover in places if self._next_state(places[mover], state, is_first) != _ASTRAY]
             for name in able:
-                for other, target in self._aside(scene, state, name, left, parked, is_first):
-                    more, self._has_parked = (*parked, other), True
-                    if other not in parked and (
-                        found := self._on(scene, state, target, left, more, is_first)
+                for blocker, target in self._aside(scene, state, name, left, parked, is_first):
+                    more, self._has_parked = (*parked, blocker), True
+                    if blocker not in parked and (
+                        sequence := self._on(scene, state, target, left, more, is_first)
                     ):
-                        return found
+                        return sequence
         self._dead.add((left, scene.moved))
         return None
 
@@ -523,7 +530,7 @@ class MotionOrder:
         if target is None:
             return None
         after = scene.after(target.name, target.pose)
-        if (reached := self._reached(after, state, is_first)) < 0:
+        if (reached := self._next_state(after, state, is_first)) < 0:
             return None
         rest = self._motions(after, reached, left, parked)
         return None if rest is None else Ordered((target, *rest.motions), rest.scene, rest.state)
@@ -534,7 +541,7 @@ class MotionOrder:
             return state in automaton.accepting
         return state == self.aims[0].target or (state in automaton.can_accept and state not in self._idle)
 
-    def _reached(self, scene: PredictedState, state: int, is_first: bool) -> int:
+    def _next_state(self, scene: PredictedState, state: int, is_first: bool) -> int:
         """Return the state after a motion; `_LOST` or `_ASTRAY` if that is not one on the way."""
         aim, is_strict = self.aims[0].target, is_first or len(self.aims) == 1
         for _ in range(len(self.aims)):
@@ -551,12 +558,12 @@ class MotionOrder:
             is_strict = is_strict and state != aim
         return state
 
-    def _stays_done(self, scene: PredictedState, left: frozenset[str], parked: str) -> bool:
+    def _aims_hold(self, scene: PredictedState, left: frozenset[str], parked: str) -> bool:
         """Return whether the aims hold in the end if an object without a place of its own stays aside."""
         if parked in self.places:
             return True
-        there = with_moved(scene.sample, {name: self._place_of(scene, name) for name in left})
-        return all(self.expected.robustness(there, each.guard) >= 0.0 for each in self.aims)
+        final_sample = move_objects(scene.sample, {name: self._place_of(scene, name) for name in left})
+        return all(self.expected.robustness(final_sample, aim.guard) >= 0.0 for aim in self.aims)
 
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
         """Return where an object is to go, with the turn from how it is oriented in a scene."""
@@ -579,36 +586,44 @@ class MotionOrder:
         settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
         if settings.skill == "place":
-            return self._placed(scene, name, tracked, constraints)
+            return self._carry_target(scene, name, tracked, constraints)
         if not self._spend(1):
             return None
         movables, place = self.expected.movables(scene), self._place_of(scene, name)
         gradient = movables.gradient(name, self.aims[0].guard, constraints)
-        found = target_in(gradient, tracked, settings, place, movables.failed_here(name))
-        if isinstance(found, str) or movables.is_repeated(found):
+        target = target_in(gradient, tracked, settings, place, movables.failed_here(name))
+        if isinstance(target, str) or movables.is_repeated(target):
             return None
-        return replace(found, robustness=self.robustness)
+        return replace(target, robustness=self.robustness)
 
-    def _placed(
+    def _carry_target(
         self, scene: PredictedState, name: str, tracked: TrackedObject, constraints: Cubes
     ) -> Target | None:
         """Return the motion of an object that is carried, if there is room for it at its place."""
         settings, (x, y, turn) = self.expected.settings, self._place_of(scene, name)
-        there = with_moved(scene.sample, {name: (x, y, turn)})
-        others = [each for each in there.objects if each != name and each not in settings.workspace.supports]
+        moved_sample = move_objects(scene.sample, {name: (x, y, turn)})
+        others = [
+            neighbour
+            for neighbour in moved_sample.objects
+            if neighbour != name and neighbour not in settings.workspace.supports
+        ]
         if (
-            min(self.expected.clearances(there, name, others), default=math.inf)
+            min(self.expected.clearances(moved_sample, name, others), default=math.inf)
             <= settings.workspace.clearance
         ):
             return None
-        lower, upper = self.expected.values(there)
+        lower, upper = self.expected.values(moved_sample)
         if any(_danger(cube, lower, upper) >= -settings.constraint_margin for cube in constraints):
             return None
         yaw = None if tracked.yaw is None else tracked.yaw + turn
         target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self.robustness)
         movables = self.expected.movables(scene)
-        found = movables.with_way(target, constraints)
-        return None if isinstance(found, str) or movables.is_repeated(found) else found
+        target_with_way = movables.with_way(target, constraints)
+        return (
+            None
+            if isinstance(target_with_way, str) or movables.is_repeated(target_with_way)
+            else target_with_way
+        )
 
     # ---------------------------------------------------------------------------------------- in the way
 
@@ -623,8 +638,8 @@ class MotionOrder:
     ) -> Iterator[tuple[str, Target]]:
         """Yield motions that bring aside what is in the way of an object, or on its place."""
         constraints, settings = self._constraints_at(state, is_first), self.expected.settings
-        names = [each for each in self.expected.movables(scene).names if each != name]
-        names = [each for each in names if each in left or each not in {*parked, *self.places}]
+        names = [movable for movable in self.expected.movables(scene).names if movable != name]
+        names = [movable for movable in names if movable in left or movable not in {*parked, *self.places}]
         if settings.skill == "push" and not self._spend(1):
             return
         way = self._way_past(scene, name, names, constraints)
@@ -633,20 +648,22 @@ class MotionOrder:
         bound = self._bound_by(scene, {name: way}, constraints)
         beside = self._beside(scene, name, names)
         clearances = self.expected.clearances(with_objects(scene.sample, {name: way}), name, names)
-        for other, clearance in zip(names, clearances, strict=True):
-            in_way = other in beside or clearance <= settings.workspace.clearance
-            if (in_way or other in bound) and self._spend(3):
-                for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
+        for blocker, clearance in zip(names, clearances, strict=True):
+            in_way = blocker in beside or clearance <= settings.workspace.clearance
+            if (in_way or blocker in bound) and self._spend(3):
+                for target in self._parking_motions(
+                    scene, state, blocker, {name: way}, left, is_first, blocker in beside
+                ):
                     after = scene.after(target.name, target.pose)
                     movables = self.expected.movables(scene)
                     # a constraint may hold wherever the other object stands
-                    if not in_way and other in self._bound_by(after, {name: way}, constraints):
+                    if not in_way and blocker in self._bound_by(after, {name: way}, constraints):
                         continue
-                    if not self._stays_done(after, left, other):
+                    if not self._aims_hold(after, left, blocker):
                         continue
-                    found = movables.with_way(target, constraints)
-                    if isinstance(found, Target) and not movables.is_repeated(found):
-                        yield other, found
+                    target_with_way = movables.with_way(target, constraints)
+                    if isinstance(target_with_way, Target) and not movables.is_repeated(target_with_way):
+                        yield blocker, target_with_way
 
     def _way_past(
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
@@ -657,8 +674,12 @@ class MotionOrder:
         if settings.skill == "place":
             return moved_object(tracked, *place)
         workspace = settings.workspace
-        kept = [each for each in self.expected.relations(constraints) if not _concerned(each, others)]
-        formulas, constraints = _cubes_of(kept)
+        conjunctions = [
+            conjunction
+            for conjunction in self.expected.relations(constraints)
+            if not _subjects_of(conjunction, others)
+        ]
+        formulas, constraints = _cubes_of(conjunctions)
         free = replace(workspace, supports=workspace.supports.union(others))
         about = formulas, self.expected.regions, scene.sample, name, free
         maps = proposition_maps(*about, self.expected.movables(scene).maps_of(name).grid)
@@ -683,11 +704,13 @@ class MotionOrder:
         ((name, way),) = covered.items()
         relations, cubes = self.expected.relations_about(name, constraints)
         lower, upper = self.expected.values(with_objects(scene.sample, {name: way}), relations)
-        own = lower[len(self.expected.formulas) :], upper[len(self.expected.formulas) :]
+        bounds = lower[len(self.expected.formulas) :], upper[len(self.expected.formulas) :]
         margin = self.expected.settings.constraint_margin
-        held = {number for cube in cubes if _danger(cube, *own) >= -margin for number, _ in cube}
+        held = {number for cube in cubes if _danger(cube, *bounds) >= -margin for number, _ in cube}
         return {
-            each for each in scene.sample.objects if any(concerns(relations[number], each) for number in held)
+            tracked_name
+            for tracked_name in scene.sample.objects
+            if any(concerns(relations[number], tracked_name) for number in held)
         }
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
@@ -696,7 +719,7 @@ class MotionOrder:
             return set()
         near = BESIDE * radius_of(scene.sample.objects[name])
         clearances = zip(others, self.expected.clearances(scene.sample, name, others), strict=True)
-        return {each for each, clearance in clearances if clearance <= near}
+        return {neighbour for neighbour, clearance in clearances if clearance <= near}
 
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
@@ -707,7 +730,7 @@ class MotionOrder:
         is_kept = danger_of(maps, constraints) < -settings.constraint_margin
         return np.asarray(is_kept & (maps.clearance > settings.workspace.clearance)), maps
 
-    def _parked(
+    def _parking_motions(
         self,
         scene: PredictedState,
         state: int,
@@ -726,17 +749,17 @@ class MotionOrder:
         tracked = scene.sample.objects[name]
         movables = self.expected.movables(scene)
         now, gradient = movables.maps_of(name), movables.gradient(name, self.aims[0].guard, constraints)
-        places = {each: self._place_of(scene, each) for each in left if each != name}
-        there = with_moved(scene.sample, places)
+        places = {mover: self._place_of(scene, mover) for mover in left if mover != name}
+        final_sample = move_objects(scene.sample, places)
         later = self.expected.relations_about(name, self._constraints_at(state, is_first=False))
-        clear, maps = self._is_kept(with_objects(there, covered), name, now.grid, *later)
+        clear, maps = self._is_kept(with_objects(final_sample, covered), name, now.grid, *later)
         good = (gradient.blocked == FREE) & clear
         after = np.ones_like(good)
         if settings.skill == "push":
-            after, _ = self._is_kept(there, name, now.grid, *later)
+            after, _ = self._is_kept(final_sample, name, now.grid, *later)
             onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
             if name in self.places:
-                # behind those that are at their places by then, it would stay away from its own
+                # behind objects that are at their places by then, it could not be pushed to its own
                 onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
             after &= onwards
             good &= after
@@ -782,15 +805,17 @@ def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> B
 
 def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
     """Return the relations of conjunctions, and these as cubes over them."""
-    formulas = list(dict.fromkeys(each.formula for way in ways for each in way))
-    return formulas, tuple(tuple((formulas.index(each.formula), each.wanted) for each in way) for way in ways)
+    formulas = list(dict.fromkeys(demand.formula for way in ways for demand in way))
+    return formulas, tuple(
+        tuple((formulas.index(demand.formula), demand.wanted) for demand in way) for way in ways
+    )
 
 
 def _danger(cube: Cube, lower: Sequence[float], upper: Sequence[float]) -> float:
     """Return the greatest robustness that a conjunction may have, by bounds of its members."""
-    return min((upper[number] if wanted else -lower[number] for number, wanted in cube), default=0.0)
+    return min((upper[number] if value else -lower[number] for number, value in cube), default=0.0)
 
 
-def _concerned(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:
+def _subjects_of(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:
     """Return which of some objects demands are about."""
-    return {name for name in names if any(concerns(each.formula, name) for each in demands)}
+    return {name for name in names if any(concerns(demand.formula, name) for demand in demands)}

@@ -51,7 +51,7 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
     first, last = ends.min(axis=0) + 1, ends.max(axis=0) + 1
     box = np.array([first[0], last[0], first[1], last[1]])
     # with a border of blocked cells, the search needs no check of bounds
-    cells = search(_bordered(is_free), _bordered(goals & is_free), box, row + 1, column + 1) - 1
+    cells = search(_add_border(is_free), _add_border(goals & is_free), box, row + 1, column + 1) - 1
     if not len(cells):
         return None
     steps = np.abs(np.diff(cells, axis=0))
@@ -62,21 +62,21 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
 
 def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
     """Return the cells (rows, columns) to which a path leads from a free cell over free ones."""
-    found = np.zeros(free.shape, np.bool_)
-    found[cell] = True
+    reached = np.zeros(free.shape, np.bool_)
+    reached[cell] = True
     while True:
-        count = np.count_nonzero(found)
+        count = np.count_nonzero(reached)
         for turns in range(4):
             # free cells that follow one that is found, with no other cell between
-            open_cells, view = np.rot90(free, turns), np.rot90(found, turns)
+            open_cells, view = np.rot90(free, turns), np.rot90(reached, turns)
             place = np.arange(len(view))[:, None]
-            last_found = np.maximum.accumulate(np.where(view, place, -1))
-            view |= last_found > np.maximum.accumulate(np.where(open_cells, -1, place))
-        if np.count_nonzero(found) == count:
-            return found
+            last_reached = np.maximum.accumulate(np.where(view, place, -1))
+            view |= last_reached > np.maximum.accumulate(np.where(open_cells, -1, place))
+        if np.count_nonzero(reached) == count:
+            return reached
 
 
-def _bordered(cells: Booleans) -> NDArray[np.int8]:
+def _add_border(cells: Booleans) -> NDArray[np.int8]:
     return np.pad(cells, 1).astype(np.int8)
 
 
@@ -129,17 +129,17 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
                 steps = _jump_straight(free, goals, row, column, down, right)
             if steps == 0:
                 continue
-            there = (row + steps * down) * columns + column + steps * right
+            cell = (row + steps * down) * columns + column + steps * right
             new_straight = straight[current] + (0 if is_diagonal else steps)
             new_diagonal = diagonal[current] + (steps if is_diagonal else 0)
             # sums of step counts, unlike sums of lengths, make equal paths equal to the last bit
             length = new_straight + ROOT_2 * new_diagonal
-            if straight[there] >= 0 and straight[there] + ROOT_2 * diagonal[there] <= length:
+            if straight[cell] >= 0 and straight[cell] + ROOT_2 * diagonal[cell] <= length:
                 continue
-            straight[there], diagonal[there] = new_straight, new_diagonal
-            parent[there] = current
+            straight[cell], diagonal[cell] = new_straight, new_diagonal
+            parent[cell] = current
             ahead = _at_least(row + steps * down, column + steps * right, box)
-            heapq.heappush(queue, (length + ahead, np.int64(there)))
+            heapq.heappush(queue, (length + ahead, np.int64(cell)))
     return np.zeros((0, 2), np.int64)
 
 

@@ -119,17 +119,19 @@ class Planner:
         self._settings = settings
         self.specification = specification
         self._regions = specification.regions
-        self._formulas = [each.formula for each in self.automaton.propositions]
+        self._formulas = [proposition.formula for proposition in self.automaton.propositions]
         refuse_delays(self._formulas)
         self._specs = specs_of(formula, self._formulas)
         # in words, a long proposition goes by the spec that it alone is part of, unless that always holds
         uses = Counter(name for names in self._specs for name in names)
-        temporal = (each for each in iter_formulas(formula) if isinstance(each, Temporal))
-        uses += Counter(each.name for each in temporal if each.name and each.operator == "G")
-        owns = (next((each for each in names if uses[each] == 1), None) for names in self._specs)
+        temporal = (part for part in iter_formulas(formula) if isinstance(part, Temporal))
+        uses += Counter(part.name for part in temporal if part.name and part.operator == "G")
+        spec_names = (next((name for name in names if uses[name] == 1), None) for names in self._specs)
         named = [
-            replace(each, name=own) if own and len(each.literal(True)) > _LONGEST_WANTED else each
-            for each, own in zip(self.automaton.propositions, owns, strict=True)
+            replace(proposition, name=spec_name)
+            if spec_name and len(proposition.literal(True)) > _LONGEST_WANTED
+            else proposition
+            for proposition, spec_name in zip(self.automaton.propositions, spec_names, strict=True)
         ]
         self._words = self.automaton.renamed(named)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
@@ -240,13 +242,15 @@ class Planner:
             if not turned:
                 return ""
             u, v = x, y
-        there = moved_object(now, 2.0 * x - u, 2.0 * y - v, turned)
-        objects = {**sample.objects, target.name: there}
+        moved = moved_object(now, 2.0 * x - u, 2.0 * y - v, turned)
+        objects = {**sample.objects, target.name: moved}
         symbol = self._observer.symbol(Sample(sample.time_ns, objects, sample.signals, sample.unknown))
         if not self.automaton.step_set(self._states, symbol).isdisjoint(self.automaton.can_accept):
             return ""
         labels = zip(self._words.propositions, self._symbol, symbol, strict=True)
-        changed = [each.literal(bool(after)) for each, value, after in labels if after is not value]
+        changed = [
+            proposition.literal(bool(after)) for proposition, value, after in labels if after is not value
+        ]
         return (
             f"stopped: with the next sample, {' and '.join(changed) or 'the specification would be violated'}"
         )
@@ -299,15 +303,15 @@ class Planner:
 
     def _next_step(self) -> Step:
         if self._states <= self.automaton.accepting:
-            return self._decided("hold", (), "the specification is satisfied: hold")
+            return self._decision("hold", (), "the specification is satisfied: hold")
         if self._is_blind():
-            return self._decided("wait", (), f"not enough is seen: {self._unknown()} unknown")
+            return self._decision("wait", (), f"not enough is seen: {self._unknown()} unknown")
         state = worst_state(self.automaton, self.states)
         if state is None:
             reason = "no path left: the specification cannot be satisfied any more"
-            return self._decided("no path", (), reason)
+            return self._decision("no path", (), reason)
         if self.is_doubtful:
-            return self._decided("hold", (), "satisfied, unless it was violated while not enough was seen")
+            return self._decision("hold", (), "satisfied, unless it was violated while not enough was seen")
         return self._step_from(state)
 
     def _step_from(self, state: int) -> Step:
@@ -322,12 +326,12 @@ class Planner:
         pruned = given_up - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) and not idle.along(path):
             aim = consideration_of(self._words, path, pruned, self._symbol)
-            exhausted = self._attempts.why_exhausted(aim.edge, self.settings.attempts)
+            exhausted = self._attempts.why_not_again(aim.edge, self.settings.attempts)
             if exhausted is not None:
                 considered.append(replace(aim, pruned=exhausted))
                 self._passed.discard(aim.edge)
             else:
-                aim = self._considered(aim, path, foresight.movables)
+                aim = self._consider(aim, path, foresight.movables)
                 before = pruned | given_up
                 undecided[len(considered)] = aim, path, before
                 considered.append(foresight.decide(aim, path, before))
@@ -336,36 +340,36 @@ class Planner:
                 return self._running_step(considered)
             self._pruned[aim.edge] = reason
             pruned |= {aim.edge, *equivalent_edges(self.automaton, aim, idle, pruned, self._symbol)}
-        # what takes several motions, or one that failed before, comes after all that one motion takes
+        # edges of several motions, or of one that failed before, come after all edges of one motion
         for number, (alone, way, before) in undecided.items():
-            found = foresight.decide(alone, way, before, together=True)
-            if found.pruned and self._attempts.motions > 0:
+            decision = foresight.decide(alone, way, before, together=True)
+            if decision.pruned and self._attempts.motions > 0:
                 # a motion may fail by chance: without any other, one that failed is made again
                 again = self._foresight(self._attempts.forgiven(), budget)
-                repeated = self._considered(alone, way, again.movables)
+                repeated = self._consider(alone, way, again.movables)
                 repeated = again.decide(repeated, way, before, together=True)
-                found = found if repeated.pruned else repeated
-            considered[number] = found
-            if found.pruned is None:
+                decision = decision if repeated.pruned else repeated
+            considered[number] = decision
+            if decision.pruned is None:
                 return self._running_step(considered[: number + 1])
-            self._pruned[found.edge] = found.pruned
-            self._passed.discard(found.edge)
+            self._pruned[decision.edge] = decision.pruned
+            self._passed.discard(decision.edge)
         if path is not None:
             considered.append(consideration_of(self._words, path, pruned, self._symbol))
             return self._waiting_step(considered, idle.along(path))
         why = ""
         if considered and self.settings.motions > 1 and not self._attempts.are_any:
             first = considered[0].pruned
-            is_later = any(each.kind == LATER for each in self._pruned.values())
+            is_later = any(reason.kind == LATER for reason in self._pruned.values())
             why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
         said = why_no_path(self.automaton, state, self._pruned, why)
-        return self._decided("no path", considered, said)
+        return self._decision("no path", considered, said)
 
     def _foresight(self, attempts: Attempts, budget: Budget) -> Lookahead:
         about = self.automaton, self._formulas, self._regions, self.settings
         return Lookahead(Expectations(*about, attempts, budget), self._newest())
 
-    def _considered(
+    def _consider(
         self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
     ) -> Consideration:
         """Return an edge with its candidates, the best one chosen; pruned if one motion does not take it."""
@@ -378,11 +382,11 @@ class Planner:
 
     def _waiting_step(self, considered: list[Consideration], ahead: tuple[int, ...]) -> Step:
         reason = f"wait for {counted(len(ahead), 'sample')}: time alone leads on, to state {ahead[-1]}"
-        return replace(self._decided("wait", considered, reason), ahead=ahead)
+        return replace(self._decision("wait", considered, reason), ahead=ahead)
 
     def _running_step(self, considered: list[Consideration]) -> Step:
         aim = considered[-1]
-        (target,) = [each.target for each in aim.candidates if each.is_chosen]
+        (target,) = [candidate.target for candidate in aim.candidates if candidate.is_chosen]
         if target is None:
             raise UsageError("the chosen object has no target")
         self._attempts.begin(aim.edge, self._newest(), self.settings)
@@ -392,41 +396,47 @@ class Planner:
         which = f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
         what = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){which} for the edge {edge}"
         reason = f"{self._why(aim, target)}. {what}"
-        return replace(self._decided("execute", considered, reason), target=target)
+        return replace(self._decision("execute", considered, reason), target=target)
 
     def _why(self, aim: Consideration, target: Target) -> str:
         """Return why an object is moved, and why this one where another one could be."""
         name, pushes = target.name, self.settings.skill == "push"
         wrong = (
-            [each for each in cube if self._symbol[each[0]] is not each[1]] for cube in aim.progress.cubes
+            [literal for literal in cube if self._symbol[literal[0]] is not literal[1]]
+            for cube in aim.progress.cubes
         )
         unmet = min(wrong, key=len)
-        own = [each for each in unmet if concerns(self._formulas[each[0]], name)]
-        later = [each.name for each in aim.motions[1:]]
-        others = [each for each in later if each != name]
-        if aim.is_joint and others and (name in later or not own):
+        relevant = [literal for literal in unmet if concerns(self._formulas[literal[0]], name)]
+        later = [motion.name for motion in aim.motions[1:]]
+        others = [mover for mover in later if mover != name]
+        if aim.is_joint and others and (name in later or not relevant):
             failed = self._attempts.failed_here(others[0], self._newest(), self.settings)
             why = "could not be moved next to it" if failed else "has to pass"
             return f"{name} goes aside: {others[0]} {why}"
-        wanted = " and ".join(self._wanted(*each) for each in own or unmet)
-        why = f"{name} moves{wanted and f': {wanted} is wanted'}"
-        rivals = [each.target for each in aim.candidates if each.target and not each.is_chosen]
+        goal = " and ".join(self._wanted_text(*literal) for literal in relevant or unmet)
+        why = f"{name} moves{goal and f': {goal} is wanted'}"
+        rivals = [
+            candidate.target for candidate in aim.candidates if candidate.target and not candidate.is_chosen
+        ]
         if aim.is_joint or not rivals:
             return why
-        cost, (least, rival) = _cost(target, pushes), min((_cost(each, pushes), each.name) for each in rivals)
+        cost, (least, rival) = (
+            _cost(target, pushes),
+            min((_cost(rival_target, pushes), rival_target.name) for rival_target in rivals),
+        )
         how = "a longer way" if pushes else "less robustness"
         if cost > least:
             how = f"{'a shorter way' if pushes else 'more robustness'}, but no motions lead on from there"
         return f"{why}; {rival} could do it with {how} ({abs(least):.3g}, here {abs(cost):.3g})"
 
-    def _wanted(self, number: int, value: bool) -> str:
+    def _wanted_text(self, number: int, value: bool) -> str:
         """Return a proposition that has to hold or not, with the specs that it is of; a long one by these."""
         text, specs = self._words.propositions[number].literal(value), " and ".join(self._specs[number])
         if not specs or self._words.propositions[number].name:
             return text
         return specs if len(text) > _LONGEST_WANTED else f"{text} ({specs})"
 
-    def _decided(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
+    def _decision(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
         number, self._steps = self._steps, self._steps + 1
         pruned = tuple(sorted(self._pruned.items()))
         time_ns = self._newest().time_ns
@@ -442,7 +452,7 @@ class Planner:
         """Return the labels of the propositions that the newest sample leaves unknown."""
         propositions = self._words.propositions
         labels = zip(propositions, self._symbol, strict=True)
-        return ", ".join(each.label for each, value in labels if value is None)
+        return ", ".join(proposition.label for proposition, value in labels if value is None)
 
 
 def _cost(target: Target, pushes: bool) -> float:

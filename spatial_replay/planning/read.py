@@ -206,7 +206,7 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
                     f"{source.name} has lost the sample at {message.time_ns} ns, on which a decision depends"
                 )
             rerun.repeat(decision)
-            rerun.taken()
+            rerun.take_messages()
             if decision.HasField("outcome"):
                 steps[decision.number] = replace(steps[decision.number], message=decision)
             elif rerun.last is not None:
@@ -251,15 +251,15 @@ def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
     waiting: list[PlannerMessage] = []
     for block in blocks:
         waiting += planner_messages(block.messages)
-        taken = 0
+        count = 0
         for sample in block.trace.samples():
-            while taken < len(waiting) and waiting[taken].time_ns < sample.time_ns:
-                moment.messages.append(waiting[taken])
-                taken += 1
+            while count < len(waiting) and waiting[count].time_ns < sample.time_ns:
+                moment.messages.append(waiting[count])
+                count += 1
             if moment.sample is not None or moment.messages:
                 yield moment
             moment = Moment(sample, [])
-        del waiting[:taken]
+        del waiting[:count]
     moment.messages.extend(waiting)
     if moment.sample is not None or moment.messages:
         yield moment
@@ -288,11 +288,11 @@ class Rerun:
         self.last: Step | None = None
         self.is_moving = False
 
-    def taken(self) -> Messages:
+    def take_messages(self) -> Messages:
         """Return the messages of what was repeated since the last call, and keep them no longer."""
-        written = merge(self._written)
+        messages = merge(self._written)
         self._written.clear()
-        return written
+        return messages
 
     def repeat(self, recorded: PlanDecision) -> None:
         """Repeat a recorded decision, or conclude it with its recorded outcome.
@@ -318,7 +318,7 @@ class Rerun:
 
 def _outcome(decision: PlanDecision) -> Outcome:
     at = decision.outcome.at
-    stage = next((each for each in get_args(Stage) if each == at), None)
+    stage = next((name for name in get_args(Stage) if name == at), None)
     if at and stage is None:
         raise LogError(f"the outcome of decision {decision.number} is at {at!r:.40}, not pick, way or place")
     return Outcome(decision.outcome.succeeded, decision.outcome.reason, stage)
@@ -409,27 +409,29 @@ class _Comparison:
         if self.differences:
             return
         is_first = self.rerun.last is None
-        self.began_within |= is_first and not any(each.topic == PLAN_DECISION for each in recorded)
+        self.began_within |= is_first and not any(message.topic == PLAN_DECISION for message in recorded)
         recomputed: list[PlannerMessage] = []
         for message in recorded:
             if message.topic == PLAN_DECISION:
                 try:
-                    recomputed += self._recomputed(decision_from_payload(message.payload))
+                    recomputed += self._recompute(decision_from_payload(message.payload))
                 except SpatialReplayError as error:
                     self.differences.append(f"at {_seconds(time_ns)}: {error}")
                     return
         for topic in PLANNER_TOPICS:
-            old, new = ([m.payload for m in each if m.topic == topic] for each in (recorded, recomputed))
+            old, new = (
+                [m.payload for m in messages if m.topic == topic] for messages in (recorded, recomputed)
+            )
             self.differences += (f"at {_seconds(time_ns)}: {what}" for what in _differences(topic, old, new))
 
-    def _recomputed(self, recorded: PlanDecision) -> Iterator[PlannerMessage]:
+    def _recompute(self, recorded: PlanDecision) -> Iterator[PlannerMessage]:
         has_outcome = recorded.HasField("outcome")
         self.began_within |= self.rerun.last is None and bool(has_outcome or recorded.number)
         self.rerun.repeat(recorded)
         if not has_outcome and self.rerun.last is not None:
             self.decisions += 1
             self.maps += len(maps_of(self.rerun.last))
-        return planner_messages(self.rerun.taken())
+        return planner_messages(self.rerun.take_messages())
 
 
 def _missing(rerun: Rerun) -> Iterator[str]:
@@ -457,10 +459,10 @@ def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> 
 
 
 def _differing_fields(recorded: bytes, recomputed: bytes) -> str:
-    one, other = map(decision_from_payload, (recorded, recomputed))
+    old, new = map(decision_from_payload, (recorded, recomputed))
     names = (field.name for field in PlanDecision.DESCRIPTOR.fields)
-    fields = [name for name in names if getattr(one, name) != getattr(other, name)]
-    return f" in {', '.join(fields)} of decision {one.number}" if fields else ""
+    fields = [name for name in names if getattr(old, name) != getattr(new, name)]
+    return f" in {', '.join(fields)} of decision {old.number}" if fields else ""
 
 
 def _seconds(time_ns: int) -> str:
@@ -604,7 +606,7 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
         return
     messages = redone.recorded.message, redone.redone.message
     sides = [
-        {each.object: each for edge in message.considered[-1:] for each in edge.candidates}
+        {candidate.object: candidate for edge in message.considered[-1:] for candidate in edge.candidates}
         for message in messages
     ]
     for name in dict.fromkeys((*sides[0], *sides[1])):
@@ -613,7 +615,7 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
         for key in dict.fromkeys((*rows[0], *rows[1])):
             ours, theirs = ([cut(text, column - 1) for text in row.get(key, ())] for row in rows)
             for place in range(max(len(ours), len(theirs))):
-                left, right = (each[place] if place < len(each) else "" for each in (ours, theirs))
+                left, right = (texts[place] if place < len(texts) else "" for texts in (ours, theirs))
                 yield f"  {key if not place else '':<11}{left:<{column}}{right}".rstrip()
 
 
@@ -684,11 +686,11 @@ def redo_decisions(
 
 
 def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
-    texts = [format_specification(each.specification) for each in (old, new)]
-    names = [f"{each.specification.filename}, {each.automaton.name}" for each in (old, new)]
+    texts = [format_specification(planner.specification) for planner in (old, new)]
+    names = [f"{planner.specification.filename}, {planner.automaton.name}" for planner in (old, new)]
     if texts[0] != texts[1] or old.automaton.name != new.automaton.name:
         yield f"specification {names[0]} -> {names[1]}"
-    before, after = (each.specification.constants for each in (old, new))
+    before, after = (planner.specification.constants for planner in (old, new))
     for name in before:
         if name in after and before[name].value != after[name].value:
             yield f"const {name} {before[name].value:g} -> {after[name].value:g}"
@@ -708,19 +710,21 @@ class _Redoing:
 
     def take(self, sample: Sample | None, recorded: list[PlannerMessage]) -> None:
         """Take a sample and the recorded messages that follow it."""
-        decisions = [decision_from_payload(each.payload) for each in recorded if each.topic == PLAN_DECISION]
-        made = [each for each in decisions if not each.HasField("outcome")]
-        self.decisions += len(made)
+        decisions = [
+            decision_from_payload(message.payload) for message in recorded if message.topic == PLAN_DECISION
+        ]
+        new_decisions = [decision for decision in decisions if not decision.HasField("outcome")]
+        self.decisions += len(new_decisions)
         if self.redone is not None or sample is None:
             return
         self._old.box.observe(sample)
         self._new.box.observe(sample)
         waiting = self._new.last is not None and self._new.last.kind == "wait"
-        if self._is_changed and waiting and not made:
+        if self._is_changed and waiting and not new_decisions:
             # what it decides now comes before anything in the log
             step = self._new.box.next_step()
             if step is not self._new.last:
-                self._differ(sample, None, step, self._new.taken())
+                self._differ(sample, None, step, self._new.take_messages())
             return
         for decision in decisions:
             if not self._repeat(sample, decision, recorded):
@@ -730,9 +734,9 @@ class _Redoing:
         """Repeat a decision or its outcome; return whether the same was done."""
         before = self._new.last
         self._old.repeat(decision)
-        self._old.taken()
+        self._old.take_messages()
         self._new.repeat(decision)
-        messages, old, new = self._new.taken(), self._old.last, self._new.last
+        messages, old, new = self._new.take_messages(), self._old.last, self._new.last
         if old is None or new is None:
             return True
         if decision.HasField("outcome"):
@@ -760,14 +764,14 @@ class _Redoing:
 
 def _does_the_same(old: Step, new: Step) -> bool:
     """Return whether two decisions have the robot do the same."""
-    targets = [each.target and replace(each.target, robustness=0.0) for each in (old, new)]
+    targets = [step.target and replace(step.target, robustness=0.0) for step in (old, new)]
     return old.kind == new.kind and targets[0] == targets[1]
 
 
 def _has_all(recorded: list[PlannerMessage], redone: Messages) -> bool:
     """Return whether the log has messages byte for byte."""
-    payloads = {(each.topic, each.payload) for each in recorded}
-    return all((each.topic, each.payload) in payloads for each in planner_messages(redone))
+    payloads = {(message.topic, message.payload) for message in recorded}
+    return all((message.topic, message.payload) in payloads for message in planner_messages(redone))
 
 
 def _on_redone_topics(messages: Messages) -> Messages:
@@ -786,12 +790,12 @@ class ReplannedSource(SourceOf):
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
-        done, _ = window_of(self.beside.log_time_ns, start_ns or 0, np.iinfo(np.int64).max)
+        start, _ = window_of(self.beside.log_time_ns, start_ns or 0, np.iinfo(np.int64).max)
         for block in self.source.iter_blocks(start_ns, end_ns):
             if not len(block.trace):
                 yield block
                 continue
             _, end = window_of(self.beside.log_time_ns, 0, int(block.trace.times_ns[-1]) + 1)
-            own = select(self.beside, np.arange(done, max(done, end)))
-            done = max(done, end)
-            yield replace(block, messages=merge([block.messages, own]))
+            replanned = select(self.beside, np.arange(start, max(start, end)))
+            start = max(start, end)
+            yield replace(block, messages=merge([block.messages, replanned]))

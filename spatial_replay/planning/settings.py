@@ -196,7 +196,7 @@ class Workspace:
         Raises:
             UsageError: the sample has no object.
         """
-        parts = [part for each in sample.objects.values() for part in each.footprint.parts]
+        parts = [part for tracked in sample.objects.values() for part in tracked.footprint.parts]
         if not parts:
             raise UsageError("there is nothing in the sample to lay a grid around; give a workspace")
         low = np.min([part.vertices.min(axis=0) - part.radius for part in parts], axis=0)
@@ -210,7 +210,7 @@ class Workspace:
         if not self.keeps_yaw:
             return np.array(self.yaws) - (yaw or 0.0) if self.yaws else np.zeros(1)
         # the shorter way round
-        turned = () if yaw is None else (math.remainder(each - yaw, math.tau) for each in self.yaws)
+        turned = () if yaw is None else (math.remainder(angle - yaw, math.tau) for angle in self.yaws)
         return np.array([0.0, *turned])
 
     def within_reach(self, grid: Grid) -> Booleans:
@@ -244,9 +244,9 @@ def is_number(value: object) -> bool:
 
 def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
     """Return what keeps values, by name, from being finite numbers of at least `least`."""
-    wanted = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
+    expected = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
     return [
-        f"{name} is {value!r}; give {wanted}"
+        f"{name} is {value!r}; give {expected}"
         for name, value in values.items()
         if not (is_number(value) and math.isfinite(value) and value >= least)
     ]
@@ -271,7 +271,7 @@ def member_faults(
 ) -> list[str]:
     """Return what keeps a value from being a collection with members of one type."""
     return kind_faults(name, members, collection, wanted) or [
-        f"{name} has {each!r}; give {wanted}" for each in members if not isinstance(each, member)
+        f"{name} has {value!r}; give {wanted}" for value in members if not isinstance(value, member)
     ]
 
 
@@ -365,7 +365,8 @@ def text_from_settings(settings: Settings) -> str:
             "nearest": workspace.nearest,
             "farthest": workspace.farthest if math.isfinite(workspace.farthest) else None,
             "obstacles": [
-                [[part.vertices.tolist(), part.radius] for part in each.parts] for each in workspace.obstacles
+                [[part.vertices.tolist(), part.radius] for part in obstacle.parts]
+                for obstacle in workspace.obstacles
             ],
             "supports": sorted(workspace.supports),
             "clearance": workspace.clearance,
@@ -502,11 +503,11 @@ def _obstacle(value: Mapping[str, Any]) -> Footprint:
 
 _OF_WORKSPACE: Final[Mapping[str, Callable[[Any], Any]]] = MappingProxyType(
     {
-        "yaws": lambda each: tuple(map(_angle, each)),
-        "base": lambda each: (float(each[0]), float(each[1])),
+        "yaws": lambda value: tuple(map(_angle, value)),
+        "base": lambda value: (float(value[0]), float(value[1])),
         "nearest": float,
-        "farthest": lambda each: math.inf if each is None else float(each),
-        "obstacles": lambda each: tuple(map(_obstacle, each)),
+        "farthest": lambda value: math.inf if value is None else float(value),
+        "obstacles": lambda value: tuple(map(_obstacle, value)),
         "supports": frozenset,
         "clearance": float,
     }
@@ -515,7 +516,7 @@ _OF_WORKSPACE: Final[Mapping[str, Callable[[Any], Any]]] = MappingProxyType(
 
 def changes_text(before: Settings, after: Settings) -> tuple[str, ...]:
     """Return what differs between two settings, such as "room 0.09 -> 0.02"."""
-    old, new = (json.loads(text_from_settings(each)) for each in (before, after))
+    old, new = (json.loads(text_from_settings(settings)) for settings in (before, after))
     return tuple(f"{key} {_brief(old[key])} -> {_brief(new[key])}" for key in old if old[key] != new[key])
 
 

@@ -77,12 +77,12 @@ def find_target(
     if settings.skill == "place":
         # near a cell that was tried, a refined target may still be another one
         for apart in (_spread(settings), _SAME * _cell(settings)):
-            untried = good & ~tried(gradient, failures, apart)
+            untried = good & ~tried_poses(gradient, failures, apart)
             if untried.any():
                 good = untried
                 break
-        wanted = min(settings.room, float(room[good].max())) if failures else settings.room
-        roomy = good & (room >= wanted)
+        least_room = min(settings.room, float(room[good].max())) if failures else settings.room
+        roomy = good & (room >= least_room)
         values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
         return _best_target(gradient, values, tracked)
     return _nearest_cell(gradient, good, tracked, settings, failures)
@@ -124,8 +124,8 @@ def nearest_target(
 
 def _best_target(gradient: GradientMap, values: Floats, tracked: TrackedObject) -> Target:
     turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
-    here, there = centre_of(tracked.footprint), gradient.grid.centre(row, column)
-    return _target(gradient, tracked, (turn, row, column), (here, there))
+    start, end = centre_of(tracked.footprint), gradient.grid.centre(row, column)
+    return _target(gradient, tracked, (turn, row, column), (start, end))
 
 
 def _nearest_cell(
@@ -135,10 +135,10 @@ def _nearest_cell(
     settings: Settings,
     failures: Sequence[Target],
 ) -> Target | str:
-    here = centre_of(tracked.footprint)
-    if not gradient.grid.contains(np.array(here)):
+    start = centre_of(tracked.footprint)
+    if not gradient.grid.contains(np.array(start)):
         return "it lies too far outside the workspace"
-    cell = gradient.grid.cell(*here)
+    cell = gradient.grid.cell(*start)
     towards = _failed_directions(gradient.grid, tracked, failures)
     entry = _path_into_reach(gradient, cell, settings, towards)
     if entry is None:
@@ -151,15 +151,15 @@ def _nearest_cell(
         for layer in range(1, len(gradient.turns)):
             goals = _turnable(gradient, layer, good[layer] & free, settings)
             paths[layer] = shortest_path(free, (row, column), goals)
-    found = [(path.length, layer, path) for layer, path in paths.items() if path is not None]
-    if not found:
+    routes = [(path.length, layer, path) for layer, path in paths.items() if path is not None]
+    if not routes:
         return "no free path leads to a good place" + _but_for(failures)
-    _, turned, path = min(found, key=lambda each: each[0])
+    _, turned, path = min(routes, key=lambda route: route[0])
     cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
     # an object off the middle of its cell need not visit that middle first
     first = 1 if cells[0] == cell and len(cells) > 1 else 0
-    turns = [gradient.grid.centre(*each) for each in cells[first:]]
-    return _target(gradient, tracked, (turned, *cells[-1]), (here, *turns))
+    turns = [gradient.grid.centre(*corner) for corner in cells[first:]]
+    return _target(gradient, tracked, (turned, *cells[-1]), (start, *turns))
 
 
 def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
@@ -182,8 +182,8 @@ def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settin
     """
     count = math.ceil(abs(turn) / _SWEPT)
     about = gradient.made_of.now.about
-    here = about.sample.objects[gradient.name].yaw or 0.0
-    yaws = tuple(here + turn * number / count for number in range(1, count))
+    yaw = about.sample.objects[gradient.name].yaw or 0.0
+    yaws = tuple(yaw + turn * number / count for number in range(1, count))
     if not yaws:
         return np.ones(grid.shape, np.bool_)
     workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
@@ -199,11 +199,11 @@ def _but_for(failures: Sequence[Target]) -> str:
 def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
     """Return (rows, columns): where a path would begin in about a direction in which a push failed."""
     towards = np.zeros(grid.shape, np.bool_)
-    here, radius = centre_of(tracked.footprint), radius_of(tracked)
-    offsets = (grid.centres() - np.array(here)).reshape(*grid.shape, 2)
+    centre, radius = centre_of(tracked.footprint), radius_of(tracked)
+    offsets = (grid.centres() - np.array(centre)).reshape(*grid.shape, 2)
     away = np.hypot(offsets[..., 0], offsets[..., 1])
-    for each in failures:
-        angle = _beginning(each, radius)
+    for failure in failures:
+        angle = _beginning(failure, radius)
         along = offsets @ np.array([math.cos(angle), math.sin(angle)])
         towards |= (away > grid.cell_size) & (away <= radius) & (along >= math.cos(_ASIDE) * away)
     return towards
@@ -213,14 +213,14 @@ def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject
     """Return whether a push begins in about the direction of one that failed."""
     radius = radius_of(tracked)
     begins = _beginning(target, radius)
-    turned = (math.remainder(begins - _beginning(each, radius), math.tau) for each in failures)
-    return any(abs(each) < _ASIDE / 2.0 for each in turned)
+    turned = (math.remainder(begins - _beginning(failure, radius), math.tau) for failure in failures)
+    return any(abs(angle) < _ASIDE / 2.0 for angle in turned)
 
 
 def _beginning(target: Target, distance: float) -> float:
     """Return the angle in which a way begins: that to its first point at a distance, or to its end."""
     begin, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
-    x, y = next((each for each in points if math.dist(each, begin) >= distance), target.waypoints[-1])
+    x, y = next((point for point in points if math.dist(point, begin) >= distance), target.waypoints[-1])
     return math.atan2(y - begin[1], x - begin[0])
 
 
@@ -271,18 +271,18 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
     if counts[FREE] and has_failed:
         return "it was tried wherever it would hold"
     reasons = zip(counts[1:].tolist(), REASONS[1:], strict=True)
-    listed = ", ".join(f"{count} cells: {reason}" for count, reason in reasons if count)
-    return f"blocked wherever it would hold: {listed}"
+    causes = ", ".join(f"{count} cells: {reason}" for count, reason in reasons if count)
+    return f"blocked wherever it would hold: {causes}"
 
 
-# ------------------------------------------------------------------------------------------------ refined
+# ----------------------------------------------------------------------------------------------- refinement
 
 
-def refined(
+def refine_target(
     target: Target,
     tracked: TrackedObject,
     settings: Settings,
-    measured: Measured,
+    measure: Measured,
     failures: Sequence[Target] = (),
 ) -> Target:
     """Return the target with the most robustness near a target, or the same one.
@@ -292,7 +292,7 @@ def refined(
 
     Args:
         tracked: the object before the motion.
-        measured: measures maps around the target.
+        measure: measures maps around the target.
         failures: targets for which motions failed; others are taken if there are any.
     """
     size = settings.workspace.grid.cell_size
@@ -308,13 +308,15 @@ def refined(
         x, y, turn = pose
         low = x - 2.5 * spacing, y - 2.5 * spacing
         turns = [0.0] if turning == 0.0 else [-turning, 0.0, turning]
-        yaws = tuple((tracked.yaw or 0.0) + turn + each for each in turns) if settings.workspace.yaws else ()
-        gradient, room = measured(Grid(*low, spacing, 5, 5), yaws)
+        yaws = (
+            tuple((tracked.yaw or 0.0) + turn + offset for offset in turns) if settings.workspace.yaws else ()
+        )
+        gradient, room = measure(Grid(*low, spacing, 5, 5), yaws)
         if number == 0:
             middle = len(gradient.turns) // 2, 2, 2
             least = settings.room if room[middle] >= settings.room else -math.inf
         good = (gradient.blocked == FREE) & (room >= least) & _near(gradient, target, tracked, settings)
-        good &= ~tried(gradient, failures, apart)
+        good &= ~tried_poses(gradient, failures, apart)
         values = np.where(good, gradient.robustness, -np.inf)
         place = tuple(map(int, np.unravel_index(int(np.argmax(values)), values.shape)))
         if values[place] > best + _BETTER:
@@ -331,13 +333,13 @@ def refined(
     return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
 
 
-def tried(gradient: GradientMap, failures: Sequence[Target], apart: float) -> Booleans:
+def tried_poses(gradient: GradientMap, failures: Sequence[Target], apart: float) -> Booleans:
     """Return (A, rows, columns): which poses of a map are some targets, but for a distance."""
     same = np.zeros(gradient.blocked.shape, np.bool_)
     centres = gradient.grid.centres().reshape(*gradient.grid.shape, 2)
-    for each in failures:
-        near = np.hypot(centres[..., 0] - each.x, centres[..., 1] - each.y) <= apart
-        same |= (np.abs(gradient.turns - each.turn) <= _SAME_TURN)[:, None, None] & near
+    for failure in failures:
+        near = np.hypot(centres[..., 0] - failure.x, centres[..., 1] - failure.y) <= apart
+        same |= (np.abs(gradient.turns - failure.turn) <= _SAME_TURN)[:, None, None] & near
     return same
 
 
@@ -348,9 +350,9 @@ def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) 
 
 def _is_near(target: Target, failures: Sequence[Target], apart: float) -> bool:
     return any(
-        math.dist((target.x, target.y), (each.x, each.y)) <= apart
-        and abs(target.turn - each.turn) <= _SAME_TURN
-        for each in failures
+        math.dist((target.x, target.y), (failure.x, failure.y)) <= apart
+        and abs(target.turn - failure.turn) <= _SAME_TURN
+        for failure in failures
     )
 
 

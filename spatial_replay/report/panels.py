@@ -57,9 +57,9 @@ from spatial_replay.planning.decision_log import (
     candidate_lines,
     cause_text,
     decision_from_payload,
+    joint_suffix,
     latest_decisions,
     map_fields,
-    once_all_are_done,
 )
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.spec.format import format_formula
@@ -835,7 +835,7 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
         "constraints": _guard_texts(edge.constraints),
         "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
         "later": [f"{each.object} to {_target_value(each)['words']}" for each in edge.motions[1:]],
-        "once": once_all_are_done(edge),
+        "once": joint_suffix(edge),
         "pruned": Reason.from_text(edge.pruned).kind,
     }
 
