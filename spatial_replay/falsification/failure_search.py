@@ -42,7 +42,7 @@ from spatial_replay.logs.remote import local_copy
 from spatial_replay.monitor.result import evaluate
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS
-from spatial_replay.sanity import refuse_decided
+from spatial_replay.sanity import refuse_constant_results
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
@@ -795,7 +795,7 @@ def search_failures(
         raise UsageError(f"the seed is {seed}; give 0 or more")
     space = Space(_distinct(parameters))
     for file in simulation.files:
-        refuse_decided(file)
+        refuse_constant_results(file)
     refuse_addresses(Path(folder))
     files = LocalFolder(Path(folder))
     _claim(files, _identity(simulation, space, seed))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.sanity.examine import doctor, refuse_decided, refuse_unsatisfiable
+    from spatial_replay.sanity.examine import doctor, refuse_constant_results, refuse_unsatisfiable
 
-__all__ = ["doctor", "refuse_decided", "refuse_unsatisfiable"]
+__all__ = ["doctor", "refuse_constant_results", "refuse_unsatisfiable"]
 
 __getattr__, __dir__ = loaded_when_used(globals())

@@ -95,35 +95,35 @@ Tree: TypeAlias = Linear | LeastOrGreatest
 def tree_of(expression: Expression, regions: Mapping[str, Outline]) -> Tree | None:
     """Return an expression as sums below minima and maxima; None for one with too many sums."""
     try:
-        return _built(expression, regions)
+        return _build(expression, regions)
     except OverflowError:
         return None
 
 
-def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
+def _build(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
     match expression:
         case Number():
             return Linear((), exact(expression.value))
         case Signal():
             return Linear(((expression, Fraction(1)),))
         case Sum():
-            return _added(_built(expression.first, regions), _built(expression.second, regions))
+            return _add(_build(expression.first, regions), _build(expression.second, regions))
         case Negative(Equality()):
             # `!=` excludes a number, and no inequality that holds at its limit can say so
             raise OverflowError("an excluded number")
         case Negative():
-            return _times(_built(expression.operand, regions), Fraction(-1))
+            return _times(_build(expression.operand, regions), Fraction(-1))
         case Equality(signal, value):
             if is_text_number(value) or isinstance(signal, Present):
                 raise OverflowError("a text, or whether an object is in the sample")
-            return _built(compare(signal, "==", value), regions)
+            return _build(compare(signal, "==", value), regions)
         case Scaled():
-            return _times(_built(expression.operand, regions), 1 / exact(expression.divisor))
+            return _times(_build(expression.operand, regions), 1 / exact(expression.divisor))
         case Minimum() | Maximum():
-            options = tuple(_built(each, regions) for each in expression.operands)
-            return _chosen("min" if isinstance(expression, Minimum) else "max", options)
+            options = tuple(_build(operand, regions) for operand in expression.operands)
+            return _least_or_greatest("min" if isinstance(expression, Minimum) else "max", options)
         case _:
-            return _measured(expression, regions)
+            return _split_measurement(expression, regions)
 
 
 def exact(value: float) -> Fraction:
@@ -137,27 +137,27 @@ def exact(value: float) -> Fraction:
     return Fraction(repr(float(value)))
 
 
-def _added(one: Tree, other: Tree) -> Tree:
-    if isinstance(one, LeastOrGreatest):
-        return _chosen(one.kind, tuple(_added(each, other) for each in one.options))
-    if isinstance(other, LeastOrGreatest):
-        return _added(other, one)
-    total = dict(one.weights)
-    for quantity, weight in other.weights:
+def _add(first: Tree, second: Tree) -> Tree:
+    if isinstance(first, LeastOrGreatest):
+        return _least_or_greatest(first.kind, tuple(_add(option, second) for option in first.options))
+    if isinstance(second, LeastOrGreatest):
+        return _add(second, first)
+    total = dict(first.weights)
+    for quantity, weight in second.weights:
         total[quantity] = total.get(quantity, Fraction(0)) + weight
-    weights = sorted(((key, value) for key, value in total.items() if value), key=lambda each: repr(each[0]))
-    return Linear(tuple(weights), one.constant + other.constant)
+    weights = sorted(((key, value) for key, value in total.items() if value), key=lambda item: repr(item[0]))
+    return Linear(tuple(weights), first.constant + second.constant)
 
 
 def _times(tree: Tree, factor: Fraction) -> Tree:
     if isinstance(tree, LeastOrGreatest):
         kind = tree.kind if factor > 0 else "max" if tree.kind == "min" else "min"
-        return LeastOrGreatest(kind, tuple(_times(each, factor) for each in tree.options))
+        return LeastOrGreatest(kind, tuple(_times(option, factor) for option in tree.options))
     weights = tuple((quantity, weight * factor) for quantity, weight in tree.weights)
     return Linear(weights, tree.constant * factor)
 
 
-def _chosen(kind: Literal["min", "max"], options: tuple[Tree, ...]) -> Tree:
+def _least_or_greatest(kind: Literal["min", "max"], options: tuple[Tree, ...]) -> Tree:
     if sum(map(_size, options)) > MAX_INEQUALITIES:
         raise OverflowError("too many sums")
     return options[0] if len(options) == 1 else LeastOrGreatest(kind, options)
@@ -167,29 +167,29 @@ def _size(tree: Tree) -> int:
     return 1 if isinstance(tree, Linear) else sum(map(_size, tree.options))
 
 
-def _measured(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
+def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
     """Return a measurement of unions as the least or greatest of measurements of their members."""
     kind: Literal["min", "max"]
-    each: list[Measurement]
+    parts: list[Measurement]
     if all(isinstance(without_radius(plain(term)), RegionName) for term in measured_terms(measurement)):
         return _of_regions(measurement, regions)
     match measurement:
         case SignedDistance() | Misalignment():
             kind, of = "min", type(measurement)
             pairs = product(members(measurement.first), members(measurement.second))
-            each = [of(*sorted(pair, key=repr)) for pair in pairs]
+            parts = [of(*sorted(pair, key=repr)) for pair in pairs]
         case Protrusion():
-            # of a union as the outer one nothing is known: a part of it may hold each part of the inner one
+            # an outer union stays whole: its members may hold different parts of the inner term
             kind, outer = "max", plain(measurement.outer)
-            each = [Protrusion(inner, outer) for inner in members(measurement.inner)]
+            parts = [Protrusion(inner, outer) for inner in members(measurement.inner)]
         case Projection():
             kind, axis = measurement.side, measurement.axis
-            each = [Projection(term, axis, kind) for term in members(measurement.term)]
+            parts = [Projection(term, axis, kind) for term in members(measurement.term)]
         case CentroidProjection():
             kind, axis = measurement.side, measurement.axis
             terms = map(without_radius, members(measurement.term))
-            each = [CentroidProjection(term, axis, kind) for term in terms]
-    return _chosen(kind, tuple(_shifted(one, regions) for one in each))
+            parts = [CentroidProjection(term, axis, kind) for term in terms]
+    return _least_or_greatest(kind, tuple(_shift(part, regions) for part in parts))
 
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
@@ -201,22 +201,24 @@ def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Lin
 def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outline]) -> list[Fraction | None]:
     """Return what is measured of regions alone; None where that is unknown."""
     nothing = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
-    values = leaf_values(nothing, [Atom("", "", each) for each in measurements], {})[:, :, 0].T.tolist()
-    return [exact(each[0]) if len(set(each)) == 1 and isfinite(each[0]) else None for each in values]
+    values = leaf_values(nothing, [Atom("", "", measurement) for measurement in measurements], {})[
+        :, :, 0
+    ].T.tolist()
+    return [exact(bounds[0]) if len(set(bounds)) == 1 and isfinite(bounds[0]) else None for bounds in values]
 
 
 def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Measurement, Fraction]:
     """Return the distances of regions that are apart, and protrusions of regions from those around them."""
-    terms = (term for each in atoms for term in terms_of(each.expression))
-    names = dict.fromkeys(each for each in map(without_radius, terms) if isinstance(each, RegionName))
+    terms = (term for atom in atoms for term in terms_of(atom.expression))
+    names = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
     pairs = list(permutations(names, 2))
     measured: list[Measurement] = [SignedDistance(*pair) for pair in pairs if repr(pair[0]) < repr(pair[1])]
     measured += [Protrusion(*pair) for pair in pairs]
     numbers = zip(measured, _numbers_of(measured, regions), strict=True) if measured else ()
     return {
-        each: value
-        for each, value in numbers
-        if value is not None and isinstance(each, SignedDistance) == (value > 0)
+        measurement: value
+        for measurement, value in numbers
+        if value is not None and isinstance(measurement, SignedDistance) == (value > 0)
     }
 
 
@@ -228,26 +230,26 @@ def _diameter(outline: Outline) -> Fraction:
 
 def is_about_heights(atoms: Iterable[Atom]) -> bool:
     """Return whether a relation is along z."""
-    parts = (part for each in atoms for part in iter_expressions(each.expression))
+    parts = (part for atom in atoms for part in iter_expressions(atom.expression))
     return any(isinstance(part, Projection) and part.axis == "z" for part in parts)
 
 
-def _shifted(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
+def _shift(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
     """Return a measurement of enlarged terms by that of the terms, where that is exact."""
-    one = Fraction(1)
+    unit = Fraction(1)
     match measurement:
         case Projection() if measurement.axis != "z":
             radius = radius_of(measurement.term)
             bare = Projection(without_radius(measurement.term), measurement.axis, measurement.side)
-            return Linear(((bare, one),), radius if measurement.side == "max" else -radius)
+            return Linear(((bare, unit),), radius if measurement.side == "max" else -radius)
         case SignedDistance() if is_flat(measurement.first, regions) or is_flat(measurement.second, regions):
             terms = measurement.first, measurement.second
             bare_pair = SignedDistance(*sorted(map(without_radius, terms), key=repr))
-            return Linear(((bare_pair, one),), -sum(map(radius_of, terms), Fraction(0)))
+            return Linear(((bare_pair, unit),), -sum(map(radius_of, terms), Fraction(0)))
         case Protrusion() if is_flat(measurement.inner, regions) or is_flat(measurement.outer, regions):
             bare_in = Protrusion(without_radius(measurement.inner), without_radius(measurement.outer))
-            return Linear(((bare_in, one),), radius_of(measurement.inner) - radius_of(measurement.outer))
-    return Linear(((measurement, one),))
+            return Linear(((bare_in, unit),), radius_of(measurement.inner) - radius_of(measurement.outer))
+    return Linear(((measurement, unit),))
 
 
 # -------------------------------------------------------------------------------------------- terms
@@ -257,13 +259,13 @@ def members(term: Term) -> tuple[Term, ...]:
     """Return the terms whose union a term is: the members of a named group, otherwise itself."""
     term = plain(term)
     if isinstance(term, Enlarged):
-        return tuple(Enlarged(each, term.radius) for each in members(term.term))
+        return tuple(Enlarged(member, term.radius) for member in members(term.term))
     if isinstance(term, Centre):
-        return tuple(Centre(standing(each)) for each in members(term.term))
+        return tuple(Centre(standing(member)) for member in members(term.term))
     group = term.term if isinstance(term, Earlier) else term
     if not isinstance(group, Group) or group.members is None:
         return (term,)
-    if any(isinstance(each, Variable) for each in group.excluded):
+    if any(isinstance(name, Variable) for name in group.excluded):
         return (term,)
     names = [TrackedName(name) for name in named_members(group)]
     if not names:
@@ -307,8 +309,13 @@ def is_solid(term: Term) -> bool:
 
 def terms_in(quantities: Iterable[Quantity]) -> list[Term]:
     """Return the terms that quantities measure, each once, without enlargements."""
-    found = (term for each in quantities if not isinstance(each, Signal) for term in measured_terms(each))
-    return list(dict.fromkeys(without_radius(term) for term in found))
+    terms = (
+        term
+        for quantity in quantities
+        if not isinstance(quantity, Signal)
+        for term in measured_terms(quantity)
+    )
+    return list(dict.fromkeys(without_radius(term) for term in terms))
 
 
 # ------------------------------------------------------------------------------------------------- conditions
@@ -371,23 +378,25 @@ class FactDiagrams:
         self._opaque_nodes: dict[int, int] = {}
         # quantities that are compared with "==": modes and counts as a rule
         self._compared: set[Weights] = set()
-        atoms = [each for one in formulas for each in iter_formulas(one) if isinstance(each, Atom)]
-        for each in atoms:
-            self._tree_of(each.expression)
-        is_upright = is_about_heights(atoms) or any(each.height is not None for each in regions.values())
-        self.diameters = {} if is_upright else {name: _diameter(each) for name, each in regions.items()}
+        atoms = [part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom)]
+        for atom in atoms:
+            self._tree_of(atom.expression)
+        is_upright = is_about_heights(atoms) or any(
+            outline.height is not None for outline in regions.values()
+        )
+        self.diameters = {} if is_upright else {name: _diameter(outline) for name, outline in regions.items()}
         self.between = _between(atoms, regions)
-        # what is measured comes first: a run that only it decides can be placed
-        for each in atoms:
-            self.of(each)
+        # atoms get the first numbers: a run that they alone decide can be placed
+        for atom in atoms:
+            self.of(atom)
 
     def of(self, formula: Formula) -> int:
         """Return the diagram of a formula about one sample."""
-        known = self._known.get(id(formula))
-        if known is None:
+        entry = self._known.get(id(formula))
+        if entry is None:
             # the formula is kept, so that its id stays its own
-            known = self._known[id(formula)] = formula, self._diagram(expand(formula))
-        return known[1]
+            entry = self._known[id(formula)] = formula, self._diagram(expand(formula))
+        return entry[1]
 
     def _diagram(self, formula: Formula) -> int:
         diagrams = self.diagrams
@@ -405,8 +414,8 @@ class FactDiagrams:
             case Boolean():
                 result = self.of(formula.operands[0])
                 join = diagrams.both if formula.operator == "and" else diagrams.either
-                for each in formula.operands[1:]:
-                    result = join(result, self.of(each))
+                for operand in formula.operands[1:]:
+                    result = join(result, self.of(operand))
                 return result
             case _:
                 return self._opaque(formula)
@@ -415,21 +424,21 @@ class FactDiagrams:
         if expression not in self._trees:
             tree = self._trees[expression] = tree_of(expression, self.regions)
             if tree is not None:
-                self._compared |= set(_equated(tree))
+                self._compared |= set(_equal_sums(tree))
         return self._trees[expression]
 
     def _condition(self, tree: Tree, atom: Atom) -> int:
         """Return where a number is at least 0."""
         if isinstance(tree, LeastOrGreatest):
-            parts = [self._condition(each, atom) for each in tree.options]
+            parts = [self._condition(option, atom) for option in tree.options]
             join = self.diagrams.both if tree.kind == "min" else self.diagrams.either
             result = parts[0]
-            for each in parts[1:]:
-                result = join(result, each)
+            for part in parts[1:]:
+                result = join(result, part)
             return result
         if not tree.weights:
             return YES if tree.constant >= 0 else NO
-        weights, threshold, is_least = _compared(tree)
+        weights, threshold, is_least = _with_threshold(tree)
         is_whole = isinstance(self._trees[atom.expression], Linear)
         texts = _texts(atom, is_whole, is_least, weights, threshold)
         if weights in self._compared:
@@ -444,9 +453,9 @@ class FactDiagrams:
         texts = dict.fromkeys((*self._written.get(number, ()), *self.facts[number].texts))
         for strict in texts:
             for sign in (" > ", " < "):
-                other = strict.replace(sign, f"{sign.rstrip()}= ")
-                if other != strict and other in texts and strict in self._written[number]:
-                    yield strict, other
+                lenient = strict.replace(sign, f"{sign.rstrip()}= ")
+                if lenient != strict and lenient in texts and strict in self._written[number]:
+                    yield strict, lenient
 
     def _opaque(self, formula: Formula) -> int:
         shape = self._shapes.of(formula)
@@ -470,13 +479,13 @@ class FactDiagrams:
             self.facts.append(fact)
         number = self._numbers[key]
         self._written.setdefault(number, {})[written] = None
-        known = self.facts[number]
-        # another relation may say without "not" what this one says with it
+        existing = self.facts[number]
+        # of several relations that say the same, the fact has the text without "not"
         first, second = (
             new if is_negated(old) and not is_negated(new) else old
-            for old, new in zip(known.texts, fact.texts, strict=True)
+            for old, new in zip(existing.texts, fact.texts, strict=True)
         )
-        self.facts[number] = known._replace(texts=(first, second))
+        self.facts[number] = existing._replace(texts=(first, second))
         return self.diagrams.variable(number)
 
 
@@ -485,22 +494,26 @@ def is_negated(text: str) -> bool:
     return text.startswith(("not (", "not a part of "))
 
 
-def _compared(linear: Linear) -> tuple[Weights, Fraction, bool]:
+def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
     """Return a sum that is at least 0 as a sum, its threshold, and whether that is the least value."""
     factor = linear.weights[0][1]
     weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)
     return weights, -linear.constant / factor, factor > 0
 
 
-def _equated(tree: Tree) -> Iterable[Weights]:
+def _equal_sums(tree: Tree) -> Iterable[Weights]:
     """Yield the sums that have to be equal to a threshold."""
     if isinstance(tree, Linear):
         return
-    sums = [_compared(each) for each in tree.options if isinstance(each, Linear) and each.weights]
+    sums = [
+        _with_threshold(option) for option in tree.options if isinstance(option, Linear) and option.weights
+    ]
     if tree.kind == "min":
-        yield from (one[0] for one in sums if one[2] and (*one[:2], False) in sums)
+        yield from (
+            comparison[0] for comparison in sums if comparison[2] and (*comparison[:2], False) in sums
+        )
     for option in tree.options:
-        yield from _equated(option)
+        yield from _equal_sums(option)
 
 
 def _texts(
@@ -544,9 +557,9 @@ def _relation_text(weights: Weights) -> tuple[str, bool] | None:
     match weights:
         case ((Protrusion() as quantity, _),):
             return f"{format_term(quantity.inner)} enclosedin {format_term(quantity.outer)}", False
-        case ((Projection() as one, _), (Projection() as other, weight)) if weight == -1:
-            ends = {one.side: one, other.side: other}
-            if one.axis == other.axis and len(ends) == 2:
+        case ((Projection() as left, _), (Projection() as right, weight)) if weight == -1:
+            ends = {left.side: left, right.side: right}
+            if left.axis == right.axis and len(ends) == 2:
                 first, second = format_term(ends["max"].term), format_term(ends["min"].term)
-                return f"{first} prec[{one.axis}] {second}", one.side == "min"
+                return f"{first} prec[{left.axis}] {second}", left.side == "min"
     return None

@@ -23,7 +23,7 @@ from spatial_replay.sanity.shortest_words import (
     WordSearch,
     automaton_of,
     joint,
-    loosened,
+    loosen,
     reading_of,
 )
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
@@ -124,7 +124,7 @@ class Examination(Printed):
             yield from str(finding.diagnostic).split("\n")
         if self.findings:
             yield ""
-        ends = {(each.specs[0], _ENDS[each.kind]) for each in self.findings if each.kind in _ENDS}
+        ends = {(finding.specs[0], _ENDS[finding.kind]) for finding in self.findings if finding.kind in _ENDS}
         for spec in self.specs:
             yield spec.name
             yield from (f"  {line}" for line in _remarks(spec))
@@ -148,7 +148,7 @@ class Examination(Printed):
     def document(self) -> dict[str, Any]:
         """The findings and examples as values for JSON."""
         return {
-            "findings": [_finding(each) for each in self.findings],
+            "findings": [_finding(finding) for finding in self.findings],
             "specifications": [
                 {
                     **json_fields(spec, "name", "reason", "undecided"),
@@ -228,7 +228,7 @@ def refuse_unsatisfiable(specification: Specification, name: str) -> None:
     _refuse(specification, [name], [True])
 
 
-def refuse_decided(specification: Specification) -> None:
+def refuse_constant_results(specification: Specification) -> None:
     """Refuse results that no run violates with a margin, or none satisfies: no run says anything about them.
 
     Raises:
@@ -241,17 +241,17 @@ def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[b
     """Refuse those specs of some names that no run satisfies (True), or violates (False)."""
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
-    found = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in ends]
-    errors = [replace(each.diagnostic, severity="error") for each in found if each is not None]
+    findings = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in ends]
+    errors = [replace(finding.diagnostic, severity="error") for finding in findings if finding is not None]
     if errors:
         raise SpecificationError(errors)
 
 
 def _subject(formula: Formula) -> frozenset[str]:
     """Return the objects, regions and signals that a formula is about."""
-    atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
-    signals = {str(each.parameters[0]) for each in atoms if each.relation == "signal"}
-    named = {each.name for each in iter_formulas(formula) if each.name is not None}
+    atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
+    signals = {str(atom.parameters[0]) for atom in atoms if atom.relation == "signal"}
+    named = {part.name for part in iter_formulas(formula) if part.name is not None}
     return (other_names(formula) - named) | signals
 
 
@@ -259,7 +259,7 @@ def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[NamedSpec]:
     """Yield the named conjuncts of a spec; the spec itself, if it has others."""
     formula, names = spec.formula, list[str]()
     if isinstance(formula, Boolean) and formula.operator in ("and", "spec"):
-        names = [each.name or "" for each in formula.operands]
+        names = [operand.name or "" for operand in formula.operands]
     if names and all(name in specs for name in names):
         for name in names:
             yield from _parts(specs[name], specs)
@@ -293,8 +293,10 @@ class _Examiner:
             if part.name not in {spec.name for spec in results}:
                 self._examine(part)
         self._pairs(tuple(parts.values()), results)
-        described = tuple(self._described(spec, examples) for spec in results)
-        places = sorted(self._findings, key=lambda each: (each.diagnostic.line, each.diagnostic.column))
+        described = tuple(self._describe(spec, examples) for spec in results)
+        places = sorted(
+            self._findings, key=lambda finding: (finding.diagnostic.line, finding.diagnostic.column)
+        )
         return Examination(tuple(places), described, tuple(self._notes))
 
     def why_empty(self, part: NamedSpec, satisfied: bool) -> Finding | None:
@@ -316,11 +318,11 @@ class _Examiner:
             reading = self._reading(part)
             runs = reading.satisfying if satisfied else reading.violating
             what = "whether a run satisfies it" if satisfied else "whether a run violates it"
-            given = [] if runs is None else [runs]
-            self._answers[key] = self._asked(part.name, what, *given, whole=(part, satisfied))
+            known_runs = [] if runs is None else [runs]
+            self._answers[key] = self._ask(part.name, what, *known_runs, whole=(part, satisfied))
         return self._answers[key]
 
-    def _asked(
+    def _ask(
         self, name: str, what: str, *runs: Runs, whole: tuple[NamedSpec, bool] | None = None
     ) -> Answer | None:
         try:
@@ -369,7 +371,7 @@ class _Examiner:
             if (ever := self._sometime(part, node.operands[0])) is None:
                 continue
             text = shortened_formula(format_formula(node.operands[0]))
-            alone = self._asked(part.name, f"whether `{text}` ever holds", ever)
+            alone = self._ask(part.name, f"whether `{text}` ever holds", ever)
             if alone is not None and alone.word is None:
                 self._add_idle(part, node, alone, "")
             elif alone is not None and satisfying is not None:
@@ -383,20 +385,20 @@ class _Examiner:
         for node, ever in possible.items():
             text = shortened_formula(format_formula(node.operands[0]))
             what = f"whether `{text}` holds in a run that satisfies it"
-            within = self._asked(part.name, what, satisfying, ever)
+            within = self._ask(part.name, what, satisfying, ever)
             if within is not None and within.word is None:
                 self._add_idle(part, node, within, f" in a run that satisfies {part.name}")
 
-    def _add_idle(self, part: NamedSpec, node: Boolean, found: Answer, where: str) -> None:
+    def _add_idle(self, part: NamedSpec, node: Boolean, answer: Answer, where: str) -> None:
         text = shortened_formula(format_formula(node.operands[0]))
         message = f"`{text}` never holds{where}, so this implication checks nothing"
-        self._add("idle antecedent", (part.name,), node.span, found, message, _IDLE)
+        self._add("idle antecedent", (part.name,), node.span, answer, message, _IDLE)
 
     def _sometime(self, part: NamedSpec, formula: Formula) -> Runs | None:
         """Return the runs in which a part of a spec holds in some sample; None without an automaton."""
-        wanted = loosened(Temporal("F", (formula,)))
+        eventually = loosen(Temporal("F", (formula,)))
         try:
-            return ((Side(automaton_of(self._specification, part.name, wanted)),),)
+            return ((Side(automaton_of(self._specification, part.name, eventually)),),)
         except NoAutomatonError:
             return None
 
@@ -405,54 +407,58 @@ class _Examiner:
         sound = [part for part in parts if not (self._is_empty(part, True) or self._is_empty(part, False))]
         subjects = {part.name: _subject(part.formula) for part in sound}
         pairs = [
-            (one, other) for one, other in combinations(sound, 2) if subjects[one.name] & subjects[other.name]
+            (first, second)
+            for first, second in combinations(sound, 2)
+            if subjects[first.name] & subjects[second.name]
         ]
         if len(pairs) > MAX_PAIRS:
             self._notes.append(f"of {len(pairs)} pairs of specs, {MAX_PAIRS} were compared")
-        for one, other in pairs[:MAX_PAIRS]:
-            satisfying = [self._reading(each).satisfying for each in (one, other)]
-            violating = [self._reading(each).violating for each in (one, other)]
-            both = self._compared(one, "contradicts", other, *satisfying)
+        for first, second in pairs[:MAX_PAIRS]:
+            satisfying = [self._reading(part).satisfying for part in (first, second)]
+            violating = [self._reading(part).violating for part in (first, second)]
+            both = self._compare(first, "contradicts", second, *satisfying)
             if both is not None and both.word is None:
-                message = f"no run satisfies both {one.name} and {other.name}"
-                self._add("contradiction", (one.name, other.name), other.span, both, message, _CONTRADICTION)
+                message = f"no run satisfies both {first.name} and {second.name}"
+                self._add(
+                    "contradiction", (first.name, second.name), second.span, both, message, _CONTRADICTION
+                )
                 continue
-            after = self._compared(one, "implies", other, satisfying[0], violating[1])
-            before = self._compared(other, "implies", one, satisfying[1], violating[0])
+            after = self._compare(first, "implies", second, satisfying[0], violating[1])
+            before = self._compare(second, "implies", first, satisfying[1], violating[0])
             follows = after is not None and after.word is None
             leads = before is not None and before.word is None
             if follows and leads:
-                message = f"{other.name} says the same as {one.name}"
-                found = joint([each for each in (after, before) if each is not None])
-                self._add("implied", (other.name, one.name), other.span, found, message, _SAME)
+                message = f"{second.name} says the same as {first.name}"
+                both_ways = joint([answer for answer in (after, before) if answer is not None])
+                self._add("implied", (second.name, first.name), second.span, both_ways, message, _SAME)
             elif follows:
-                message = f"{other.name} follows from {one.name}"
-                self._add("implied", (other.name, one.name), other.span, after, message, _IMPLIED)
+                message = f"{second.name} follows from {first.name}"
+                self._add("implied", (second.name, first.name), second.span, after, message, _IMPLIED)
             elif leads:
-                message = f"{one.name} follows from {other.name}"
-                self._add("implied", (one.name, other.name), one.span, before, message, _IMPLIED)
+                message = f"{first.name} follows from {second.name}"
+                self._add("implied", (first.name, second.name), first.span, before, message, _IMPLIED)
 
-    def _compared(self, one: NamedSpec, verb: str, other: NamedSpec, *runs: Runs | None) -> Answer | None:
-        given = [each for each in runs if each is not None]
-        if len(given) < len(runs):
+    def _compare(self, first: NamedSpec, verb: str, second: NamedSpec, *runs: Runs | None) -> Answer | None:
+        known_runs = [options for options in runs if options is not None]
+        if len(known_runs) < len(runs):
             return None
-        return self._asked(one.name, f"whether it {verb} {other.name}", *given)
+        return self._ask(first.name, f"whether it {verb} {second.name}", *known_runs)
 
     def _add(
-        self, kind: Kind, specs: tuple[str, ...], span: Span, found: Answer | None, message: str, hint: str
+        self, kind: Kind, specs: tuple[str, ...], span: Span, answer: Answer | None, message: str, hint: str
     ) -> None:
-        if found is None:
+        if answer is None:
             return
-        reason = _reason(found)
+        reason = _reason(answer)
         loose = [name for name in specs if name in self._readings and self._readings[name].reason]
         if loose:
             reason += ", however its bounds and past operators are read"
         diagnostic = self._source.diagnostic("warning", span, f"{message}: {reason}", hint)
-        self._findings.append(Finding(kind, specs, reason, found.exclusions, diagnostic))
+        self._findings.append(Finding(kind, specs, reason, answer.exclusions, diagnostic))
 
     def _example(self, spec: NamedSpec, satisfied: bool, word: Word) -> Example | None:
         reading = self._reading(spec)
-        wanted = reading.satisfying if satisfied else reading.violating
+        runs = reading.satisfying if satisfied else reading.violating
         return shortest_example(
             self._specification,
             spec,
@@ -460,10 +466,10 @@ class _Examiner:
             word,
             satisfied,
             is_exact=not reading.reason,
-            another=lambda avoided: self._search.another(len(word), avoided, *([wanted] if wanted else [])),
+            another=lambda avoided: self._search.another(len(word), avoided, *([runs] if runs else [])),
         )
 
-    def _described(self, spec: NamedSpec, examples: bool) -> SpecExamination:
+    def _describe(self, spec: NamedSpec, examples: bool) -> SpecExamination:
         runs: list[Example | None] = []
         for satisfied in (True, False):
             answer = self._answer(spec, satisfied)
@@ -471,7 +477,7 @@ class _Examiner:
             runs.append(self._example(spec, satisfied, word) if word is not None and examples else None)
         undecided = tuple(self._undecided.get(spec.name, ()))
         return SpecExamination(
-            spec.name, self._reading(spec).reason, undecided, tuple(_unrelated(spec.formula)), *runs
+            spec.name, self._reading(spec).reason, undecided, tuple(_unrelated_texts(spec.formula)), *runs
         )
 
 
@@ -483,16 +489,18 @@ _IMPLIED: Final = "it adds nothing; leave it out, or make it stricter"
 _SAME: Final = "leave one of them out"
 
 
-def _reason(found: Answer) -> str:
+def _reason(answer: Answer) -> str:
     """Return why there is no such run."""
-    if found.by_logic or not found.exclusions:
+    if answer.by_logic or not answer.exclusions:
         opposites = "".join(
-            f"; `{one}` and `{other}` are opposites" for one, other in found.opposites[:_SHOWN]
+            f"; `{text}` and `{opposite}` are opposites" for text, opposite in answer.opposites[:_SHOWN]
         )
-        equals = "".join(f"; `{one}` has the robustness of `{other}`" for one, other in found.equals[:_SHOWN])
+        equals = "".join(
+            f"; `{text}` has the robustness of `{equal}`" for text, equal in answer.equals[:_SHOWN]
+        )
         return f"by logic alone, whatever is measured{opposites}{equals}"
-    texts = [_exclusion_text(each) for each in found.exclusions[:_SHOWN]]
-    more = len(found.exclusions) - len(texts)
+    texts = [_exclusion_text(exclusion) for exclusion in answer.exclusions[:_SHOWN]]
+    more = len(answer.exclusions) - len(texts)
     return "; ".join(texts) + (f"; and {more} more" if more else "")
 
 
@@ -503,14 +511,14 @@ def _exclusion_text(texts: Sequence[str]) -> str:
     return f"{', '.join(most)} and {last} exclude each other"
 
 
-def _unrelated(formula: Formula) -> Iterator[str]:
+def _unrelated_texts(formula: Formula) -> Iterator[str]:
     """Yield what geometry says nothing about: open quantifiers, and relations to earlier samples."""
     texts: dict[str, None] = {}
-    for each in iter_formulas(formula):
-        if isinstance(each, Quantified):
-            texts[format_formula(each)] = None
-        elif isinstance(each, Atom) and is_spatial(each):
-            terms = [member for term in terms_of(each.expression) for member in members(term)]
+    for part in iter_formulas(formula):
+        if isinstance(part, Quantified):
+            texts[format_formula(part)] = None
+        elif isinstance(part, Atom) and is_spatial(part):
+            terms = [member for term in terms_of(part.expression) for member in members(term)]
             if any(looks_back(term) or not is_solid(term) for term in terms):
-                texts[each.text] = None
+                texts[part.text] = None
     yield from texts

@@ -183,7 +183,7 @@ def placements(
         CannotPlaceError: a fact is about something that is not placed.
     """
     unit = _unit(setting, facts)
-    turns = [_turns(setting, each) for each in facts]
+    turns = [_turns(setting, sample_facts) for sample_facts in facts]
     places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
     for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
         attempt = _Attempt(setting, unit, margin * unit, spread)
@@ -191,16 +191,19 @@ def placements(
         choices: list[Ways] = []
         for label, (index, place) in enumerate(places):
             fact, value = facts[index][place]
-            ways = [[each._replace(label=label) for each in way] for way in attempt.ways(fact, value, index)]
+            ways = [
+                [inequality._replace(label=label) for inequality in way]
+                for way in attempt.ways(fact, value, index)
+            ]
             if len(ways) == 1:
                 required += ways[0]
             elif ways:
                 choices.append(ways)
-        found = attempt.solve(required, choices, len(facts))
-        if not isinstance(found, frozenset):
-            yield tuple(attempt.sample(found, at, turn, period_ns) for at, turn in enumerate(turns)), None
+        solution = attempt.solve(required, choices, len(facts))
+        if not isinstance(solution, frozenset):
+            yield tuple(attempt.sample(solution, at, turn, period_ns) for at, turn in enumerate(turns)), None
         else:
-            yield None, frozenset(places[label] for label in found) if attempt.is_finished else None
+            yield None, frozenset(places[label] for label in solution) if attempt.is_finished else None
 
 
 def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
@@ -254,7 +257,7 @@ class _Attempt:
         if isinstance(quantities[0], Misalignment):
             # turned before anything is placed
             return []
-        if all(isinstance(each, (Projection, CentroidProjection, Signal)) for each in quantities):
+        if all(isinstance(quantity, (Projection, CentroidProjection, Signal)) for quantity in quantities):
             total = _Amount({})
             for quantity, weight in fact.weights:
                 total = total.plus(self._amount(quantity, index), float(weight))
@@ -262,12 +265,12 @@ class _Attempt:
         if len(quantities) == 1:
             return self._relation(quantities[0], rises, bound, index)
         if len(quantities) == 2 and fact.weights[1][1] == -1:
-            # one is beyond some middle value, the other is not
+            # to bound a difference, both distances are bounded by a common middle value
             return [
-                [*one, *other]
+                [*first_way, *second_way]
                 for middle in (0.0, self._unit, 3.0 * self._unit)
-                for one in self._relation(quantities[0], rises, middle + bound, index)
-                for other in self._relation(quantities[1], not rises, middle, index)
+                for first_way in self._relation(quantities[0], rises, middle + bound, index)
+                for second_way in self._relation(quantities[1], not rises, middle, index)
             ]
         raise CannotPlaceError(f"`{fact.texts[0]}` compares several distances")
 
@@ -300,10 +303,10 @@ class _Attempt:
         for way in sorted(ways, key=lambda way: _missing(way, values)):
             if self._left <= 0:
                 break
-            found = self.solve([*required, *way], choices, samples)
-            if not isinstance(found, frozenset) or label not in found:
-                return found
-            conflicts |= found
+            outcome = self.solve([*required, *way], choices, samples)
+            if not isinstance(outcome, frozenset) or label not in outcome:
+                return outcome
+            conflicts |= outcome
         return conflicts
 
     def sample(
@@ -315,14 +318,14 @@ class _Attempt:
             limits = []
             for axis in self._setting.axes:
                 low = values["at", name, axis, index]
-                limits.append((_rounded(low), _rounded(low + values["size", name, axis])))
+                limits.append((_round(low), _round(low + values["size", name, axis])))
             (xmin, xmax), (ymin, ymax), *height = limits
             objects[name] = TrackedObject(
                 Footprint.box(xmin, ymin, xmax, ymax),
                 yaw=turns.get(name),
                 height=height[0] if height else None,
             )
-        signals = {name: _rounded(values["signal", name, index]) for name in self._setting.signals}
+        signals = {name: _round(values["signal", name, index]) for name in self._setting.signals}
         return Sample(index * period_ns, objects, signals)
 
     def _start(self, samples: int) -> dict[Any, float]:
@@ -344,17 +347,17 @@ class _Attempt:
     def _relation(self, quantity: Quantity, rises: bool, bound: float, index: int) -> Ways:
         """Return what makes a distance or a protrusion at least, or at most, a bound."""
         if isinstance(quantity, SignedDistance):
-            one, other = plain(quantity.first), plain(quantity.second)
-            bound += float(radius_of(one) + radius_of(other))
+            first, second = plain(quantity.first), plain(quantity.second)
+            bound += float(radius_of(first) + radius_of(second))
         elif isinstance(quantity, Protrusion):
-            one, other = plain(quantity.inner), plain(quantity.outer)
-            bound += float(radius_of(other) - radius_of(one))
+            first, second = plain(quantity.inner), plain(quantity.outer)
+            bound += float(radius_of(second) - radius_of(first))
         else:
             raise CannotPlaceError("it compares quantities of several kinds")
         # a region is taken for a box that makes it harder: around it to be away, inside it to be near
         outers = (rises, rises) if isinstance(quantity, SignedDistance) else (not rises, rises)
-        a = self._sides(one, index, outer=outers[0])
-        b = self._sides(other, index, outer=outers[1])
+        a = self._sides(first, index, outer=outers[0])
+        b = self._sides(second, index, outer=outers[1])
         gaps: list[_Amount] = []
         for (a_low, a_high), (b_low, b_high) in zip(a, b, strict=False):
             if isinstance(quantity, SignedDistance):
@@ -424,7 +427,9 @@ def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, fl
     if len(setting.turned) > MAX_TURNED:
         raise CannotPlaceError(f"more than {MAX_TURNED} objects have orientations")
     for quarters in product(range(4), repeat=len(setting.turned)):
-        turns = {name: math.pi / 2.0 * each for name, each in zip(setting.turned, quarters, strict=True)}
+        turns = {
+            name: math.pi / 2.0 * quarter for name, quarter in zip(setting.turned, quarters, strict=True)
+        }
         if all(_is_turned(fact, value, turns) for fact, value in asked):
             return turns
     raise CannotPlaceError("no turns by quarters fit")
@@ -435,10 +440,13 @@ def _is_turned(fact: Fact, value: bool, turns: Mapping[str, float]) -> bool:
     for quantity, weight in fact.weights:
         if not isinstance(quantity, Misalignment):
             raise CannotPlaceError("it compares quantities of several kinds")
-        (one, first), (other, second) = _object(quantity.first, 0), _object(quantity.second, 0)
-        if first or second:
+        (first_name, first_index), (second_name, second_index) = (
+            _object(quantity.first, 0),
+            _object(quantity.second, 0),
+        )
+        if first_index or second_index:
             raise CannotPlaceError("it compares orientations over time")
-        total += float(weight) * (1.0 - math.cos(turns[one] - turns[other]))
+        total += float(weight) * (1.0 - math.cos(turns[first_name] - turns[second_name]))
     rises = (fact.side != "<=") == value
     return total > float(fact.threshold) if rises else total < float(fact.threshold)
 
@@ -449,11 +457,14 @@ def _all_hold(way: Sequence[Inequality], values: Mapping[Any, float]) -> bool:
 
 def _missing(way: Sequence[Inequality], values: Mapping[Any, float]) -> float:
     """Return by how much values miss the bounds of inequalities."""
-    sums = (sum(weight * values[key] for key, weight in each.coefficients) - each.bound for each in way)
+    sums = (
+        sum(weight * values[key] for key, weight in inequality.coefficients) - inequality.bound
+        for inequality in way
+    )
     return float(max(0.0, *sums)) if len(way) > 1 else float(max(0.0, next(sums)))
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}")
 
 
@@ -495,7 +506,7 @@ class Example:
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The lines of that file."""
-        return [_row(each) for each in self.samples or ()]
+        return [_row(sample) for sample in self.samples or ()]
 
 
 def shortest_example(
@@ -521,15 +532,16 @@ def shortest_example(
         facts = [[(search.fact(number), value) for number, value in sorted(cube.items())] for cube in word]
         sentences = tuple(
             # two facts of one quantity may read the same
-            " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in each)) or "any sample"
-            for each in facts
+            " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in sample_facts))
+            or "any sample"
+            for sample_facts in facts
         )
         try:
-            found, note, core = _placed(specification, spec, facts, verdict, is_exact=is_exact)
+            placement, note, core = _place(specification, spec, facts, verdict, is_exact=is_exact)
         except CannotPlaceError as reason:
-            found, note, core = None, str(reason), None
-        if found is not None:
-            return Example(verdict, sentences, *found)
+            placement, note, core = None, str(reason), None
+        if placement is not None:
+            return Example(verdict, sentences, *placement)
         first = first or Example(verdict, sentences, note=note)
         if core is None:
             break
@@ -546,7 +558,7 @@ def shortest_example(
     return first if is_exact else None
 
 
-def _placed(
+def _place(
     specification: Specification,
     spec: NamedSpec,
     facts: Sequence[Sequence[tuple[Fact, bool]]],
@@ -574,42 +586,42 @@ def _placed(
             if samples is None:
                 continue
             try:
-                found, robustness = _evaluated(specification, spec, Trace.from_samples(samples))
+                evaluated_verdict, robustness = _evaluate(specification, spec, Trace.from_samples(samples))
             except SpatialReplayError as error:
                 note = f"it cannot be evaluated: {error}"
                 continue
-            if found == verdict:
+            if evaluated_verdict == verdict:
                 return (samples, robustness), "", None
             note = ""
     return None, note or "no placement of boxes was found", core
 
 
-def _evaluated(specification: Specification, spec: NamedSpec, trace: Trace) -> tuple[str, float]:
+def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tuple[str, float]:
     """Return the verdict and the robustness of a spec; of its parts, where it nests too much for a whole."""
 
-    def evaluated(*formulas: Formula) -> Evaluation:
+    def evaluation_of(*formulas: Formula) -> Evaluation:
         specs = [
-            replace(spec, name=f"{spec.name}_{number}", formula=each, is_result=True)
-            for number, each in enumerate(formulas)
+            replace(spec, name=f"{spec.name}_{number}", formula=formula, is_result=True)
+            for number, formula in enumerate(formulas)
         ]
         return evaluate(replace(specification, specs=tuple(specs)), trace)
 
     try:
-        evaluation = evaluated(spec.formula)
+        evaluation = evaluation_of(spec.formula)
     except SpatialReplayError:
-        evaluation = evaluated(*conjuncts(spec.formula))
-    return str(evaluation.verdict), min(each.robustness for each in evaluation)
+        evaluation = evaluation_of(*conjuncts(spec.formula))
+    return str(evaluation.verdict), min(result.robustness for result in evaluation)
 
 
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:
     """Return what there is to place: what the other specs are about, too, so that they can be evaluated."""
-    own = _atoms(spec)
-    every = [*own, *(atom for each in specification.results for atom in _atoms(each))]
+    own_atoms = _atoms(spec)
+    every = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
     upright = is_about_heights(every)
-    turned = dict.fromkeys(_turned(own))
-    if len({*turned, *_turned(every)}) <= MAX_TURNED:
-        turned.update(dict.fromkeys(_turned(every)))
-    bases = [base_of(term) for atom in own for term in terms_of(atom.expression)]
+    turned = dict.fromkeys(_turned_names(own_atoms))
+    if len({*turned, *_turned_names(every)}) <= MAX_TURNED:
+        turned.update(dict.fromkeys(_turned_names(every)))
+    bases = [base_of(term) for atom in own_atoms for term in terms_of(atom.expression)]
     regions = [base.name for base in bases if isinstance(base, RegionName)]
     named = {name: specification.regions[name] for name in dict.fromkeys(regions)}
     objects, signals = object_names(specification), signal_names(specification)
@@ -617,10 +629,10 @@ def _setting(specification: Specification, spec: NamedSpec) -> Setting:
 
 
 def _atoms(spec: NamedSpec) -> list[Atom]:
-    return [each for each in iter_formulas(spec.formula) if isinstance(each, Atom)]
+    return [part for part in iter_formulas(spec.formula) if isinstance(part, Atom)]
 
 
-def _turned(atoms: Iterable[Atom]) -> list[str]:
+def _turned_names(atoms: Iterable[Atom]) -> list[str]:
     """Return the objects whose orientations are compared."""
     parts = (part for atom in atoms for part in iter_expressions(atom.expression))
     terms = (term for part in parts if isinstance(part, Misalignment) for term in measured_terms(part))

@@ -54,28 +54,34 @@ def laws(
     """
     used = list(dict.fromkeys(quantities))
     present = set(terms_in(used))
-    between = {each: value for each, value in between.items() if present.issuperset(measured_terms(each))}
-    used += [each for each in between if each not in used]
+    between = {
+        measurement: value
+        for measurement, value in between.items()
+        if present.issuperset(measured_terms(measurement))
+    }
+    used += [measurement for measurement in between if measurement not in used]
     terms = [term for term in terms_in(used) if is_solid(term)]
-    found = [*_single(used), *_fixed(between)]
+    inequalities = [*_single(used), *_region_laws(between)]
     extents = _Extents(used, terms, regions)
-    distances = [each for each in used if isinstance(each, SignedDistance)]
-    protrusions = [each for each in used if isinstance(each, Protrusion)]
-    found += _enlarged(distances, protrusions)
+    distances = [quantity for quantity in used if isinstance(quantity, SignedDistance)]
+    protrusions = [quantity for quantity in used if isinstance(quantity, Protrusion)]
+    inequalities += _enlargement(distances, protrusions)
     # in the order of the text, so that equal questions are answered by equal steps
     bare = dict.fromkeys(
-        _distance(without_radius(each.first), without_radius(each.second)) for each in distances
+        _distance(without_radius(distance.first), without_radius(distance.second)) for distance in distances
     )
-    outside = dict.fromkeys(_bare(each) for each in protrusions)
+    outside = dict.fromkeys(_bare(protrusion) for protrusion in protrusions)
     held: set[object] = {*inside, *between}
-    within = dict.fromkeys(each for each in outside if each in held)
-    found += _transitive(outside, within, regions)
-    found += _nested(bare, within, regions)
-    found += _across(bare, outside, diameters)
+    within = dict.fromkeys(protrusion for protrusion in outside if protrusion in held)
+    inequalities += _transitive(outside, within, regions)
+    inequalities += _nesting(bare, within, regions)
+    inequalities += _across(bare, outside, diameters)
     if extents.matter:
-        # those of regions are measured, and rounded: extents, which are exact, add nothing to them
-        found += extents.laws(bare, [each for each in outside if each not in between])
-    return found
+        # protrusions of regions are measured and rounded: exact extents add nothing to them
+        inequalities += extents.laws(
+            bare, [protrusion for protrusion in outside if protrusion not in between]
+        )
+    return inequalities
 
 
 def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequality:
@@ -86,29 +92,29 @@ def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequ
     return Inequality(tuple((key, value) for key, value in total.items() if value), bound)
 
 
-def _distance(one: Term, other: Term) -> SignedDistance:
-    first, second = sorted((one, other), key=repr)
+def _distance(a: Term, b: Term) -> SignedDistance:
+    first, second = sorted((a, b), key=repr)
     return SignedDistance(first, second)
 
 
 def _single(used: Iterable[Quantity]) -> Iterator[Inequality]:
     """Yield the laws of single measurements."""
-    for each in used:
-        match each:
+    for quantity in used:
+        match quantity:
             case Misalignment():
-                yield _law((each, -1))
-                yield _law((each, 1), bound=Fraction(0 if each.first == each.second else 2))
-            case SignedDistance() if each.first == each.second:
-                yield _law((each, 1))
-            case Protrusion() if each.inner == each.outer:
-                yield _law((each, 1))
+                yield _law((quantity, -1))
+                yield _law((quantity, 1), bound=Fraction(0 if quantity.first == quantity.second else 2))
+            case SignedDistance() if quantity.first == quantity.second:
+                yield _law((quantity, 1))
+            case Protrusion() if quantity.inner == quantity.outer:
+                yield _law((quantity, 1))
 
 
-def _fixed(between: Mapping[Measurement, Fraction]) -> Iterator[Inequality]:
+def _region_laws(between: Mapping[Measurement, Fraction]) -> Iterator[Inequality]:
     """Yield how far regions are apart at least, and how far they stick out of one another at most."""
-    for each, value in between.items():
-        sign = -1 if isinstance(each, SignedDistance) else 1
-        yield _law((each, sign), bound=sign * value)
+    for measurement, value in between.items():
+        sign = -1 if isinstance(measurement, SignedDistance) else 1
+        yield _law((measurement, sign), bound=sign * value)
 
 
 def _across(
@@ -118,19 +124,19 @@ def _across(
     for pair, (name, diameter) in product(distances, diameters.items()):
         region = RegionName(name)
         rooms = [Protrusion(pair.first, region), Protrusion(pair.second, region)]
-        if pair.first != pair.second and all(each in outside for each in rooms):
-            law = _law((pair, 1), *((each, -1) for each in rooms), bound=diameter)
+        if pair.first != pair.second and all(protrusion in outside for protrusion in rooms):
+            law = _law((pair, 1), *((protrusion, -1) for protrusion in rooms), bound=diameter)
             yield law._replace(label=LEVEL)
 
 
-def _enlarged(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
+def _enlargement(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
     """Yield by how much enlarging changes a measurement at most: less where heights decide it."""
-    for one, other in _variants(
-        distances, lambda each: _distance(*map(without_radius, (each.first, each.second)))
+    for first, second in _variants(
+        distances, lambda distance: _distance(*map(without_radius, (distance.first, distance.second)))
     ):
-        change = _reach(one) - _reach(other)
-        yield _law((one, 1), (other, -1), bound=max(-change, Fraction(0)))
-        yield _law((other, 1), (one, -1), bound=max(change, Fraction(0)))
+        change = _reach(first) - _reach(second)
+        yield _law((first, 1), (second, -1), bound=max(-change, Fraction(0)))
+        yield _law((second, 1), (first, -1), bound=max(change, Fraction(0)))
     for inner, outer in _variants(protrusions, _bare):
         change = _growth(inner) - _growth(outer)
         yield _law((inner, 1), (outer, -1), bound=max(change, Fraction(0)))
@@ -145,8 +151,8 @@ def _variants(
 ) -> Iterator[tuple[_Measured, _Measured]]:
     """Yield pairs of measurements of the same terms, enlarged by different radii."""
     alike: dict[_Measured, dict[_Measured, None]] = {}
-    for each in measured:
-        alike.setdefault(bare_of(each), {})[each] = None
+    for measurement in measured:
+        alike.setdefault(bare_of(measurement), {})[measurement] = None
     for bare, variants in alike.items():
         yield from combinations({**variants, bare: None}, 2)
 
@@ -168,11 +174,11 @@ def _transitive(
 ) -> Iterator[Inequality]:
     """Yield that a sticks out of c at most as far as a out of b and b out of c together."""
     outers: dict[Term, dict[Term, Protrusion]] = {}
-    for each in protrusions:
-        if is_solid(each.inner) and is_solid(each.outer):
-            outers.setdefault(each.inner, {})[each.outer] = each
-    beyond = {term: _reached(term, outers) for term in outers}
-    waiting = [each for found in outers.values() for each in found.values()]
+    for protrusion in protrusions:
+        if is_solid(protrusion.inner) and is_solid(protrusion.outer):
+            outers.setdefault(protrusion.inner, {})[protrusion.outer] = protrusion
+    beyond = {term: _reachable(term, outers) for term in outers}
+    waiting = [protrusion for by_outer in outers.values() for protrusion in by_outer.values()]
     for first in waiting:
         a, b = first.inner, first.outer
         for c, second in outers.get(b, {}).items():
@@ -195,36 +201,36 @@ def _transitive(
                 waiting.append(whole)
 
 
-def _reached(term: Term, outers: Mapping[Term, Mapping[Term, Protrusion]]) -> frozenset[Term]:
+def _reachable(term: Term, outers: Mapping[Term, Mapping[Term, Protrusion]]) -> frozenset[Term]:
     """Return what a chain of protrusions leads to from a term."""
-    waiting, found = [term], set[Term]()
+    waiting, reached = [term], set[Term]()
     while waiting:
-        more = outers.get(waiting.pop(), {}).keys() - found
-        found |= more
+        more = outers.get(waiting.pop(), {}).keys() - reached
+        reached |= more
         waiting += more
-    return frozenset(found)
+    return frozenset(reached)
 
 
-def _nested(
+def _nesting(
     distances: dict[SignedDistance, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
     """Yield that what is inside overlaps, and is as far from others as its outside or farther."""
     inside: dict[Term, list[Protrusion]] = {}
-    for each in within:
-        if is_solid(each.inner) and is_solid(each.outer):
-            for term in (each.inner, each.outer):
-                inside.setdefault(term, []).append(each)
+    for protrusion in within:
+        if is_solid(protrusion.inner) and is_solid(protrusion.outer):
+            for term in (protrusion.inner, protrusion.outer):
+                inside.setdefault(term, []).append(protrusion)
     waiting = list(distances)
     for pair in waiting:
-        for other, c in ((pair.first, pair.second), (pair.second, pair.first)):
-            for each in inside.get(other, ()):
-                a, b = each.inner, each.outer
-                if c in (a, b) and c != other:
-                    yield _law((pair, 1), (each, -1))
+        for end, c in ((pair.first, pair.second), (pair.second, pair.first)):
+            for protrusion in inside.get(end, ()):
+                a, b = protrusion.inner, protrusion.outer
+                if c in (a, b) and c != end:
+                    yield _law((pair, 1), (protrusion, -1))
                 elif not (is_flat(a, regions) and not is_flat(b, regions)):
                     near, far = _distance(b, c), _distance(a, c)
-                    yield _law((near, 1), (far, -1), (each, -1))
-                    more = [one for one in (near, far) if one not in distances]
+                    yield _law((near, 1), (far, -1), (protrusion, -1))
+                    more = [distance for distance in (near, far) if distance not in distances]
                     distances.update(dict.fromkeys(more))
                     waiting += more
 
@@ -233,11 +239,13 @@ class _Extents:
     """The least and greatest coordinates of terms along the axes."""
 
     def __init__(self, used: Iterable[Quantity], terms: list[Term], regions: Mapping[str, Outline]) -> None:
-        along = [each for each in used if isinstance(each, (Projection, CentroidProjection))]
+        along = [quantity for quantity in used if isinstance(quantity, (Projection, CentroidProjection))]
         self._terms = terms
         self._regions = regions
-        self._upright = {each.term for each in along if each.axis == "z"}
-        self._centroids = dict.fromkeys(each for each in along if isinstance(each, CentroidProjection))
+        self._upright = {quantity.term for quantity in along if quantity.axis == "z"}
+        self._centroids = dict.fromkeys(
+            quantity for quantity in along if isinstance(quantity, CentroidProjection)
+        )
         self.matter = bool(along) or any(isinstance(term, RegionName) for term in terms)
 
     def laws(
@@ -249,12 +257,12 @@ class _Extents:
                 least, most = Projection(term, axis, "min"), Projection(term, axis, "max")
                 yield _law((least, 1), (most, -1))
                 yield from self._of_region(term, axis)
-        for each in self._centroids:
-            yield _law((Projection(each.term, each.axis, "min"), 1), (each, -1))
-            yield _law((each, 1), (Projection(each.term, each.axis, "max"), -1))
-        for one, other in combinations(self._centroids, 2):
-            if (one.term, one.axis) == (other.term, other.axis):
-                low, high = (one, other) if one.side == "min" else (other, one)
+        for centroid in self._centroids:
+            yield _law((Projection(centroid.term, centroid.axis, "min"), 1), (centroid, -1))
+            yield _law((centroid, 1), (Projection(centroid.term, centroid.axis, "max"), -1))
+        for first, second in combinations(self._centroids, 2):
+            if (first.term, first.axis) == (second.term, second.axis):
+                low, high = (first, second) if first.side == "min" else (second, first)
                 yield _law((low, 1), (high, -1))
         for pair in distances:
             if not (is_solid(pair.first) and is_solid(pair.second)) or pair.first == pair.second:

@@ -70,18 +70,18 @@ def solve(
     """
     tableau = _Tableau(0.0 if exact else _TOLERANCE, start or {})
     added, waiting = list(inequalities), list(laws)
-    found = tableau.extended(added, 0)
-    while found is None:
-        kept = [tableau.keeps(each) for each in waiting]
-        if all(kept):
+    conflict = tableau.extend(added, 0)
+    while conflict is None:
+        keeps = [tableau.keeps(law) for law in waiting]
+        if all(keeps):
             return Solution(tableau.values(), None)
-        broken = list(compress(waiting, map(not_, kept)))
-        waiting = list(compress(waiting, kept))
+        broken = list(compress(waiting, map(not_, keeps)))
+        waiting = list(compress(waiting, keeps))
         added += broken
-        found = tableau.extended(broken, len(added) - len(broken))
-    if not found:
+        conflict = tableau.extend(broken, len(added) - len(broken))
+    if not conflict:
         return Solution(None, None)
-    labels = (added[index].label for index in found)
+    labels = (added[index].label for index in conflict)
     return Solution(None, frozenset(label for label in labels if label is not None))
 
 
@@ -109,10 +109,10 @@ class _Tableau:
         self._lower: list[tuple[_Pair, int] | None] = []
         self._upper: list[tuple[_Pair, int] | None] = []
 
-    def extended(self, inequalities: Sequence[Inequality], first: int) -> set[int] | None:
+    def extend(self, inequalities: Sequence[Inequality], first: int) -> set[int] | None:
         """Add bounds, numbered from `first`, and move variables into all; return as `search` does."""
-        for index, each in enumerate(inequalities, first):
-            if not self.add(each, index):
+        for index, inequality in enumerate(inequalities, first):
+            if not self.add(inequality, index):
                 return self.conflict
         return self.search()
 
@@ -153,22 +153,25 @@ class _Tableau:
         for variable, row in self._rows.items():
             self._value[variable] = self._sum(row)
         for _ in range(MAX_PIVOTS):
-            violated = self._violated()
+            violated = self._violation()
             if violated is None:
                 return None
             variable, rises = violated
-            own = self._lower[variable] if rises else self._upper[variable]
-            if own is None:
+            goal = self._lower[variable] if rises else self._upper[variable]
+            if goal is None:
                 return set()
             row = self._rows[variable]
-            entering = next((each for each in sorted(row) if self._can_move(each, row[each], rises)), None)
+            entering = next(
+                (candidate for candidate in sorted(row) if self._can_move(candidate, row[candidate], rises)),
+                None,
+            )
             if entering is None:
                 bounds = [
-                    self._upper[each] if (factor > 0) == rises else self._lower[each]
-                    for each, factor in row.items()
+                    self._upper[candidate] if (factor > 0) == rises else self._lower[candidate]
+                    for candidate, factor in row.items()
                 ]
-                return {own[1], *(bound[1] for bound in bounds if bound is not None)}
-            self._pivot(variable, entering, own[0])
+                return {goal[1], *(bound[1] for bound in bounds if bound is not None)}
+            self._pivot(variable, entering, goal[0])
         return set()
 
     def values(self) -> dict[Hashable, Real]:
@@ -186,7 +189,7 @@ class _Tableau:
             number = self._numbers[normal] = self._new()
             row: dict[int, Real] = {}
             for quantity, factor in terms:
-                # one that is a sum by now is replaced by that
+                # a quantity that a pivot made a sum is replaced by that sum
                 whole: dict[int, Real] = self._rows.get(quantity, {quantity: 1})
                 for variable, weight in whole.items():
                     row[variable] = row.get(variable, 0) + factor * weight
@@ -225,10 +228,10 @@ class _Tableau:
             small += factor * value[1]
         return whole, small
 
-    def _below(self, one: _Pair, other: _Pair) -> bool:
-        return one[0] < other[0] - self._tolerance if self._tolerance else one < other
+    def _below(self, first: _Pair, second: _Pair) -> bool:
+        return first[0] < second[0] - self._tolerance if self._tolerance else first < second
 
-    def _violated(self) -> tuple[int, bool] | None:
+    def _violation(self) -> tuple[int, bool] | None:
         """Return the first sum outside of its bounds, and whether it has to rise (Bland's rule)."""
         for variable in sorted(self._rows):
             value, lower, upper = self._value[variable], self._lower[variable], self._upper[variable]
@@ -251,15 +254,15 @@ class _Tableau:
         factor = row.pop(entering)
         step = tuple(_ratio(to - at, factor) for to, at in zip(goal, self._value[leaving], strict=True))
         self._value[leaving] = goal
-        here = self._value[entering]
-        self._value[entering] = (here[0] + step[0], here[1] + step[1])
+        before = self._value[entering]
+        self._value[entering] = (before[0] + step[0], before[1] + step[1])
         solved = {variable: _ratio(-value, factor) for variable, value in row.items()}
         solved[leaving] = _ratio(1, factor)
-        for other, content in self._rows.items():
+        for dependent, content in self._rows.items():
             weight = content.pop(entering, 0)
             if weight:
-                was = self._value[other]
-                self._value[other] = (was[0] + weight * step[0], was[1] + weight * step[1])
+                was = self._value[dependent]
+                self._value[dependent] = (was[0] + weight * step[0], was[1] + weight * step[1])
                 for variable, value in solved.items():
                     total = content.get(variable, 0) + weight * value
                     if total > self._tolerance or total < -self._tolerance:

@@ -64,7 +64,7 @@ class Side(NamedTuple):
         """Return whether a run may still end as it has to."""
         return state in (self.automaton.can_accept if self.accepts else self.automaton.can_reject)
 
-    def least_left(self, state: int) -> int:
+    def least_remaining(self, state: int) -> int:
         """Return how many samples it takes at least to end as it has to."""
         return self.automaton.distances[state] if self.accepts else int(not self.agrees(state))
 
@@ -95,7 +95,7 @@ def word_of_length(
     runs = _Runs(length, facts, diagrams)
     whole = YES
     for side in sides:
-        whole = runs.diagrams.both(whole, runs.agreed(side, condition_of(side.automaton)))
+        whole = runs.diagrams.both(whole, runs.agreeing_runs(side, condition_of(side.automaton)))
     allowed = whole
     for word in avoided:
         allowed = runs.without(allowed, word)
@@ -125,11 +125,13 @@ def agreements(
     """
     runs = _Runs(len(word), facts, diagrams)
     cube = {
-        runs.variable(fact, index): value for index, each in enumerate(word) for fact, value in each.items()
+        runs.variable(fact, index): value
+        for index, sample_cube in enumerate(word)
+        for fact, value in sample_cube.items()
     }
     never = clause(diagrams, cube)
-    agreed = [runs.agreed(side, condition_of(side.automaton)) for side in sides]
-    return [(diagrams.either(never, each) != never, diagrams.either(never, each) == YES) for each in agreed]
+    nodes = [runs.agreeing_runs(side, condition_of(side.automaton)) for side in sides]
+    return [(diagrams.either(never, node) != never, diagrams.either(never, node) == YES) for node in nodes]
 
 
 class _Runs:
@@ -165,27 +167,29 @@ class _Runs:
             word[index][fact] = value
         return word
 
-    def agreed(self, side: Side, conditions: Sequence[int]) -> int:
+    def agreeing_runs(self, side: Side, conditions: Sequence[int]) -> int:
         """Return the runs that a side agrees with."""
         automaton = side.automaton
-        known: dict[tuple[int, int], int] = {}
+        nodes: dict[tuple[int, int], int] = {}
 
         def after(state: int, index: int) -> int:
             if index == self._length:
                 return YES if side.agrees(state) else NO
             if not side.may_agree(state):
                 return NO
-            return decided(automaton.entries[state], index)
+            return decision_node(automaton.entries[state], index)
 
-        def decided(place: int, index: int) -> int:
+        def decision_node(place: int, index: int) -> int:
             if place < 0:
                 return after(~place, index + 1)
             key = place, index
-            if key not in known:
+            if key not in nodes:
                 proposition, low, high = automaton.decisions[place]
                 condition = self._in_sample(conditions[proposition], index)
-                known[key] = self.diagrams.choose(condition, decided(high, index), decided(low, index))
-            return known[key]
+                nodes[key] = self.diagrams.choose(
+                    condition, decision_node(high, index), decision_node(low, index)
+                )
+            return nodes[key]
 
         return after(automaton.initial, 0)
 
@@ -217,7 +221,7 @@ def first_cube(diagrams: Diagrams, node: int) -> Cube:
 def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
     """Return facts of a cube that make a condition true, without those that do not matter."""
     for fact in sorted(cube, reverse=True):
-        less = {each: value for each, value in cube.items() if each != fact}
+        less = {number: value for number, value in cube.items() if number != fact}
         if _is_certain(diagrams, condition, less):
             cube = less
     return cube
@@ -227,12 +231,12 @@ def _is_certain(diagrams: Diagrams, node: int, cube: Cube) -> bool:
     """Return whether a function is true wherever some facts have their values."""
     waiting, visited = [node], {node}
     while waiting:
-        each = waiting.pop()
-        if each == NO:
+        current = waiting.pop()
+        if current == NO:
             return False
-        if each == YES:
+        if current == YES:
             continue
-        variable, low, high = diagrams[each]
+        variable, low, high = diagrams[current]
         value = cube.get(variable)
         for after in (low, high) if value is None else (high,) if value else (low,):
             if after not in visited:
@@ -335,11 +339,11 @@ class WordSearch:
             word = self._short(options)
             if word is not None and any(word):
                 return Answer(word)
-            answers = [self._refined(sides) for sides in options]
+            answers = [self._refine(sides) for sides in options]
         except (NoAutomatonError, RecursionError) as error:
             raise UndecidedError from error
-        words = [each for each in answers if each.word is not None]
-        return min(words, key=lambda each: len(each.word or ()), default=joint(answers))
+        words = [answer for answer in answers if answer.word is not None]
+        return min(words, key=lambda answer: len(answer.word or ()), default=joint(answers))
 
     def is_found(self, *runs: Runs) -> bool:
         """Return whether a run that belongs to all is found at once; if not, there may be one."""
@@ -372,7 +376,7 @@ class WordSearch:
     def _short(self, options: Sequence[Sequence[Side]]) -> Word | None:
         """Return the shortest run of a few samples; None if none is found."""
         least = [
-            max([1, *(side.least_left(side.automaton.initial) for side in sides)])
+            max([1, *(side.least_remaining(side.automaton.initial) for side in sides)])
             for sides in options
             if all(side.may_agree(side.automaton.initial) for side in sides)
         ]
@@ -387,7 +391,7 @@ class WordSearch:
                     # longer runs take more
                     left.remove(sides)
                     continue
-                # what has to hold says more than that every run of this length will do
+                # a run with requirements says more than that any run of this length will do
                 if word is not None and any(word):
                     return word
                 anything = anything or word
@@ -395,45 +399,47 @@ class WordSearch:
                 return anything
         return None
 
-    def _refined(self, sides: Sequence[Side]) -> Answer:
+    def _refine(self, sides: Sequence[Side]) -> Answer:
         """Return the answer for all sides by that for a few: a run of these shows which one is missing."""
         pairs = combinations(sides, 2) if len(sides) > 2 else ()
         for pair in islice(pairs, MAX_PAIRS):
-            if self._short([pair]) is None and (answer := self._decided(pair)).word is None:
+            if self._short([pair]) is None and (answer := self._decide(pair)).word is None:
                 return answer
-        chosen = list(sides[-1:])
+        subset = list(sides[-1:])
         while True:
-            answer = self._decided(chosen)
-            other = None if answer.word is None else self._disagreeing(sides, answer.word)
-            if other is None:
+            answer = self._decide(subset)
+            missing = None if answer.word is None else self._disagreeing(sides, answer.word)
+            if missing is None:
                 return answer
-            chosen.append(other)
+            subset.append(missing)
 
     def _disagreeing(self, sides: Sequence[Side], word: Word) -> Side | None:
         """Return a side that may disagree with a run, of those that certainly do if there are any."""
         diagrams = Diagrams(MAX_NODES)
-        found = agreements(sides, word, self._diagrams, diagrams, self._conditions_of)
-        partly = [side for side, (_, is_whole) in zip(sides, found, strict=True) if not is_whole]
-        wholly = [side for side, (is_any, _) in zip(sides, found, strict=True) if not is_any]
+        agreement_flags = agreements(sides, word, self._diagrams, diagrams, self._conditions_of)
+        partly = [side for side, (_, is_whole) in zip(sides, agreement_flags, strict=True) if not is_whole]
+        wholly = [side for side, (is_any, _) in zip(sides, agreement_flags, strict=True) if not is_any]
         return next(iter([*wholly, *partly]), None)
 
-    def _decided(self, sides: Sequence[Side]) -> Answer:
+    def _decide(self, sides: Sequence[Side]) -> Answer:
         word = self._search(sides, geometry=True)
         if word is not None:
             return Answer(word)
         if self._search(sides, geometry=False) is not None:
-            return Answer(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
+            return Answer(
+                None, exclusions=tuple(self._texts_of(exclusion) for exclusion in self._about(sides))
+            )
         numbers = sorted(self._read(sides))
         facts = [self.fact(number) for number in numbers]
-        # what is compared by "==" and not has no opposites that need to be named
+        # facts that "==" compares, and negated ones, have no opposites that need to be named
         opposites = [
-            each.texts for each in facts if each.side == ">" and not any(map(is_negated, each.texts))
+            fact.texts for fact in facts if fact.side == ">" and not any(map(is_negated, fact.texts))
         ]
         equals = [pair for number in numbers for pair in self._conditions.equal_texts(number)]
         return Answer(None, True, opposites=tuple(opposites), equals=tuple(equals))
 
     def _conditions_of(self, automaton: Automaton) -> list[int]:
-        return [self._conditions.of(each.formula) for each in automaton.propositions]
+        return [self._conditions.of(proposition.formula) for proposition in automaton.propositions]
 
     def _conflicts(self, cube: Cube) -> list[Cube]:
         """Return the fewest facts of a cube that geometry excludes together, of each part that has some."""
@@ -443,19 +449,19 @@ class WordSearch:
         """Return the shortest run by A*: automata say how many samples it takes at least from here on."""
         before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
         order = count()
-        # what geometry says is asked when a move is taken out, of few of all that are put in
+        # geometry is asked when a move leaves the queue: few of those that enter it do
         waiting: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
 
         def put_in(moves: int, leaves: Sequence[int], length: int, source: tuple[int, ...] | None) -> None:
             for leaf in leaves:
                 after = self._tuples[leaf]
                 if after not in before and all(map(Side.may_agree, sides, after)):
-                    # of equals, those first that need least for the last side: what has to hold once
-                    left = tuple(map(Side.least_left, sides, after))
+                    # among equals, first those nearest to the end of the last side, then the longest
+                    left = tuple(map(Side.least_remaining, sides, after))
                     key = length + max(left), left[::-1], -length
                     heappush(waiting, (key, next(order), moves, leaf, source))
 
-        put_in(*self._joined(sides, tuple(side.automaton.initial for side in sides)), 1, None)
+        put_in(*self._join(sides, tuple(side.automaton.initial for side in sides)), 1, None)
         while waiting:
             (_, _, length), _, moves, leaf, source = heappop(waiting)
             after = self._tuples[leaf]
@@ -468,7 +474,7 @@ class WordSearch:
             before[after] = source, cube
             if all(map(Side.agrees, sides, after)):
                 return tuple(reversed(list(_back(after, before))))
-            put_in(*self._joined(sides, after), 1 - length, after)
+            put_in(*self._join(sides, after), 1 - length, after)
         return None
 
     def _spend(self, steps: int) -> None:
@@ -477,27 +483,29 @@ class WordSearch:
         if self._steps > MAX_STEPS or self._all_steps > MAX_ALL_STEPS:
             raise UndecidedError
 
-    def _joined(self, sides: Sequence[Side], states: Sequence[int]) -> tuple[int, list[int]]:
+    def _join(self, sides: Sequence[Side], states: Sequence[int]) -> tuple[int, list[int]]:
         """Return where one sample leads to, as a diagram over facts, and its leaves: tuples of states."""
-        nodes = [self._composed(side.automaton, state) for side, state in zip(sides, states, strict=True)]
-        known: dict[tuple[int, ...], int] = {}
+        nodes = [self._compose(side.automaton, state) for side, state in zip(sides, states, strict=True)]
+        joined_nodes: dict[tuple[int, ...], int] = {}
 
         def join(key: tuple[int, ...]) -> int:
-            if key not in known:
+            if key not in joined_nodes:
                 decisions = [self._diagrams[node] for node in key]
-                variable = min(each.variable for each in decisions)
+                variable = min(decision.variable for decision in decisions)
                 if variable == LEAF:
-                    known[key] = self._diagrams.leaf(self._number(tuple(each.low for each in decisions)))
+                    joined_nodes[key] = self._diagrams.leaf(
+                        self._number(tuple(decision.low for decision in decisions))
+                    )
                 else:
                     branches = [self._diagrams.branches(node, variable) for node in key]
-                    low, high = (join(each) for each in zip(*branches, strict=True))
-                    known[key] = self._diagrams.decide(variable, low, high)
-            return known[key]
+                    low, high = (join(branch) for branch in zip(*branches, strict=True))
+                    joined_nodes[key] = self._diagrams.decide(variable, low, high)
+            return joined_nodes[key]
 
         whole = join(tuple(nodes))
-        self._spend(len(known))
-        decisions = [self._diagrams[node] for node in known.values()]
-        return whole, list(dict.fromkeys(each.low for each in decisions if each.variable == LEAF))
+        self._spend(len(joined_nodes))
+        decisions = [self._diagrams[node] for node in joined_nodes.values()]
+        return whole, list(dict.fromkeys(decision.low for decision in decisions if decision.variable == LEAF))
 
     def _open_leaves(self, moves: int) -> set[int]:
         """Return the leaves of a diagram to which facts lead that are not excluded together yet."""
@@ -510,7 +518,7 @@ class WordSearch:
                 if allowed != NO and self._diagrams[node].variable == LEAF:
                     leaves.add(self._diagrams[node].low)
                 elif allowed != NO:
-                    branches = [self._diagrams.branches(each, variable) for each in (node, allowed)]
+                    branches = [self._diagrams.branches(diagram, variable) for diagram in (node, allowed)]
                     more = set(zip(*branches, strict=True)) - visited
                     visited |= more
                     waiting += more
@@ -524,7 +532,7 @@ class WordSearch:
             self._tuples.append(states)
         return self._numbers[states]
 
-    def _composed(self, automaton: Automaton, state: int) -> int:
+    def _compose(self, automaton: Automaton, state: int) -> int:
         """Return the moves from a state as a diagram over facts, with states as leaves."""
         self._automata[id(automaton)] = automaton
         conditions = self._conditions_of(automaton)
@@ -542,19 +550,19 @@ class WordSearch:
 
     def _leading(self, node: int, leaf: int) -> int:
         """Return where a diagram leads to a leaf."""
-        known: dict[int, int] = {}
+        nodes: dict[int, int] = {}
 
-        def to(each: int) -> int:
-            if each not in known:
-                variable, low, high = self._diagrams[each]
+        def to(inner: int) -> int:
+            if inner not in nodes:
+                variable, low, high = self._diagrams[inner]
                 if variable == LEAF:
-                    known[each] = YES if low == leaf else NO
+                    nodes[inner] = YES if low == leaf else NO
                 else:
-                    known[each] = self._diagrams.decide(variable, to(low), to(high))
-            return known[each]
+                    nodes[inner] = self._diagrams.decide(variable, to(low), to(high))
+            return nodes[inner]
 
         result = to(node)
-        self._spend(len(known))
+        self._spend(len(nodes))
         return result
 
     def _cube(self, condition: int) -> Cube | None:
@@ -580,7 +588,7 @@ class WordSearch:
             return None
         core = {number: cube[number] for number in sorted(numbers - {LEVEL})}
         for number in tuple(core):
-            less = {each: value for each, value in core.items() if each != number}
+            less = {fact: value for fact, value in core.items() if fact != number}
             if less and self._impossible(less) is not None:
                 core = less
         return core
@@ -589,7 +597,7 @@ class WordSearch:
         """Return facts of a cube that geometry excludes together; None if it allows them all."""
         key = frozenset(cube.items())
         if key not in self._possible:
-            self._possible[key] = self._asked(cube)
+            self._possible[key] = self._ask_geometry(cube)
         return self._possible[key]
 
     def _parts(self, cube: Cube) -> list[Cube]:
@@ -598,11 +606,11 @@ class WordSearch:
         for number, value in cube.items():
             about, part = self._about_of(number), {number: value}
             apart = []
-            for terms, other in parts:
+            for terms, other_cube in parts:
                 if terms.isdisjoint(about):
-                    apart.append((terms, other))
+                    apart.append((terms, other_cube))
                 else:
-                    about, part = terms | about, {**other, **part}
+                    about, part = terms | about, {**other_cube, **part}
             parts = [*apart, (about, part)]
         return [part for _, part in parts]
 
@@ -610,41 +618,43 @@ class WordSearch:
         """Return the terms and signals that a fact is about."""
         if number not in self._terms:
             quantities = [quantity for quantity, _ in self._conditions.facts[number].weights]
-            signals = [each for each in quantities if isinstance(each, Signal)]
+            signals = [quantity for quantity in quantities if isinstance(quantity, Signal)]
             self._terms[number] = frozenset([*signals, *terms_in(quantities)])
         return self._terms[number]
 
-    def _asked(self, cube: Cube) -> frozenset[int] | None:
+    def _ask_geometry(self, cube: Cube) -> frozenset[int] | None:
         facts = self._conditions.facts
-        own = [
+        inequalities = [
             facts[number].inequality(value, number) for number, value in cube.items() if facts[number].weights
         ]
         inside = {
             quantity
-            for each in own
-            if len(each.coefficients) == 1 and each.bound <= 0
-            for quantity, weight in each.coefficients
+            for inequality in inequalities
+            if len(inequality.coefficients) == 1 and inequality.bound <= 0
+            for quantity, weight in inequality.coefficients
             if isinstance(quantity, Protrusion) and weight > 0
         }
         weights = [facts[number].weights for number in cube]
-        quantities = dict.fromkeys(quantity for each in weights for quantity, _ in each)
-        geometry = [each for each in quantities if not isinstance(each, Signal)]
+        quantities = dict.fromkeys(quantity for fact_weights in weights for quantity, _ in fact_weights)
+        geometry = [quantity for quantity in quantities if not isinstance(quantity, Signal)]
         conditions = self._conditions
-        known = laws(geometry, inside, conditions.regions, conditions.between, conditions.diameters)
-        return solve(own, known).conflict
+        geometry_laws = laws(geometry, inside, conditions.regions, conditions.between, conditions.diameters)
+        return solve(inequalities, geometry_laws).conflict
 
     def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
         """Return the exclusions between facts that automata read; without any, those with other facts."""
         facts = self._read(sides)
-        about = [(each, {fact for fact, _ in each}) for each in self._exclusions]
-        own = [each for each, read in about if facts >= read]
-        return own or [each for each, read in about if facts & read]
+        about = [(exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions]
+        within = [exclusion for exclusion, read in about if facts >= read]
+        return within or [exclusion for exclusion, read in about if facts & read]
 
     def _read(self, sides: Sequence[Side]) -> set[int]:
         """Return the facts that automata read."""
         facts: set[int] = set()
         waiting = [
-            self._conditions.of(each.formula) for side in sides for each in side.automaton.propositions
+            self._conditions.of(proposition.formula)
+            for side in sides
+            for proposition in side.automaton.propositions
         ]
         visited = set(waiting)
         while waiting:
@@ -668,15 +678,15 @@ class WordSearch:
 
 def _together(runs: Sequence[Runs]) -> list[tuple[Side, ...]]:
     """Return the options of what belongs to all of some runs."""
-    return [tuple(chain.from_iterable(each)) for each in product(*runs)]
+    return [tuple(chain.from_iterable(combination)) for combination in product(*runs)]
 
 
 def joint(answers: Sequence[Answer]) -> Answer:
     """Return the answers that there is no run, of several questions, as one."""
-    exclusions = dict.fromkeys(exclusion for each in answers for exclusion in each.exclusions)
-    opposites = dict.fromkeys(opposite for each in answers for opposite in each.opposites)
-    equals = dict.fromkeys(equal for each in answers for equal in each.equals)
-    by_logic = all(each.by_logic for each in answers)
+    exclusions = dict.fromkeys(exclusion for answer in answers for exclusion in answer.exclusions)
+    opposites = dict.fromkeys(opposite for answer in answers for opposite in answer.opposites)
+    equals = dict.fromkeys(equal for answer in answers for equal in answer.equals)
+    by_logic = all(answer.by_logic for answer in answers)
     return Answer(None, by_logic, tuple(exclusions), tuple(opposites), tuple(equals))
 
 
@@ -718,15 +728,15 @@ def reading_of(specification: Specification, name: str, formula: Formula) -> Spe
     violating: list[Side | None] = []
     for part in conjuncts(formula):
         try:
-            own = automaton_of(specification, name, part)
+            exact_automaton = automaton_of(specification, name, part)
         except NoAutomatonError as error:
             reasons.append(error.reason)
             looser = _loosely(specification, name, part, positive=True)
             satisfying += [] if looser is None else [looser]
             violating.append(_loosely(specification, name, part, positive=False))
         else:
-            satisfying.append(Side(own))
-            violating.append(Side(own, False))
+            satisfying.append(Side(exact_automaton))
+            violating.append(Side(exact_automaton, False))
 
     options = tuple((side,) for side in violating if side is not None)
     return SpecReading(
@@ -740,11 +750,11 @@ def conjuncts(formula: Formula) -> tuple[Formula, ...]:
     """Return formulas that hold together exactly where a formula does: `G (a and b)` is `(G a) and (G b)`."""
     match formula:
         case Boolean(operator="and" | "spec"):
-            return tuple(part for each in formula.operands for part in conjuncts(each))
+            return tuple(part for operand in formula.operands for part in conjuncts(operand))
         case Temporal(operator="G"):
             parts = conjuncts(formula.operands[0])
             return tuple(
-                # what holds from each sample on holds from each later one on
+                # `G (G a)` is `G a`
                 part
                 if formula.bound is None and isinstance(part, Temporal) and _is_always(part)
                 else replace(formula, operands=(part,))
@@ -768,10 +778,10 @@ def automaton_of(specification: Specification, name: str, formula: Formula) -> A
 
 
 def _loosely(specification: Specification, name: str, formula: Formula, *, positive: bool) -> Side | None:
-    wanted = formula if positive else Boolean("not", (formula,))
+    signed = formula if positive else Boolean("not", (formula,))
     for bounds in ("seconds", "all"):
-        looser = loosened(wanted, bounds)
-        if looser is wanted:
+        looser = loosen(signed, bounds)
+        if looser is signed:
             # it has no automaton as it is
             continue
         try:
@@ -781,28 +791,26 @@ def _loosely(specification: Specification, name: str, formula: Formula, *, posit
     return None
 
 
-def loosened(
-    formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, loose: bool = True
-) -> Formula:
+def loosen(formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, loose: bool = True) -> Formula:
     """Return a formula without past operators and bounds that holds wherever the formula does.
 
     Args:
         bounds: drop those in seconds, or all.
         loose: otherwise, return one that holds at most where the formula does.
     """
-    if not any(_is_obstacle(each, bounds) for each in iter_formulas(formula)):
+    if not any(_is_obstacle(part, bounds) for part in iter_formulas(formula)):
         return formula
     formula = expand(formula)
     match formula:
         case Boolean(operator="not"):
-            return replace(formula, operands=(loosened(formula.operands[0], bounds, loose=not loose),))
+            return replace(formula, operands=(loosen(formula.operands[0], bounds, loose=not loose),))
         case Boolean() | Temporal():
             if formula.operator in PAST_OPERATORS:
                 return Truth(loose)
-            operands = tuple(loosened(each, bounds, loose=loose) for each in formula.operands)
+            operands = tuple(loosen(operand, bounds, loose=loose) for operand in formula.operands)
             if isinstance(formula, Boolean) or not _is_obstacle(formula, bounds):
                 return replace(formula, operands=operands)
-            # every window from here on holds this sample; others may be empty
+            # a window from 0 on has the present sample; any other may be empty
             is_now = formula.bound is not None and formula.bound.lower == 0
             if (formula.operator == "G") == loose:
                 return operands[-1] if is_now else Truth(loose)
