@@ -90,15 +90,17 @@ def _fill(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
     if isinstance(first, tuple):
         if any(len(part) != len(first) for part in parts):
             raise _NeedsParsingError
-        fills = [_fill(each, values) for each in zip(*parts, strict=True)]
+        fills = [_fill(elements, values) for elements in zip(*parts, strict=True)]
         return lambda numbers: tuple(fill(numbers) for fill in fills)
     if not is_dataclass(first) or isinstance(first, type):
         raise _NeedsParsingError
     changing = {}
     for name in (field.name for field in fields(first) if field.init and field.compare):
-        own = [getattr(part, name) for part in parts]
-        if any(each != own[0] for each in own) and not (isinstance(first, Atom) and name == "text"):
-            changing[name] = _fill(own, values)
+        field_values = [getattr(part, name) for part in parts]
+        if any(value != field_values[0] for value in field_values) and not (
+            isinstance(first, Atom) and name == "text"
+        ):
+            changing[name] = _fill(field_values, values)
     if isinstance(first, Bound) and "lower" in changing and first.upper is not None:
         raise _NeedsParsingError
     return lambda numbers: replace(first, **{name: fill(numbers) for name, fill in changing.items()})
@@ -110,7 +112,7 @@ def _number(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
         raise _NeedsParsingError
     for name in values[0]:
         for sign in (1, -1):
-            if all(part == sign * each[name] for part, each in zip(parts, values, strict=True)):
+            if all(part == sign * numbers[name] for part, numbers in zip(parts, values, strict=True)):
                 return lambda numbers, name=name, sign=sign: kind(sign * numbers[name])  # type: ignore[misc]
     raise _NeedsParsingError
 
@@ -144,20 +146,20 @@ class VariedConstant:
         Raises:
             UsageError: an end that is none, or of another kind than the constant; an empty range.
         """
-        ends = [_decimal(name, each, written) for each in (low, high)]
+        ends = [_decimal(name, end, written) for end in (low, high)]
         width = ends[1] - ends[0]
-        shown = f"[{_text(ends[0], written)}, {_text(ends[1], written)}]"
+        range_text = f"[{_text(ends[0], written)}, {_text(ends[1], written)}]"
         if width <= 0:
-            raise UsageError(f"{name}: the range {shown} is empty; give a lower and a greater end")
+            raise UsageError(f"{name}: the range {range_text} is empty; give a lower and a greater end")
         if written.range is not None:
-            # what a text allows is decided there
-            inner = [Decimal(repr(each)) for each in written.range]
+            # a range in the text is the widest that may be tried
+            inner = [Decimal(repr(end)) for end in written.range]
             if written.duration_ns is not None:
-                inner = [each * 10**9 for each in inner]
+                inner = [end * 10**9 for end in inner]
             if not inner[0] <= ends[0] < ends[1] <= inner[1]:
                 allowed = f"[{_text(inner[0], written)}, {_text(inner[1], written)}]"
                 raise UsageError(
-                    f"{name}: {shown} is outside of {allowed}, the range in the text; "
+                    f"{name}: {range_text} is outside of {allowed}, the range in the text; "
                     "choose within it, or widen it there"
                 )
         step = Decimal(1).scaleb((width / _PARTS).adjusted())
@@ -168,7 +170,7 @@ class VariedConstant:
     @property
     def is_whole(self) -> bool:
         """Whether both ends are whole numbers, so that it may count samples."""
-        return self.written.duration_ns is None and all(each % 1 == 0 for each in (self.low, self.high))
+        return self.written.duration_ns is None and all(end % 1 == 0 for end in (self.low, self.high))
 
     @cached_property
     def steps(self) -> int:
@@ -213,7 +215,7 @@ class VariedConstant:
     @property
     def start(self) -> int:
         """The number of the value next to the written one."""
-        return self.nearest(_decimal(self.name, _written(self.written), self.written))
+        return self.nearest(_decimal(self.name, _written_value(self.written), self.written))
 
     def roundest(self, first: int, last: int) -> int:
         """Return the number of a short value near the middle of a range of numbers."""
@@ -240,32 +242,36 @@ def varied_constants(
     Raises:
         UsageError: no such constant, one without a range, an empty range, none at all.
     """
-    known = specification.constants
-    with_range = [name for name, each in known.items() if each.range is not None and not each.is_computed]
-    chosen = ranges or dict.fromkeys(with_range)
-    if not chosen:
-        example = next(iter(known), None)
+    constants = specification.constants
+    with_range = [
+        name
+        for name, constant in constants.items()
+        if constant.range is not None and not constant.is_computed
+    ]
+    ends_by_name = ranges or dict.fromkeys(with_range)
+    if not ends_by_name:
+        example = next(iter(constants), None)
         raise UsageError(
             f"{specification.filename} has no constant to tune; "
             "name a number in it: const NAME = VALUE in [LOW, HIGH]"
             if example is None
             else f"no constant of {specification.filename} has a range to tune it in; "
             f"vary one ({example}=LOW:HIGH), or write const {example} = "
-            f"{text_of_constant(known[example])} in [LOW, HIGH]"
+            f"{text_of_constant(constants[example])} in [LOW, HIGH]"
         )
     varied = []
-    for name, ends in chosen.items():
-        if name not in known:
-            hint = nearest_hint(name, known) or f"the constants are: {', '.join(known) or 'none'}"
+    for name, ends in ends_by_name.items():
+        if name not in constants:
+            hint = nearest_hint(name, constants) or f"the constants are: {', '.join(constants) or 'none'}"
             raise UsageError(f"{specification.filename} has no constant {name!r} to vary; {hint}")
-        if known[name].is_computed:
+        if constants[name].is_computed:
             raise UsageError(f"{name} is computed from other constants; vary those")
         if ends is None:
-            span = known[name].range
+            span = constants[name].range
             if span is None:
                 raise UsageError(f"{name} has no range in the text; give one: {name}=LOW:HIGH")
-            ends = (_end(span[0], known[name]), _end(span[1], known[name]))
-        varied.append(VariedConstant.of(name, known[name], *ends))
+            ends = (_end(span[0], constants[name]), _end(span[1], constants[name]))
+        varied.append(VariedConstant.of(name, constants[name], *ends))
     return tuple(varied)
 
 
@@ -274,7 +280,7 @@ def text_of_constant(constant: Constant) -> str:
     return text_of(constant.value if constant.duration_ns is None else Duration(constant.duration_ns))
 
 
-def _written(constant: Constant) -> Value:
+def _written_value(constant: Constant) -> Value:
     return constant.value if constant.duration_ns is None else text_of_constant(constant)
 
 
@@ -307,17 +313,16 @@ def direction(before: Specification, after: Specification) -> Direction | None:
     if before.regions != after.regions or len(before.results) != len(after.results):
         return None
     return _common(
-        _of_formula(one.formula, other.formula)
-        for one, other in zip(before.results, after.results, strict=True)
+        _of_formula(old.formula, new.formula) for old, new in zip(before.results, after.results, strict=True)
     )
 
 
 def _common(directions: Iterable[Direction | None]) -> Direction | None:
     """Return the direction of something that rises with each of its parts."""
-    found = set(directions) - {0}
-    if not found:
+    signs = set(directions) - {0}
+    if not signs:
         return 0
-    return found.pop() if len(found) == 1 else None
+    return signs.pop() if len(signs) == 1 else None
 
 
 def _opposite(direction: Direction | None) -> Direction | None:
@@ -334,27 +339,27 @@ def _of_formula(before: Formula, after: Formula) -> Direction | None:
     if isinstance(before, Boolean) and before.operator in ("xor", "<->"):
         return None
     match expand(before), expand(after):
-        case Atom() as one, Atom() as other:
-            return _of_expression(one.expression, other.expression)
-        case Quantified() as one, Quantified() as other:
-            same = (one.quantifier, one.variables, one.group) == (
-                other.quantifier,
-                other.variables,
-                other.group,
+        case Atom() as old, Atom() as new:
+            return _of_expression(old.expression, new.expression)
+        case Quantified() as old, Quantified() as new:
+            same = (old.quantifier, old.variables, old.group) == (
+                new.quantifier,
+                new.variables,
+                new.group,
             )
-            return _of_formula(one.body, other.body) if same else None
-        case Boolean() as one, Boolean() as other if _alike(one, other):
-            parts = _common(map(_of_formula, one.operands, other.operands))
-            return _opposite(parts) if one.operator == "not" else parts
-        case Temporal() as one, Temporal() as other if _alike(one, other):
-            window = _of_bound(one.bound, other.bound)
-            window = _opposite(window) if one.operator in ("G", "H") else window
-            return _common([window, *map(_of_formula, one.operands, other.operands)])
+            return _of_formula(old.body, new.body) if same else None
+        case Boolean() as old, Boolean() as new if _alike(old, new):
+            parts = _common(map(_of_formula, old.operands, new.operands))
+            return _opposite(parts) if old.operator == "not" else parts
+        case Temporal() as old, Temporal() as new if _alike(old, new):
+            window = _of_bound(old.bound, new.bound)
+            window = _opposite(window) if old.operator in ("G", "H") else window
+            return _common([window, *map(_of_formula, old.operands, new.operands)])
     return None
 
 
-def _alike(one: Boolean | Temporal, other: Boolean | Temporal) -> bool:
-    return one.operator == other.operator and len(one.operands) == len(other.operands)
+def _alike(old: Boolean | Temporal, new: Boolean | Temporal) -> bool:
+    return old.operator == new.operator and len(old.operands) == len(new.operands)
 
 
 def _of_bound(before: Bound | None, after: Bound | None) -> Direction | None:
@@ -363,7 +368,7 @@ def _of_bound(before: Bound | None, after: Bound | None) -> Direction | None:
         return 0
     if before is None or after is None or before.unit != after.unit:
         return None
-    ends = [float("inf") if each.upper is None else each.upper for each in (before, after)]
+    ends = [float("inf") if bound.upper is None else bound.upper for bound in (before, after)]
     return _common([_sign(before.lower - after.lower), _sign(ends[1] - ends[0])])
 
 
@@ -371,26 +376,26 @@ def _of_expression(before: Expression, after: Expression) -> Direction | None:
     if before == after:
         return 0
     match before, after:
-        case Number() as one, Number() as other:
-            return _sign(other.value - one.value)
-        case Sum() as one, Sum() as other:
-            return _common([_of_expression(one.first, other.first), _of_expression(one.second, other.second)])
-        case Negative() as one, Negative() as other:
-            return _opposite(_of_expression(one.operand, other.operand))
-        case Scaled() as one, Scaled() as other if one.divisor == other.divisor:
-            return _of_expression(one.operand, other.operand)
-        case Minimum() as one, Minimum() as other if len(one.operands) == len(other.operands):
-            return _common(map(_of_expression, one.operands, other.operands))
-        case Maximum() as one, Maximum() as other if len(one.operands) == len(other.operands):
-            return _common(map(_of_expression, one.operands, other.operands))
-        case SignedDistance() as one, SignedDistance() as other:
-            grown = [_of_term(one.first, other.first), _of_term(one.second, other.second)]
+        case Number() as old, Number() as new:
+            return _sign(new.value - old.value)
+        case Sum() as old, Sum() as new:
+            return _common([_of_expression(old.first, new.first), _of_expression(old.second, new.second)])
+        case Negative() as old, Negative() as new:
+            return _opposite(_of_expression(old.operand, new.operand))
+        case Scaled() as old, Scaled() as new if old.divisor == new.divisor:
+            return _of_expression(old.operand, new.operand)
+        case Minimum() as old, Minimum() as new if len(old.operands) == len(new.operands):
+            return _common(map(_of_expression, old.operands, new.operands))
+        case Maximum() as old, Maximum() as new if len(old.operands) == len(new.operands):
+            return _common(map(_of_expression, old.operands, new.operands))
+        case SignedDistance() as old, SignedDistance() as new:
+            grown = [_of_term(old.first, new.first), _of_term(old.second, new.second)]
             return _opposite(_common(grown))
-        case Protrusion() as one, Protrusion() as other:
-            return _common([_of_term(one.inner, other.inner), _opposite(_of_term(one.outer, other.outer))])
-        case Projection() as one, Projection() as other if (one.side, one.axis) == (other.side, other.axis):
-            grew = _of_term(one.term, other.term)
-            return grew if one.side == "max" else _opposite(grew)
+        case Protrusion() as old, Protrusion() as new:
+            return _common([_of_term(old.inner, new.inner), _opposite(_of_term(old.outer, new.outer))])
+        case Projection() as old, Projection() as new if (old.side, old.axis) == (new.side, new.axis):
+            grew = _of_term(old.term, new.term)
+            return grew if old.side == "max" else _opposite(grew)
     return None
 
 
@@ -435,13 +440,13 @@ def load_runs(
     Raises:
         UsageError: a log that is good and bad.
     """
-    files = [each for each in (*good, *bad) if not isinstance(each, Trace)]
+    files = [log for log in (*good, *bad) if not isinstance(log, Trace)]
     names_of_good, names_of_bad = _names(good), _names(bad)
     both = names_of_good.keys() & names_of_bad.keys()
     if both:
-        names = ", ".join(sorted(names_of_good[each] for each in both))
+        names = ", ".join(sorted(names_of_good[place] for place in both))
         raise UsageError(f"{names} cannot be good and bad at once; leave it out of one of them")
-    has_own_names = len({each.name for each in files}) == len(files)
+    has_own_names = len({file.name for file in files}) == len(files)
     runs = []
     for is_good, logs in ((True, good), (False, bad)):
         for number, log in enumerate(logs, 1):
@@ -457,8 +462,8 @@ def load_runs(
 
 def _names(logs: Sequence[LogFile | Trace]) -> dict[Path | str, str]:
     """Return the names of files by their places."""
-    files = [each for each in logs if not isinstance(each, Trace)]
-    return {each.resolve() if isinstance(each, Path) else _place(each): each.name for each in files}
+    files = [log for log in logs if not isinstance(log, Trace)]
+    return {file.resolve() if isinstance(file, Path) else _place(file): file.name for file in files}
 
 
 def _place(file: LogFile) -> str:
@@ -534,7 +539,7 @@ class Margins:
         self._base = parse({})
         self._first = {spec.name: new_leaves(spec.formula, ()) for spec in self._base.results}
         self.start: Point = tuple(constant.start for constant in self.varied)
-        tried = [self._tried(constant) for constant in self.varied]
+        tried = [self._probe(constant) for constant in self.varied]
         self.directions = tuple(map(self._direction, self.varied, tried))
         self.axes = {name: self._axes(name, tried) for name in self._first}
         self._formulas = {name: self._formula(name, tried) for name in self._first}
@@ -544,7 +549,9 @@ class Margins:
             advance(1)
 
     def _parsed_at(self, point: Point) -> Specification | None:
-        values = {one.name: one.value(number) for one, number in zip(self.varied, point, strict=True)}
+        values = {
+            constant.name: constant.value(number) for constant, number in zip(self.varied, point, strict=True)
+        }
         try:
             return self._parse(values)
         except SpecificationError:
@@ -555,10 +562,10 @@ class Margins:
         """Return that of a run, of all results or some of them; None where the specification is invalid."""
         lower = upper = np.inf
         for name in self.axes if results is None else results:
-            found = self._of_result(run, name, point)
-            if found is None:
+            robustness = self._of_result(run, name, point)
+            if robustness is None:
                 return None
-            lower, upper = min(lower, found.lower), min(upper, found.upper)
+            lower, upper = min(lower, robustness.lower), min(upper, robustness.upper)
         return Robustness(lower, upper)
 
     def _of_result(self, run: int, name: str, point: Point) -> Robustness | None:
@@ -579,10 +586,10 @@ class Margins:
         Args:
             results: names; all of them if None.
         """
-        found = self.robustness(run, point, results)
-        if found is None:
+        robustness = self.robustness(run, point, results)
+        if robustness is None:
             return -np.inf
-        return found.lower if self.runs[run].is_good else -found.upper
+        return robustness.lower if self.runs[run].is_good else -robustness.upper
 
     def holds(self, run: int, point: Point, least: float = 0.0, results: Iterable[str] | None = None) -> bool:
         """Return whether a margin is at least so large, and the verdict right: robustness 0 satisfies."""
@@ -609,17 +616,17 @@ class Margins:
             return replace(constant, step=Decimal(1))
         return constant
 
-    def _tried(self, constant: VariedConstant) -> dict[int, Specification]:
+    def _probe(self, constant: VariedConstant) -> dict[int, Specification]:
         """Return the specification with some values of a constant, the others as written."""
         numbers = sorted({constant.steps * part // 4 for part in range(5)})
         return {number: self._parse({constant.name: constant.value(number)}) for number in numbers}
 
     def _direction(self, constant: VariedConstant, tried: Mapping[int, Specification]) -> Direction | None:
-        found = {direction(one, other) for one, other in pairwise(tried.values())}
-        if found == {0} and len({str(each.regions) for each in tried.values()}) == 1:
+        directions = {direction(before, after) for before, after in pairwise(tried.values())}
+        if directions == {0} and len({str(specification.regions) for specification in tried.values()}) == 1:
             raise UsageError(f"no result of {self._base.filename} depends on {constant.name}; vary another")
-        found -= {0}
-        return found.pop() if len(found) == 1 else None
+        directions -= {0}
+        return directions.pop() if len(directions) == 1 else None
 
     def _axes(self, name: str, tried: Sequence[Mapping[int, Specification]]) -> tuple[int, ...]:
         """Return the constants that change a result; any may that changes a region."""
@@ -629,19 +636,21 @@ class Margins:
                 specification, name
             ) != _result_of(self._base, name)
 
-        return tuple(axis for axis, each in enumerate(tried) if any(map(changes, each.values())))
+        return tuple(
+            axis for axis, specifications in enumerate(tried) if any(map(changes, specifications.values()))
+        )
 
     def _formula(
         self, name: str, tried: Sequence[Mapping[int, Specification]]
     ) -> Callable[[Numbers], Formula] | None:
         """Return what gives the formula of a result with other values, if that can be had without parsing."""
-        written = {one.name: one.written_number for one in self.varied}
-        probes = [Probe(_result_of(self._base, name), written)]
-        for one, specifications in zip(self.varied, tried, strict=True):
+        written_numbers = {constant.name: constant.written_number for constant in self.varied}
+        probes = [Probe(_result_of(self._base, name), written_numbers)]
+        for constant, specifications in zip(self.varied, tried, strict=True):
             for number, specification in specifications.items():
                 if specification.regions != self._base.regions:
                     return None
-                numbers = {**written, one.name: one.number(number)}
+                numbers = {**written_numbers, constant.name: constant.number(number)}
                 probes.append(Probe(_result_of(specification, name), numbers))
         return formula_with(probes)
 
@@ -651,7 +660,10 @@ class Margins:
             self._compiled.move_to_end(key)
             return self._compiled[key]
         if (formula_of := self._formulas[name]) is not None:
-            numbers = {one.name: one.number(each) for one, each in zip(self.varied, point, strict=True)}
+            numbers = {
+                constant.name: constant.number(number)
+                for constant, number in zip(self.varied, point, strict=True)
+            }
             formula, regions = formula_of(numbers), self._base.regions
         else:
             specification = self.specification(point)
@@ -674,24 +686,24 @@ class Margins:
         if not len(times_ns):
             raise UsageError(f"{run.name} has no sample; leave it out")
         remarks = check_names(self._base, run.trace.names, tuple(run.trace.signals))
-        missing = [each.message for each in remarks if each.severity == "error"]
+        missing = [remark.message for remark in remarks if remark.severity == "error"]
         if missing:
             raise UsageError(
                 f"{run.name} does not fit {self._base.filename}: {'; '.join(missing)}; leave it out, or "
                 "give names that it has"
             )
-        found: dict[str, list[tuple[Instance, slice]]] = {}
+        instances: dict[str, list[tuple[Instance, slice]]] = {}
         for instance in find_instances(self._base, self._each, [run.trace], 0, FOREVER):
             inside = slice(*window_of(times_ns, instance.start_ns, instance.end_ns))
-            found.setdefault(instance.name, []).append((instance, inside))
-        if not found:
+            instances.setdefault(instance.name, []).append((instance, inside))
+        if not instances:
             raise UsageError(f"{run.name} has no object for the template to stand for; leave it out")
-        return _Prepared(scene, found)
+        return _Prepared(scene, instances)
 
     def _evaluate(self, prepared: _Prepared, name: str, result: _Result) -> Robustness:
         scene = prepared.scene
         if not result.same_measurements:
-            # measurements of values that are only tried do not stay in the run's cache
+            # a new trace, so that measurements for values that are only tried stay out of the run's cache
             scene = TraceScene(replace(scene.trace), result.regions, scene.skip)
         lower = upper = np.inf
         for instance, inside in prepared.instances.get(name, ()):

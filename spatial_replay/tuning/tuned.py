@@ -152,10 +152,10 @@ class ExactSearch:
 
     def widest(self, good: Sequence[int], bad: Sequence[int]) -> Feasibility:
         """Return the point of the widest margin of some runs, if at any point all have the right verdict."""
-        found = self.decide(good, bad, 0.0)
-        if found.looseness is None:
-            return found
-        best, low = found.looseness, self._least((*good, *bad), found.looseness)
+        feasibility = self.decide(good, bad, 0.0)
+        if feasibility.looseness is None:
+            return feasibility
+        best, low = feasibility.looseness, self._least((*good, *bad), feasibility.looseness)
         ends = self._steps, [0] * len(self._steps)
         high = min(self._least(good, ends[0]), self._least(bad, ends[1]))
         if any(self._is_invalid((*good, *bad), end) for end in ends):
@@ -225,17 +225,17 @@ class ExactSearch:
     ) -> None:
         """Move a corner of a box past numbers with which some runs fail even if all else is as opposite."""
         for axis in self._joint.axes:
-            end, other = corner[axis], opposite[axis]
-            if end == other or self._may_fit(runs, _with(opposite, [axis], end), level):
+            end, limit = corner[axis], opposite[axis]
+            if end == limit or self._may_fit(runs, _with(opposite, [axis], end), level):
                 continue
-            least = max(abs(other - end) >> _CONTRACTION, 1)
-            while abs(other - end) > least:
-                middle = (end + other) // 2
+            least = max(abs(limit - end) >> _CONTRACTION, 1)
+            while abs(limit - end) > least:
+                middle = (end + limit) // 2
                 if self._may_fit(runs, _with(opposite, [axis], middle), level):
-                    other = middle
+                    limit = middle
                 else:
                     end = middle
-            corner[axis] = end + (1 if other > end else -1)
+            corner[axis] = end + (1 if limit > end else -1)
 
     def _may_fit(self, runs: Sequence[int], numbers: Sequence[int], level: float) -> bool:
         return all(self._holds(run, numbers, level, self._joint.results) for run in runs) or (
@@ -340,7 +340,7 @@ class Search:
         is_good = self._margins.runs[run].is_good
 
         def at(easiness: int) -> Point:
-            return (self._numbered(0, easiness if is_good else steps - easiness),)
+            return (self._number_at(0, easiness if is_good else steps - easiness),)
 
         return at(self._least([run], steps, at))[0] if self._margins.holds(run, at(steps)) else None
 
@@ -367,7 +367,7 @@ class Search:
         for axis, steps in enumerate(self._steps):
 
             def along(looseness: int, axis: int = axis, point: Point = point) -> Point:
-                return self._with(point, axis, self._numbered(axis, looseness))
+                return self._with(point, axis, self._number_at(axis, looseness))
 
             point = along(self._least(self._good, steps, along))
         return Found(point, is_held=True)
@@ -376,7 +376,7 @@ class Search:
         steps = self._steps[0]
 
         def at(looseness: int) -> Point:
-            return (self._numbered(0, looseness),)
+            return (self._number_at(0, looseness),)
 
         alone = self._alone(at(steps), at(0))
         good, bad = ([run for run in runs if run not in alone] for runs in (self._good, self._bad))
@@ -430,36 +430,36 @@ class Search:
         alone = self._alone(self._at(_PARTS), self._at(0))
         if alone:
             return Found(self._margins.start, is_held=False, conflict=alone, alone=alone)
-        exact = ExactSearch(self._margins, self._loosened)
+        exact = ExactSearch(self._margins, self._point_at)
         deciding = self._worst(self._margins.start, [])
         while True:
-            good, bad = self._sorted(deciding)
-            found = exact.widest(good, bad)
-            if found.looseness is None:
+            good, bad = self._split(deciding)
+            feasibility = exact.widest(good, bad)
+            if feasibility.looseness is None:
                 break
-            point = self._climbed(deciding, self._loosened(found.looseness))
+            point = self._climb(deciding, self._point_at(feasibility.looseness))
             missing = self._worst(point, deciding) or self._failing(point)[:1]
             if not missing:
-                return Found(self._centred(point), is_held=True, is_proven=found.is_proven)
+                return Found(self._centre(point), is_held=True, is_proven=feasibility.is_proven)
             deciding += missing
-        if found.is_proven:
-            # each run that is left is needed for the contradiction
+        if feasibility.is_proven:
+            # leave out runs that the contradiction does not need, so that the conflict names few
             for run in list(deciding):
-                rest = self._sorted([each for each in deciding if each != run])
+                rest = self._split([other_run for other_run in deciding if other_run != run])
                 fewer = exact.decide(*rest, 0.0)
                 if fewer.looseness is None and fewer.is_proven:
                     deciding.remove(run)
-        return Found(self._margins.start, False, tuple(deciding), found.is_proven)
+        return Found(self._margins.start, False, tuple(deciding), feasibility.is_proven)
 
-    def _sorted(self, runs: Sequence[int]) -> tuple[list[int], list[int]]:
+    def _split(self, runs: Sequence[int]) -> tuple[list[int], list[int]]:
         """Return the good ones among runs, and the bad ones."""
         return [run for run in runs if run in self._good], [run for run in runs if run in self._bad]
 
     def _failing(self, point: Point) -> list[int]:
         return [run for run in (*self._good, *self._bad) if not self._margins.holds(run, point)]
 
-    def _loosened(self, looseness: Sequence[int]) -> Point:
-        return tuple(self._numbered(axis, number) for axis, number in enumerate(looseness))
+    def _point_at(self, looseness: Sequence[int]) -> Point:
+        return tuple(self._number_at(axis, number) for axis, number in enumerate(looseness))
 
     def _widest_of_several(self) -> Found:
         """Optimise over the runs that decide, and add those that turn out to, until none is missing."""
@@ -467,14 +467,14 @@ class Search:
         deciding = self._worst(start, [])
         point = start
         for _ in range(_ROUNDS):
-            point = self._optimised(deciding, point)
+            point = self._optimise(deciding, point)
             missing = self._worst(point, deciding)
             if not missing:
                 break
             deciding += missing
         if not self._all_hold([*self._bad, *self._good], point):
             return Found(point, is_held=False, conflict=self._conflict(point), is_proven=False)
-        return Found(self._centred(point), is_held=True, is_proven=False)
+        return Found(self._centre(point), is_held=True, is_proven=False)
 
     def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
         """Return the good and the bad run of the least margin, if it is less than that of the known runs."""
@@ -483,32 +483,32 @@ class Search:
         worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
         return [run for run in worst if run not in known and (not known or margin(run, point) < least)]
 
-    def _optimised(self, runs: Sequence[int], start: Point) -> Point:
+    def _optimise(self, runs: Sequence[int], start: Point) -> Point:
         """Return the best point for some runs: of all on few grid lines, or else the best that is found.
 
         The lines go along an axis with a direction, on which the best number is narrowed down.
         """
-        directed = [axis for axis, each in enumerate(self._margins.directions) if each is not None]
+        directed = [axis for axis, direction in enumerate(self._margins.directions) if direction is not None]
         axis = max(directed, key=lambda axis: self._steps[axis], default=None)
-        others = [each for each in range(len(self._steps)) if each != axis]
+        others = [other_axis for other_axis in range(len(self._steps)) if other_axis != axis]
         best: tuple[float, Point] = (-np.inf, start)
 
         def look(numbers: Sequence[int]) -> float:
             nonlocal best
             point = list(start)
-            for other, number in zip(others, numbers, strict=True):
-                point[other] = number
-            found = self._best_on_line(runs, tuple(point), axis)
-            best = max(best, found)
-            return -found[0]
+            for other_axis, number in zip(others, numbers, strict=True):
+                point[other_axis] = number
+            candidate = self._best_on_line(runs, tuple(point), axis)
+            best = max(best, candidate)
+            return -candidate[0]
 
-        sizes = [self._steps[other] for other in others]
+        sizes = [self._steps[other_axis] for other_axis in others]
         if axis is not None and math.prod(size + 1 for size in sizes) <= _MOST_LINES:
             for numbers in itertools.product(*(range(size + 1) for size in sizes)):
                 look(numbers)
         else:
-            evolve(look, sizes, [start[other] for other in others], self._seed)
-        return self._climbed(runs, best[1])
+            evolve(look, sizes, [start[other_axis] for other_axis in others], self._seed)
+        return self._climb(runs, best[1])
 
     def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
         """Return the best point that is found along an axis, with its margin.
@@ -522,7 +522,7 @@ class Search:
 
         def excess(looseness: int) -> float:
             nonlocal best
-            moved = self._with(point, axis, self._numbered(axis, looseness))
+            moved = self._with(point, axis, self._number_at(axis, looseness))
             least, good, bad = self._sides(runs, moved)
             best = max(best, (least, moved))
             return good - bad
@@ -536,10 +536,10 @@ class Search:
                 break
             share = 0.5 if turn % 3 == 2 else below / (below - above)
             middle = min(max(low + round(share * (high - low)), low + 1), high - 1)
-            if (found := excess(middle)) >= 0.0:
-                high, above = middle, found
+            if (middle_excess := excess(middle)) >= 0.0:
+                high, above = middle, middle_excess
             else:
-                low, below = middle, found
+                low, below = middle, middle_excess
         return best
 
     def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
@@ -550,11 +550,11 @@ class Search:
             least[side] = max(min(self._margins.margin(run, point), least[side]), -_FAR)
         return min(least), least[0], least[1]
 
-    def _climbed(self, runs: Sequence[int], point: Point) -> Point:
+    def _climb(self, runs: Sequence[int], point: Point) -> Point:
         """Move a point along single axes while the least margin grows, by steps that halve."""
 
-        def value(each: Point) -> float:
-            return min(self._margins.margin(run, each) for run in runs)
+        def value(trial: Point) -> float:
+            return min(self._margins.margin(run, trial) for run in runs)
 
         best = value(point)
         sizes = [max(steps >> 4, 1) for steps in self._steps]
@@ -567,7 +567,7 @@ class Search:
             sizes = [max(size >> 1, 1) for size in sizes]
         return point
 
-    def _centred(self, point: Point) -> Point:
+    def _centre(self, point: Point) -> Point:
         """Move each number to the middle of those that give no lesser margin."""
         least = self._least_margin(point)
         for axis, constant in enumerate(self._margins.varied):
@@ -581,19 +581,19 @@ class Search:
         """Return the runs that conflict: one or two for which no point is found, else all that fail."""
         worst = self._worst(point, [])
         for few in (*[[run] for run in worst], worst):
-            if not self._all_hold(few, self._optimised(few, point)):
+            if not self._all_hold(few, self._optimise(few, point)):
                 return tuple(few)
         return tuple(self._failing(point))
 
     # ---------------------------------------------------------------------------------------------- points
 
-    def _numbered(self, axis: int, looseness: int) -> int:
+    def _number_at(self, axis: int, looseness: int) -> int:
         """Return the number on an axis of a value that is so many steps looser than the tightest."""
         return self._steps[axis] - looseness if self._margins.directions[axis] == -1 else looseness
 
     def _at(self, part: int) -> Point:
         """Return the point whose looseness is this part of all steps, on each axis."""
-        return self._loosened([part * steps // _PARTS for steps in self._steps])
+        return self._point_at([part * steps // _PARTS for steps in self._steps])
 
     def _with(self, point: Point, axis: int, number: int) -> Point:
         return (*point[:axis], number, *point[axis + 1 :])
@@ -782,19 +782,21 @@ class Tuning(Displayed):
         Raises:
             UsageError: a constant that was not varied, more than two, fewer than 2 points or more than 200.
         """
-        known = [constant.name for constant in self.constants]
-        chosen = names or tuple(known[:2])
-        for name in chosen:
-            if name not in known:
-                hint = nearest_hint(name, known) or f"varied were: {', '.join(known)}"
+        varied_names = [constant.name for constant in self.constants]
+        axis_names = names or tuple(varied_names[:2])
+        for name in axis_names:
+            if name not in varied_names:
+                hint = nearest_hint(name, varied_names) or f"varied were: {', '.join(varied_names)}"
                 raise UsageError(f"{name!r} was not varied; {hint}")
-        if len({*chosen}) != len(chosen) or len(chosen) > 2:
-            raise UsageError(f"a surface is over one or two constants, not over {', '.join(chosen)}")
+        if len({*axis_names}) != len(axis_names) or len(axis_names) > 2:
+            raise UsageError(f"a surface is over one or two constants, not over {', '.join(axis_names)}")
         if not 2 <= points <= 200:
             raise UsageError(f"points is {points}; give 2 to 200")
-        axes = [known.index(name) for name in chosen]
+        axes = [varied_names.index(name) for name in axis_names]
         varied = [self._margins.varied[axis] for axis in axes]
-        grids = [np.unique(np.linspace(0, each.steps, points).round().astype(np.int64)) for each in varied]
+        grids = [
+            np.unique(np.linspace(0, constant.steps, points).round().astype(np.int64)) for constant in varied
+        ]
         rows = grids[1] if len(grids) > 1 else np.array([self._point[axes[0]]])
         margins = np.empty((len(self.runs), len(rows), len(grids[0])))
         for row, y in enumerate(rows.tolist()):
@@ -806,21 +808,23 @@ class Tuning(Displayed):
                     self._margins.margin(run, tuple(moved)) for run in range(len(self.runs))
                 ]
         values = [
-            np.array([_number(each.decimal(number), each.written.duration_ns) for number in grid.tolist()])
-            for each, grid in zip(varied, grids, strict=True)
+            np.array(
+                [_number(constant.decimal(number), constant.written.duration_ns) for number in grid.tolist()]
+            )
+            for constant, grid in zip(varied, grids, strict=True)
         ]
-        found = tuple(
-            _number(each.decimal(self._point[axis]), each.written.duration_ns)
-            for each, axis in zip(varied, axes, strict=True)
+        tuned_values = tuple(
+            _number(constant.decimal(self._point[axis]), constant.written.duration_ns)
+            for constant, axis in zip(varied, axes, strict=True)
         )
         return Surface(
-            chosen,
+            axis_names,
             values[0],
             values[1] if len(values) > 1 else np.full(1, np.nan),
             margins,
             tuple((run.name, run.is_good) for run in self.runs),
-            found if self.is_found else None,
-            tuple(each.written.duration_ns is not None for each in varied),
+            tuned_values if self.is_found else None,
+            tuple(constant.written.duration_ns is not None for constant in varied),
         )
 
     @property
@@ -831,7 +835,7 @@ class Tuning(Displayed):
             "found": self.is_found,
             "margin": json_number(self.margin),
             "widest": self.is_widest,
-            "constants": [{**json_fields(each), **unknown} for each in self.constants],
+            "constants": [{**json_fields(constant), **unknown} for constant in self.constants],
             "runs": json_value(self.runs),
             "conflict": json_value(self.conflict),
         }
@@ -875,29 +879,29 @@ def tune_runs(
     parse = partial(_with_values, specification, constant_writer(specification), runs[0].trace.units)
     margins = Margins(runs, parse, varied, each or {}, advance=advance)
     search = Search(margins, seed)
-    found = search.best()
-    kept = _kept(margins, search, found) if found.is_held else {}
-    point = tuple(kept.get(axis, number) for axis, number in enumerate(found.point))
-    is_widest = found.is_proven and point == found.point
-    found = replace(found, point=point, is_proven=is_widest if found.is_held else found.is_proven)
-    return _tuning(specification, margins, search, found, kept)
+    result = search.best()
+    kept_numbers = _undecided_constants(margins, search, result) if result.is_held else {}
+    point = tuple(kept_numbers.get(axis, number) for axis, number in enumerate(result.point))
+    is_widest = result.is_proven and point == result.point
+    result = replace(result, point=point, is_proven=is_widest if result.is_held else result.is_proven)
+    return _tuning(specification, margins, search, result, kept_numbers)
 
 
-def _kept(margins: Margins, search: Search, found: Found) -> dict[int, int]:
+def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict[int, int]:
     """Return the constants that no bad run decides, with the numbers of the values that they keep.
 
     The widest margin would loosen them as far as can be. Good runs alone find the tightest values.
     """
-    kept: dict[int, int] = {}
+    kept_numbers: dict[int, int] = {}
     if all(run.is_good for run in margins.runs):
-        return kept
-    for axis, one in enumerate(margins.varied):
-        point = tuple(kept.get(place, number) for place, number in enumerate(found.point))
+        return kept_numbers
+    for axis, constant in enumerate(margins.varied):
+        point = tuple(kept_numbers.get(place, number) for place, number in enumerate(found.point))
         low, high = search.interval(point, axis)
-        is_free = {1: high == one.steps, -1: low == 0}.get(margins.directions[axis] or 0, False)
-        if (low, high) == (0, one.steps) or is_free:
-            kept[axis] = min(max(one.start, low), high)
-    return kept
+        is_free = {1: high == constant.steps, -1: low == 0}.get(margins.directions[axis] or 0, False)
+        if (low, high) == (0, constant.steps) or is_free:
+            kept_numbers[axis] = min(max(constant.start, low), high)
+    return kept_numbers
 
 
 def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
@@ -945,28 +949,28 @@ def _tuning(
     specification: Specification, margins: Margins, search: Search, found: Found, kept: Collection[int]
 ) -> Tuning:
     constants = []
-    for axis, one in enumerate(margins.varied):
+    for axis, constant in enumerate(margins.varied):
         number = found.point[axis]
         low, high = search.interval(found.point, axis) if found.is_held else (number, number)
-        duration_ns = one.written.duration_ns
+        duration_ns = constant.written.duration_ns
         constants.append(
             TunedConstant(
-                one.name,
-                one.value(number),
-                one.written.value if duration_ns is None else text_of_constant(one.written),
-                one.value(low),
-                one.value(high),
-                (one.value(0), one.value(one.steps)),
-                _number(one.step, duration_ns),
+                constant.name,
+                constant.value(number),
+                constant.written.value if duration_ns is None else text_of_constant(constant.written),
+                constant.value(low),
+                constant.value(high),
+                (constant.value(0), constant.value(constant.steps)),
+                _number(constant.step, duration_ns),
                 margins.directions[axis],
                 axis not in kept,
             )
         )
-    listed = []
+    run_margins = []
     for number, run in enumerate(margins.runs):
         robustness = margins.robustness(number, found.point)
         lower, upper = (-np.inf, np.inf) if robustness is None else robustness
-        listed.append(
+        run_margins.append(
             RunMargin(
                 run.name,
                 run.is_good,
@@ -978,8 +982,8 @@ def _tuning(
     return Tuning(
         found.is_held,
         tuple(constants),
-        min(run.margin for run in listed),
-        tuple(listed),
+        min(run.margin for run in run_margins),
+        tuple(run_margins),
         None if found.is_held else _conflict(margins, search, found),
         found.is_held and found.is_proven,
         margins.specification(found.point) or specification,
@@ -1007,18 +1011,18 @@ def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
 
 def _needs(margins: Margins, search: Search, run: int, *, is_exact: bool, is_alone: bool) -> str:
     """Say which values a run needs, in a part of a sentence."""
-    one = margins.runs[run]
-    what = "satisfied" if one.is_good else "violated"
+    labelled = margins.runs[run]
+    what = "satisfied" if labelled.is_good else "violated"
     if not is_exact:
         if is_alone:
-            return f"{one.name} is not {what} with any values tried"
-        return f"{one.name} has to be {what}"
+            return f"{labelled.name} is not {what} with any values tried"
+        return f"{labelled.name} has to be {what}"
     constant, limit = margins.varied[0], search.limit(run)
     if limit is None:
         span = f"from {constant.text(0)} to {constant.text(constant.steps)}"
-        return f"{one.name} is not {what} with any {constant.name} {span}"
-    rises = (margins.directions[0] == 1) == one.is_good
-    return f"{one.name} is {what} only with {constant.name} {'>=' if rises else '<='} {constant.text(limit)}"
+        return f"{labelled.name} is not {what} with any {constant.name} {span}"
+    sign = ">=" if (margins.directions[0] == 1) == labelled.is_good else "<="
+    return f"{labelled.name} is {what} only with {constant.name} {sign} {constant.text(limit)}"
 
 
 def _number(value: Any, duration_ns: int | None) -> float:
