@@ -114,11 +114,11 @@ class LimitedRelation:
         number = number_text(0.0 - self.limit if self.direction else self.limit)
         if not quantity.parties:
             return f"{quantity.signal} {verb('is')} {'at most' if self.direction else 'at least'} {number}"
-        one, other = quantity.parties
-        if one == other:
-            both, a, b = f"any two of class {one.name}", f"any {one.name}", "any other"
+        first, second = quantity.parties
+        if first == second:
+            both, a, b = f"any two of class {first.name}", f"any {first.name}", "any other"
         else:
-            a, b = _called(one), _called(other)
+            a, b = _party_text(first), _party_text(second)
             both = f"{a} and {b}"
         if quantity.relation == "dist":
             if self.other_limit is not None:
@@ -148,7 +148,7 @@ class LimitedRelation:
         return replace(self, direction=1 - self.direction, limit=0.0 - self.limit)
 
 
-def _called(party: Party) -> str:
+def _party_text(party: Party) -> str:
     return f"every {party.name}" if party.is_class else party.name
 
 
@@ -200,7 +200,7 @@ class Line:
         return f"{self.fact.name}_{ends[self.pattern]}"
 
 
-def ordered(first: LimitedRelation, later: LimitedRelation) -> Line:
+def order_line(first: LimitedRelation, later: LimitedRelation) -> Line:
     """Return that a fact holds before another one does, in the words that need the fewer negations."""
     is_positive = later.quantity.relation not in WITH_LIMIT and not later.direction
     return Line("before" if is_positive else "until", first, later)
@@ -257,17 +257,17 @@ class FittedLimits:
         distinguishes this way moves the limit that it is farthest behind, in margins, to the middle between
         it and the good runs.
         """
-        values = np.stack([_by_pattern(each, 0) for each in good], axis=-1)
+        values = np.stack([_by_pattern(run, 0) for run in good], axis=-1)
         lowest = values.min(axis=-1)
         with np.errstate(invalid="ignore"):
             spread = values.max(axis=-1) - lowest
             margins = np.maximum(_MARGIN * spread / (len(good) - 1), _FINEST * np.abs(lowest))
-        with_limit = np.array([each.relation in WITH_LIMIT for each in quantities])
+        with_limit = np.array([quantity.relation in WITH_LIMIT for quantity in quantities])
         valid = np.isfinite(lowest) & np.isfinite(margins) & (with_limit | (lowest >= 0.0))
         _leave_out(valid, quantities, lowest)
         limits = np.where(with_limit, lowest - margins, 0.0)
-        # what is never nearer than at a distance is not said to overlap
-        is_distance = np.array([each.relation == "dist" for each in quantities])
+        # a limit for objects that never overlapped does not let them overlap
+        is_distance = np.array([quantity.relation == "dist" for quantity in quantities])
         limits[:, 0] = np.where(
             is_distance & (lowest[:, 0] >= 0.0), np.maximum(limits[:, 0], 0.0), limits[:, 0]
         )
@@ -276,7 +276,7 @@ class FittedLimits:
             return cls(
                 tuple(quantities), tuple(good), (), limits, lowest, margins, np.empty((*limits.shape, 0))
             )
-        reached = np.stack([_by_pattern(each, 1) for each in bad], axis=-1)
+        reached = np.stack([_by_pattern(run, 1) for run in bad], axis=-1)
         beyond = reached < limits[..., None]
         nearest = np.where(beyond, reached, -np.inf).max(axis=-1)
         limits = np.where(with_limit, np.fmax(limits, (lowest + nearest) / 2.0), limits)
@@ -292,83 +292,91 @@ class FittedLimits:
                 moved.append((*map(int, where), run))
         beyond = reached < limits[..., None]
         apart = np.where(beyond, np.clip(np.nan_to_num(far / _SURE, nan=1.0, posinf=1.0), 0.05, 1.0), 0.0)
-        for each in moved:
-            apart[each] = 1.0
+        for index in moved:
+            apart[index] = 1.0
         return cls(tuple(quantities), tuple(good), tuple(bad), limits, lowest, margins, apart)
 
     def fact(self, pattern: int, direction: int, quantity: int) -> LimitedRelation:
         """Return a quantity with its limit, as a short decimal that still holds."""
-        found = self.quantities[quantity]
-        if found.relation not in WITH_LIMIT:
-            return LimitedRelation(found, direction, 0.0)
+        subject = self.quantities[quantity]
+        if subject.relation not in WITH_LIMIT:
+            return LimitedRelation(subject, direction, 0.0)
         where = pattern, direction, quantity
         limit, lowest = float(self.limits[where]), float(self.lowest[where])
         if not self.bad and (plain := _one_digit(limit, lowest)) is not None:
-            return LimitedRelation(found, direction, plain)
+            return LimitedRelation(subject, direction, plain)
         return LimitedRelation(
-            found, direction, _short(limit, max(lowest - limit, _FINEST * abs(lowest)), lowest)
+            subject, direction, _short(limit, max(lowest - limit, _FINEST * abs(lowest)), lowest)
         )
 
     @cached_property
     def scale(self) -> float:
         """The greatest distance of any pair in the good runs."""
-        found = [
-            each.greatest[0, 1, index]
-            for each in self.good[:_SCORED_RUNS]
+        distances = [
+            run.greatest[0, 1, index]
+            for run in self.good[:_SCORED_RUNS]
             for index, quantity in enumerate(self.quantities)
             if quantity.relation == "dist"
         ]
-        return max((float(each) for each in found if np.isfinite(each)), default=1.0) or 1.0
+        return max((float(distance) for distance in distances if np.isfinite(distance)), default=1.0) or 1.0
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
         """For each quantity that is about a class, those about its members; none for the others."""
         classes = members_of(self.good[0].trace)
         numbers = {
-            (each.relation, parties): index
-            for index, each in enumerate(self.quantities)
-            for parties in ([each.parties, each.parties[::-1]] if each.is_symmetric else [each.parties])
+            (quantity.relation, parties): index
+            for index, quantity in enumerate(self.quantities)
+            for parties in (
+                [quantity.parties, quantity.parties[::-1]] if quantity.is_symmetric else [quantity.parties]
+            )
         }
-        found = []
-        for each in self.quantities:
+        members = []
+        for quantity in self.quantities:
             named = [
                 [Party(name) for name in classes.get(party.name, ())] if party.is_class else [party]
-                for party in each.parties
+                for party in quantity.parties
             ]
-            own: set[int] = set()
-            if any(party.is_class for party in each.parties):
+            member_numbers: set[int] = set()
+            if any(party.is_class for party in quantity.parties):
                 pairs = product(*named)
-                own = {index for pair in pairs if (index := numbers.get((each.relation, pair), -1)) >= 0}
-            found.append(tuple(sorted(own)))
-        return tuple(found)
+                member_numbers = {
+                    index for pair in pairs if (index := numbers.get((quantity.relation, pair), -1)) >= 0
+                }
+            members.append(tuple(sorted(member_numbers)))
+        return tuple(members)
 
     @cached_property
     def moves(self) -> Booleans:
         """(Q,), whether each quantity varies in a good run."""
-        travel = np.max([each.travel for each in self.good], axis=0)
-        is_length = np.array([each.relation not in ("oriented", "signal") for each in self.quantities])
+        travel = np.max([run.travel for run in self.good], axis=0)
+        is_length = np.array(
+            [quantity.relation not in ("oriented", "signal") for quantity in self.quantities]
+        )
         return np.asarray(travel > np.where(is_length, _STILL * self.scale, 0.0))
 
     @cached_property
     def landmarks(self) -> frozenset[Party]:
         """The objects, and whole classes, that stay where they are in all good runs."""
         shifts = {
-            name: max(each.shifts[name] for each in self.good)
-            for name in set.intersection(*(set(each.shifts) for each in self.good))
+            name: max(run.shifts[name] for run in self.good)
+            for name in set.intersection(*(set(run.shifts) for run in self.good))
         }
-        farthest = max((each for each in shifts.values() if np.isfinite(each)), default=0.0)
+        farthest = max((shift for shift in shifts.values() if np.isfinite(shift)), default=0.0)
         still = {name for name, shift in shifts.items() if shift < _STAYS * farthest}
-        classes = [members_of(each.trace) for each in self.good]
-        whole = {name for name in classes[0] if all(name in each and each[name] <= still for each in classes)}
+        classes = [members_of(run.trace) for run in self.good]
+        whole = {
+            name
+            for name in classes[0]
+            if all(name in names_by_class and names_by_class[name] <= still for names_by_class in classes)
+        }
         return frozenset([*map(Party, still), *(Party(name, True) for name in whole)])
 
     def bits_between(self, quantity: int) -> float:
         """Return how much it says that a distance is between both its limits at the end."""
         limits = self.limits[FINALLY, :, quantity, None]
         limits = np.where(np.isfinite(limits), limits, -np.inf)
-        inside = [
-            (each.sampled[:, quantity] >= limits).all(axis=0).mean() for each in self.good[:_SCORED_RUNS]
-        ]
+        inside = [(run.sampled[:, quantity] >= limits).all(axis=0).mean() for run in self.good[:_SCORED_RUNS]]
         return float(-np.log2(max(float(np.mean(inside)), 2.0**-_MOST_BITS)))
 
     @cached_property
@@ -376,42 +384,42 @@ class FittedLimits:
         """(3, 2, Q), the information of each line. For `F`: how seldom it holds. For `G`: how close it comes
         to failing, relative to its variation."""
         some = self.good[:_SCORED_RUNS]
-        share = np.mean(
-            [(each.sampled[None] >= self.limits[..., None]).mean(axis=-1) for each in some], axis=0
-        )
+        share = np.mean([(run.sampled[None] >= self.limits[..., None]).mean(axis=-1) for run in some], axis=0)
         bits = -np.log2(np.maximum(share, 2.0**-_MOST_BITS))
-        travel = np.max([each.travel for each in self.good], axis=0)
-        is_distance = np.array([each.relation == "dist" for each in self.quantities])
-        other = np.array([each.relation in ("signal", "oriented") for each in self.quantities])
+        travel = np.max([run.travel for run in self.good], axis=0)
+        is_distance = np.array([quantity.relation == "dist" for quantity in self.quantities])
+        has_no_length = np.array(
+            [quantity.relation in ("signal", "oriented") for quantity in self.quantities]
+        )
         near = np.maximum(np.abs(self.lowest[ALWAYS]) + self.margins[ALWAYS], 1e-12)
         with np.errstate(invalid="ignore", divide="ignore"):
             tight = np.log2(np.where(is_distance, self.scale / 2.0, travel) / near)
         # that a relation never holds, and what a signal's limits are, may be an accident
         tight[1, ~is_distance] = 0.0
-        tight[:, other | ~self.moves] = 0.0
+        tight[:, has_no_length | ~self.moves] = 0.0
         bits[ALWAYS] = tight
         return np.where(np.isfinite(self.limits), np.clip(bits, 0.0, _MOST_BITS), 0.0)
 
     def events(self) -> list[LimitedRelation]:
         """Return facts that hold at the end of all good runs, not at their beginning, the rarest first."""
-        begun = np.stack([each.first[:, 1] for each in self.good], axis=-1).max(axis=-1)
+        begun = np.stack([run.first[:, 1] for run in self.good], axis=-1).max(axis=-1)
         limits = self.limits[FINALLY]
-        found = np.isfinite(limits) & (begun < limits) & (self.bits[FINALLY] > 0.0)
-        found[0] &= np.array([each.relation != "dist" for each in self.quantities])
-        where = np.argwhere(found)
-        order = np.argsort(-self.bits[FINALLY][found], kind="stable")[:_MOST_EVENTS]
+        is_event = np.isfinite(limits) & (begun < limits) & (self.bits[FINALLY] > 0.0)
+        is_event[0] &= np.array([quantity.relation != "dist" for quantity in self.quantities])
+        where = np.argwhere(is_event)
+        order = np.argsort(-self.bits[FINALLY][is_event], kind="stable")[:_MOST_EVENTS]
         return [self.fact(FINALLY, direction, index) for direction, index in where[order].tolist()]
 
     def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
         """Return in which sample each fact first holds for sure, and in which it first may, (F, R) each."""
-        found = [
+        first_times = [
             [
-                [each.first_time(fact.quantity, fact.direction, fact.limit, surely=surely) for each in runs]
+                [run.first_time(fact.quantity, fact.direction, fact.limit, surely=surely) for run in runs]
                 for fact in facts
             ]
             for surely in (True, False)
         ]
-        sure, possible = np.array(found, np.int64).reshape(2, len(facts), len(runs))
+        sure, possible = np.array(first_times, np.int64).reshape(2, len(facts), len(runs))
         return sure, possible
 
     def orders(self, facts: Sequence[LimitedRelation]) -> list[tuple[Line, int, Booleans]]:
@@ -420,20 +428,20 @@ class FittedLimits:
         Returns:
             Each line, the fewest samples between both facts, and which bad runs have the other order.
         """
-        facts = [each.near for each in facts]
+        facts = [fact.near for fact in facts]
         sure, possible = self.times(facts, self.good)
         bad_sure, bad_possible = self.times(facts, self.bad)
-        lengths = np.array([len(each.trace) for each in self.good])
-        found = []
-        for one, first in enumerate(facts):
-            for other, later in enumerate(facts):
-                if one == other or first.quantity.pair == later.quantity.pair:
+        lengths = np.array([len(run.trace) for run in self.good])
+        lines = []
+        for first_index, first in enumerate(facts):
+            for later_index, later in enumerate(facts):
+                if first_index == later_index or first.quantity.pair == later.quantity.pair:
                     continue
-                gap = int((possible[other] - sure[one]).min())
-                if gap > 0 and (sure[other] < lengths).all():
-                    violating = bad_sure[other] < bad_possible[one]
-                    found.append((ordered(first, later), gap, violating))
-        return found
+                gap = int((possible[later_index] - sure[first_index]).min())
+                if gap > 0 and (sure[later_index] < lengths).all():
+                    violating = bad_sure[later_index] < bad_possible[first_index]
+                    lines.append((order_line(first, later), gap, violating))
+        return lines
 
 
 def _by_pattern(run: Observed, end: int) -> Floats:
@@ -451,7 +459,7 @@ def _leave_out(valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) 
         if quantity.relation == "oriented":
             valid[:, 1, index] = False
         elif quantity.relation == "dist":
-            # how deep two overlap, or that they were far apart at some time
+            # not written: how deep two objects overlap, or that they were far apart at some time
             valid[:, 0, index] &= lowest[:, 0, index] >= 0.0
             valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
             valid[EVENTUALLY, 0, index] = False
@@ -470,8 +478,8 @@ def _short(limit: float, margin: float, lowest: float) -> float:
         return limit
     exponent = floor(log10(margin)) - 1
     rounded = Decimal(limit).scaleb(-exponent).to_integral_value(ROUND_FLOOR).scaleb(exponent)
-    found = float(rounded)
-    return found if found <= lowest else lowest
+    short = float(rounded)
+    return short if short <= lowest else lowest
 
 
 def _one_digit(limit: float, lowest: float) -> float | None:

@@ -64,39 +64,39 @@ _DIRECTIONS: Final = frozenset({"leftof", "below", "prec"})
 
 def chosen_lines(fit: FittedLimits, most: int) -> tuple[Line, ...]:
     """Return the lines to write, the most distinctive ones first: at most `most`."""
-    found = _distinctive(fit, most) if fit.bad else _characteristic(fit, most)
-    return tuple(_joined(found))
+    lines = _distinctive(fit, most) if fit.bad else _characteristic(fit, most)
+    return tuple(_join_limits(lines))
 
 
 def _distinctive(fit: FittedLimits, most: int) -> list[Line]:
     """Return lines by how many bad runs they distinguish that the lines before them have not."""
     where = np.argwhere((fit.apart > 0.0).any(axis=-1))
     events = fit.events()
-    lengths = np.array([len(each.trace) for each in fit.bad])
+    lengths = np.array([len(run.trace) for run in fit.bad])
     never = dict(zip(events, fit.times(events, fit.bad)[1] >= lengths, strict=True))
     orders = [(line, violating) for line, _, violating in fit.orders(events) if violating.any()]
-    weights = [fit.apart[tuple(each)] for each in where]
+    weights = [fit.apart[tuple(place)] for place in where]
     weights += [
         np.where(violating, np.where(never[line.fact], _NEVER, 1.0), 0.0) for line, violating in orders
     ]
-    plain = [_plainness(fit, *each) for each in where.tolist()]
+    plain = [_plainness(fit, *place) for place in where.tolist()]
     plain += [_PLAIN_BEFORE if line.pattern == "before" else _PLAIN_UNTIL for line, _ in orders]
-    bits = [round(float(fit.bits[tuple(each)]), 3) for each in where] + [0.0 for _ in orders]
+    bits = [round(float(fit.bits[tuple(place)]), 3) for place in where] + [0.0 for _ in orders]
     apart = np.array(weights).reshape(len(weights), len(fit.bad))
-    rows = {tuple(each): row for row, each in enumerate(where.tolist())}
+    rows = {tuple(place): row for row, place in enumerate(where.tolist())}
     still = np.ones(len(fit.bad))
     result: list[Line] = []
     while len(result) < min(most, len(weights)):
         gains = np.round(apart @ still * plain, 3)
-        best = max(range(len(weights)), key=lambda each: (gains[each], bits[each], -each))
+        best = max(range(len(weights)), key=lambda row: (gains[row], bits[row], -row))
         if gains[best] < _LEAST_GAIN:
             break
         if best < len(where):
             pattern, direction, quantity = where[best].tolist()
             result.append(Line(PATTERNS[pattern], fit.fact(pattern, direction, quantity)))
             # what is said of a class is said of its members
-            own = [rows.get((pattern, direction, each)) for each in fit.members[quantity]]
-            apart[[row for row in own if row is not None]] = 0.0
+            member_rows = [rows.get((pattern, direction, member)) for member in fit.members[quantity]]
+            apart[[row for row in member_rows if row is not None]] = 0.0
         else:
             result.append(orders[best - len(where)][0])
         still = still * (1.0 - apart[best] * _LESS)
@@ -121,9 +121,9 @@ def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -
 
 def _join(groups: list[set[Party]], pair: tuple[Party, ...]) -> bool:
     """Join the groups of two objects, and return whether they were apart."""
-    own = [each for each in groups if not each.isdisjoint(pair)]
-    groups[:] = [*(each for each in groups if each not in own), set(pair).union(*own)]
-    return not any(each.issuperset(pair) for each in own)
+    touching = [group for group in groups if not group.isdisjoint(pair)]
+    groups[:] = [*(group for group in groups if group not in touching), set(pair).union(*touching)]
+    return not any(group.issuperset(pair) for group in touching)
 
 
 def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
@@ -142,7 +142,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
     pairs = set()
     of_class: set[int] = set()
     centre = _centre(fit)
-    for _, index in sorted(_distances(fit), key=lambda each: (-each[0], each[1])):
+    for _, index in sorted(_distances(fit), key=lambda item: (-item[0], item[1])):
         quantity = fit.quantities[index]
         if index not in of_class and (
             _places(fit, quantity, placed, centre) if fit.landmarks else _join(joined, quantity.parties)
@@ -152,11 +152,11 @@ def _goals(fit: FittedLimits) -> list[Line]:
             if fit.limits[FINALLY, 0, index] > 0.0:
                 fact = replace(fit.fact(FINALLY, 0, index), other_limit=near.limit)
             bit = fit.bits_between(index)
-            if centre in quantity.parties or any(placed[each] == 1 for each in quantity.parties):
+            if centre in quantity.parties or any(placed[party] == 1 for party in quantity.parties):
                 # the nearest landmark says most, whatever the way there was
                 bit = max(bit, _LEAST_BITS_PLACED)
             scored.append((bit, index, Line("finally", fact)))
-            pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
+            pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
     before: dict[tuple[str, Party], set[Party]] = {}
     relations = [
         (bit, index)
@@ -167,7 +167,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
         and fit.moves[index]
         and _agrees(fit, FINALLY, 0, index)
     ]
-    for bit, index in sorted(relations, key=lambda each: _by_worth(fit, *each)):
+    for bit, index in sorted(relations, key=lambda item: _by_worth(fit, *item)):
         quantity = fit.quantities[index]
         began = _begins_otherwise(fit, index)
         if index in of_class or not (began or quantity.pair in pairs):
@@ -177,14 +177,14 @@ def _goals(fit: FittedLimits) -> list[Line]:
             continue
         of_class.update(fit.members[index])
         if quantity.relation in _DIRECTIONS:
-            one, other = quantity.parties
-            if _leads(before, quantity.relation, one, other):
+            first, second = quantity.parties
+            if _leads(before, quantity.relation, first, second):
                 continue
-            before.setdefault((quantity.relation, one), set()).add(other)
+            before.setdefault((quantity.relation, first), set()).add(second)
         scored.append((bit, index, Line("finally", fit.fact(FINALLY, 0, index))))
-        pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
+        pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
     scored += _visits(fit, pairs)
-    ordered = sorted(scored, key=lambda each: (-each[0], each[1]))
+    ordered = sorted(scored, key=lambda item: (-item[0], item[1]))
     return _spread([(bit, line) for bit, _, line in ordered], fit.landmarks)
 
 
@@ -207,14 +207,16 @@ def _centre(fit: FittedLimits) -> Party | None:
     """Return the landmark next to which most objects end, such as a plate; None if no two end by the same."""
     nearest: dict[Party, tuple[float, Party]] = {}
     for index, quantity in enumerate(fit.quantities):
-        still = [each for each in quantity.parties if each in fit.landmarks and not each.is_class]
-        moved = [each for each in quantity.parties if each not in fit.landmarks and not each.is_class]
+        still = [party for party in quantity.parties if party in fit.landmarks and not party.is_class]
+        moved = [party for party in quantity.parties if party not in fit.landmarks and not party.is_class]
         if quantity.relation == "dist" and len(still) == len(moved) == 1 and fit.moves[index]:
-            found = float(fit.lowest[FINALLY, 0, index]), still[0]
-            nearest[moved[0]] = min(nearest.get(moved[0], found), found)
+            landmark_distance = float(fit.lowest[FINALLY, 0, index]), still[0]
+            nearest[moved[0]] = min(nearest.get(moved[0], landmark_distance), landmark_distance)
     counts = Counter(landmark for _, landmark in nearest.values())
     return max(
-        (each for each in counts if counts[each] > 1), key=lambda each: (counts[each], each), default=None
+        (landmark for landmark in counts if counts[landmark] > 1),
+        key=lambda landmark: (counts[landmark], landmark),
+        default=None,
     )
 
 
@@ -223,7 +225,7 @@ def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centr
 
     That from the centre always does.
     """
-    moved = [each for each in quantity.parties if each not in fit.landmarks]
+    moved = [party for party in quantity.parties if party not in fit.landmarks]
     if len(moved) != 1 or (placed[moved[0]] >= _DISTANCES and centre not in quantity.parties):
         return False
     placed.update(moved)
@@ -242,7 +244,7 @@ def _spread(scored: list[tuple[float, Line]], landmarks: frozenset[Party]) -> li
     left = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored]
     while left:
         worth = [
-            bit * _NEXT_LINE ** min((counts[each] for each in moved), default=0) for bit, _, moved in left
+            bit * _NEXT_LINE ** min((counts[party] for party in moved), default=0) for bit, _, moved in left
         ]
         _, line, moved = left.pop(worth.index(max(worth)))
         result.append(line)
@@ -257,9 +259,11 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
     """
     limit = abs(float(fit.limits[pattern, direction, index]))
     alike = _ALIKE_ALWAYS if pattern == ALWAYS else _ALIKE
-    for each in fit.members[index]:
-        own = abs(float(fit.limits[pattern, direction, each]))
-        if not fit.bits[pattern, direction, each] >= _LEAST_BITS or max(own, limit) > alike * min(own, limit):
+    for member in fit.members[index]:
+        member_limit = abs(float(fit.limits[pattern, direction, member]))
+        if not fit.bits[pattern, direction, member] >= _LEAST_BITS or max(member_limit, limit) > alike * min(
+            member_limit, limit
+        ):
             return False
     return True
 
@@ -277,21 +281,21 @@ def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
                 yield near, index
         elif is_apart and bits >= _LEAST_BITS and _agrees(fit, FINALLY, 1, index):
             spread = -near - (far if np.isfinite(far) else 0.0)
-            travel = max(float(each.travel[index]) for each in fit.good)
+            travel = max(float(run.travel[index]) for run in fit.good)
             exact = np.log2(travel / max(spread, 1e-3 * travel))
             close = np.log2(fit.scale / max(-near, 0.02 * fit.scale))
             yield float(min(bits, 3.0) + min(exact, 4.0) + close), index
 
 
-def _leads(before: dict[tuple[str, Party], set[Party]], relation: str, one: Party, other: Party) -> bool:
+def _leads(before: dict[tuple[str, Party], set[Party]], relation: str, first: Party, second: Party) -> bool:
     """Return whether a chain of directions that are written leads from one object to another."""
-    reached, left = {one}, [one]
+    reached, left = {first}, [first]
     while left:
-        for each in before.get((relation, left.pop()), ()):
-            if each not in reached:
-                reached.add(each)
-                left.append(each)
-    return other in reached
+        for follower in before.get((relation, left.pop()), ()):
+            if follower not in reached:
+                reached.add(follower)
+                left.append(follower)
+    return second in reached
 
 
 def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[float, int, Line]]:
@@ -320,17 +324,17 @@ def _invariants(fit: FittedLimits) -> list[Line]:
         is_written = is_distance or fact.quantity.relation == "enclosedin"
         if is_said and is_written and _agrees(fit, ALWAYS, direction, index):
             scored.append((-round(bits, 3), index, Line("always", fact)))
-    scored.sort(key=lambda each: each[:2])
-    hidden = {(line.fact.direction, each) for _, index, line in scored for each in fit.members[index]}
+    scored.sort(key=lambda item: item[:2])
+    hidden = {(line.fact.direction, member) for _, index, line in scored for member in fit.members[index]}
     return [line for _, index, line in scored if (line.fact.direction, index) not in hidden]
 
 
 def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line]:
     """Yield the order in which goals are reached, each before the next."""
-    goals = [each.near for each in goals]
+    goals = [goal.near for goal in goals]
     times, _ = fit.times(goals, fit.good)
     gaps = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
-    # what holds from the beginning is not reached
+    # a goal that holds from the beginning is not reached
     reached = [
         goals[index]
         for index in np.argsort(np.median(times, axis=1), kind="stable").tolist()
@@ -347,20 +351,20 @@ def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line
             last = last or first
 
 
-def _joined(lines: Sequence[Line]) -> Iterator[Line]:
+def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
     """Yield lines with the two limits of one distance in one."""
     limits: dict[tuple[str, Quantity, int], LimitedRelation] = {
         (line.pattern, line.fact.quantity, line.fact.direction): line.fact
         for line in lines
         if line.fact.quantity.relation == "dist" and line.pattern in ("always", "finally")
     }
-    done = set()
+    joined = set()
     for line in lines:
-        least, greatest = (limits.get((line.pattern, line.fact.quantity, each)) for each in (0, 1))
+        least, greatest = (limits.get((line.pattern, line.fact.quantity, direction)) for direction in (0, 1))
         if line.later is not None or least is None or greatest is None or least.other_limit is not None:
             yield line
-        elif (line.pattern, line.fact.quantity) not in done:
-            done.add((line.pattern, line.fact.quantity))
+        elif (line.pattern, line.fact.quantity) not in joined:
+            joined.add((line.pattern, line.fact.quantity))
             yield Line(line.pattern, replace(least, other_limit=greatest.limit))
 
 
@@ -465,8 +469,8 @@ class Learned(Printed):
             yield f"{name} violates none of these lines"
         if self.specs and len(self.missed) > _MOST_MISSED:
             yield f"… nor do {counted(len(self.missed) - _MOST_MISSED, 'more bad run')}"
-        for each in self.left_out:
-            yield f"not compared: {each}"
+        for omission in self.left_out:
+            yield f"not compared: {omission}"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -520,20 +524,20 @@ def learn_runs(
 
     def learn(some: Sequence[LabelledRun]) -> _Written | None:
         groups = ([observed[id(run)] for run in some if run.is_good is kind] for kind in (True, False))
-        found = chosen_lines(FittedLimits.to(quantities, *groups), lines)
-        return writer.written(found, some)
+        candidates = chosen_lines(FittedLimits.to(quantities, *groups), lines)
+        return writer.write_lines(candidates, some)
 
-    written = learn(runs)
-    if written is not None and bad:
-        written = writer.ordered(written, bad)
-    learned = [_evidence(*each, good, bad) for each in written.pairs] if written is not None else []
+    draft = learn(runs)
+    if draft is not None and bad:
+        draft = writer.order(draft, bad)
+    learned = [_evidence(*pair, good, bad) for pair in draft.pairs] if draft is not None else []
     violating = {name for line in learned for name in line.violated_by}
-    checked = tuple(_checked(good, bad, learn))
+    checked = tuple(_check_folds(good, bad, learn))
     missed = tuple(run.name for run in bad if run.name not in violating)
     text = ""
-    if written is not None:
+    if draft is not None:
         head = list(_head(good, bad, missed, checked, left_out))
-        text = writer.text(written, head, learned, len(good), len(bad))
+        text = writer.text(draft, head, learned, len(good), len(bad))
     return Learned(
         text,
         parse_specification(text, filename="learned.spatial") if text else None,
@@ -560,16 +564,19 @@ def _check(runs: Sequence[LabelledRun]) -> None:
         if len(run.trace) < _FEWEST_SAMPLES:
             have = counted(len(run.trace), "sample")
             raise UsageError(f"{run.name} is too short to learn from: it has {have}; leave it out")
-    for one in good:
-        for other in runs:
-            if other is one or (len(one.trace), one.trace.names) != (len(other.trace), other.trace.names):
+    for first in good:
+        for second in runs:
+            if second is first or (len(first.trace), first.trace.names) != (
+                len(second.trace),
+                second.trace.names,
+            ):
                 continue
-            if one.trace == other.trace:
-                if one.name == other.name:
-                    raise UsageError(f"{one.name} is given twice; give each run once")
-                kind = "good" if other.is_good else "bad"
+            if first.trace == second.trace:
+                if first.name == second.name:
+                    raise UsageError(f"{first.name} is given twice; give each run once")
+                kind = "good" if second.is_good else "bad"
                 raise UsageError(
-                    f"the {kind} run {other.name} holds the same samples as the good run {one.name}; "
+                    f"the {kind} run {second.name} holds the same samples as the good run {first.name}; "
                     "leave one of them out"
                 )
 
@@ -585,12 +592,12 @@ def _missing(good: Sequence[LabelledRun]) -> Iterator[str]:
 
 
 def _nothing_in_common(good: Sequence[LabelledRun]) -> str:
-    listed = "; ".join(
+    names_text = "; ".join(
         f"{run.name} has {printable(', '.join(run.trace.names), 60) or 'none'}" for run in good[:_MOST_NAMED]
     )
     return (
         "no two objects, classes or signals are in all good runs, so there is nothing to compare: "
-        f"{listed}. Give runs of one scene, or a mapping that gives objects the same names or classes"
+        f"{names_text}. Give runs of one scene, or a mapping that gives objects the same names or classes"
     )
 
 
@@ -613,19 +620,19 @@ class _Writer:
     profile: str
     taken: set[str]
 
-    def written(self, lines: Sequence[Line], runs: Sequence[LabelledRun]) -> _Written | None:
+    def write_lines(self, lines: Sequence[Line], runs: Sequence[LabelledRun]) -> _Written | None:
         """Return the lines that, as they are written, all good runs satisfy, and that some bad run violates.
 
         None if there are none.
         """
         if not lines:
             return None
-        kept = [
+        kept_lines = [
             line for line, spec in zip(lines, self._parse(lines).specs, strict=True) if _is_kept(spec, runs)
         ]
-        return _Written(tuple(kept), self._parse(kept)) if kept else None
+        return _Written(tuple(kept_lines), self._parse(kept_lines)) if kept_lines else None
 
-    def ordered(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
+    def order(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
         """Return the same lines: of those that the same bad runs violate, the shorter ones first."""
         alike: dict[tuple[bool, ...], list[Line]] = {}
         keys = []
@@ -659,7 +666,9 @@ class _Writer:
             lowest = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
             lines += ["", _comment(f"Holds in {good} of {counted(good, 'good run')}, {lowest}.")]
             if bad:
-                violating = f"{len(line.violated_by)} of {counted(bad, 'bad run')}{_listed(line.violated_by)}"
+                violating = (
+                    f"{len(line.violated_by)} of {counted(bad, 'bad run')}{_names_text(line.violated_by)}"
+                )
                 lines.append(_comment(f"Violated by {violating}."))
             title = quoted(f"{spec.id}: {spec.title}")
             lines.append(f"spec {spec.name} {title} = {format_formula(spec.formula)}")
@@ -678,7 +687,7 @@ def _comment(text: str) -> str:
     return f"# {printable(text, _LONGEST)}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     if not names:
         return ""
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
@@ -694,7 +703,7 @@ def _evidence(
     return LearnedLine(spec.name, spec.title or "", text, line.pattern, lowest, good[run].name, violating)
 
 
-def _checked(
+def _check_folds(
     good: Sequence[LabelledRun],
     bad: Sequence[LabelledRun],
     learn: Callable[[Sequence[LabelledRun]], _Written | None],
@@ -708,11 +717,11 @@ def _checked(
         folds = len(good)
     for fold in range(folds):
         left_out = [*good[fold::folds], *bad[fold::folds]]
-        kept = [run for run in (*good, *bad) if not any(run is each for each in left_out)]
-        written = learn(kept)
+        training_runs = [run for run in (*good, *bad) if not any(run is omitted for omitted in left_out)]
+        draft = learn(training_runs)
         for run in left_out:
             lower = upper = float("inf")
-            for spec in () if written is None else written.specification.specs:
+            for spec in () if draft is None else draft.specification.specs:
                 low, high = robustness_of(spec.formula, run.trace)
                 lower, upper = min(lower, low), min(upper, high)
             yield CheckedRun(run.name, run.is_good, final_verdict(lower, upper))
@@ -729,13 +738,13 @@ def _head(
     yield f"Learned from {runs}."
     if missed:
         verb = "violates" if len(missed) == 1 else "violate"
-        yield f"{counted(len(missed), 'bad run')} {verb} none of these lines{_listed(missed)}."
+        yield f"{counted(len(missed), 'bad run')} {verb} none of these lines{_names_text(missed)}."
     if checked:
         yield checked_text(checked)
     else:
         yield "Not checked on runs left out: that takes three good runs."
-    for each in left_out:
-        yield f"Not compared: {each}."
+    for omission in left_out:
+        yield f"Not compared: {omission}."
 
 
 def checked_text(checked: Sequence[CheckedRun]) -> str:

@@ -111,34 +111,36 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
         left_out.append(f"classes with more than {MOST_MEMBERS} objects: {', '.join(crowded)}")
     class_pairs = list(_class_pairs(classes, members, names, common))
     pairs = _nearest_first(traces[0], [*combinations(map(Party, names), 2)])
-    kept = [*class_pairs[:most], *pairs[: max(0, most - len(class_pairs))]]
-    if missing := len(class_pairs) + len(pairs) - len(kept):
+    measured_pairs = [*class_pairs[:most], *pairs[: max(0, most - len(class_pairs))]]
+    if missing := len(class_pairs) + len(pairs) - len(measured_pairs):
         left_out.append(
-            f"{counted(missing, 'pair')} of objects that come less near than {len(kept):,} others"
+            f"{counted(missing, 'pair')} of objects that come less near than {len(measured_pairs):,} others"
         )
     signals = sorted(set(traces[0].signals).intersection(*(trace.signals for trace in traces[1:])))
-    signals = [each for each in signals if not any((trace.signals[each] <= TEXTS).any() for trace in traces)]
+    signals = [
+        signal for signal in signals if not any((trace.signals[signal] <= TEXTS).any() for trace in traces)
+    ]
     if len(signals) > MOST_SIGNALS:
         left_out.append(f"{counted(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}")
-    taken = common | {each for trace in traces for each in trace.names}
-    found = [quantity for a, b in kept for quantity in _quantities(a, b, profile, taken)]
+    taken_names = common | {name for trace in traces for name in trace.names}
+    quantities = [quantity for a, b in measured_pairs for quantity in _quantities(a, b, profile, taken_names)]
     for name in signals[:MOST_SIGNALS]:
         atom = Atom(format_relation("signal", (), (name, ">=", 0.0)), "signal", Signal(name))
-        found.append(Quantity("signal", (), name, atom, atom))
-    return found, left_out
+        quantities.append(Quantity("signal", (), name, atom, atom))
+    return quantities, left_out
 
 
 def members_of(trace: Trace) -> dict[str, set[str]]:
     """Return the names of all objects of each class."""
-    found: dict[str, set[str]] = {}
+    names_by_class: dict[str, set[str]] = {}
     for column, name in enumerate(trace.names):
         rows = trace.rows[:, column]
         rows = rows[rows != ABSENT]
         codes = np.unique(trace.class_code[np.where(rows < 0, -2 - rows, rows)])
         for code in codes.tolist():
             if class_name := trace.classes[code]:
-                found.setdefault(class_name, set()).add(name)
-    return found
+                names_by_class.setdefault(class_name, set()).add(name)
+    return names_by_class
 
 
 def _classes(members: Sequence[Mapping[str, set[str]]], common: set[str]) -> tuple[list[str], list[str]]:
@@ -147,9 +149,11 @@ def _classes(members: Sequence[Mapping[str, set[str]]], common: set[str]) -> tup
     fitting = sorted(
         name
         for name in shared
-        if all(len(each[name]) > 1 for each in members) or not members[0][name] <= common
+        if all(len(run_members[name]) > 1 for run_members in members) or not members[0][name] <= common
     )
-    crowded = [name for name in fitting if any(len(each[name]) > MOST_MEMBERS for each in members)]
+    crowded = [
+        name for name in fitting if any(len(run_members[name]) > MOST_MEMBERS for run_members in members)
+    ]
     return [name for name in fitting if name not in crowded], crowded
 
 
@@ -157,13 +161,13 @@ def _class_pairs(
     classes: Sequence[str], members: Sequence[Mapping[str, set[str]]], names: Sequence[str], common: set[str]
 ) -> Iterator[tuple[Party, Party]]:
     for name in classes:
-        if all(len(each[name]) > 1 for each in members):
+        if all(len(run_members[name]) > 1 for run_members in members):
             yield Party(name, True), Party(name, True)
-        for other in names:
-            if not any(other in each[name] for each in members):
-                yield Party(name, True), Party(other)
+        for object_name in names:
+            if not any(object_name in run_members[name] for run_members in members):
+                yield Party(name, True), Party(object_name)
     for a, b in combinations(classes, 2):
-        if not all(each[a] <= common and each[b] <= common for each in members):
+        if not all(run_members[a] <= common and run_members[b] <= common for run_members in members):
             yield Party(a, True), Party(b, True)
 
 
@@ -183,8 +187,8 @@ def _quantities(a: Party, b: Party, profile: str, taken: set[str]) -> Iterator[Q
         yield _quantity(relation, a, b, profile, taken)
     ways = [(a, b)] if a == b else [*permutations((a, b))]
     for relation in _ONE_WAY:
-        for one, other in ways:
-            yield _quantity(relation, one, other, profile, taken)
+        for first, second in ways:
+            yield _quantity(relation, first, second, profile, taken)
 
 
 def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken: set[str]) -> Quantity:
@@ -203,12 +207,12 @@ def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken: set[s
 
 def variables_of(parties: Sequence[Party], taken: set[str]) -> tuple[str, str]:
     """Return a name for a member of each class that no object has."""
-    found = []
+    variables = []
     for name in ("a", "b"):
         while name in taken or name in {party.name for party in parties}:
             name += "_"
-        found.append(name)
-    return found[0], found[1]
+        variables.append(name)
+    return variables[0], variables[1]
 
 
 def _over(parties: tuple[Party, Party], variables: tuple[str, str], atom: Atom) -> Atom | Quantified:
@@ -269,20 +273,20 @@ class Observed:
         scene = TraceScene(trace, {})
         step = max(1, _AT_ONCE // max(1, len(trace)))
         some = np.unique(np.linspace(0, len(trace) - 1, _SAMPLED_OF_A_RUN).astype(np.int64))
-        found: list[tuple[Floats, ...]] = []
+        blocks: list[tuple[Floats, ...]] = []
         for start in range(0, len(quantities), step):
-            values = directed(scene, quantities[start : start + step])
+            values = measure_both_ways(scene, quantities[start : start + step])
             nominal = np.where(np.isfinite(values[0]), values[0], np.nan).mean(axis=0)
-            known = np.isfinite(nominal)
-            span = np.where(known, nominal, -np.inf).max(axis=1) - np.where(known, nominal, np.inf).min(
+            is_known = np.isfinite(nominal)
+            span = np.where(is_known, nominal, -np.inf).max(axis=1) - np.where(is_known, nominal, np.inf).min(
                 axis=1
             )
             ends = values.min(axis=3), values.max(axis=3), values[..., 0], values[..., -1]
-            found.append((*ends, values[:, 0][..., some], np.maximum(span, 0.0)))
-        # the axis of the quantities in each
+            blocks.append((*ends, values[:, 0][..., some], np.maximum(span, 0.0)))
+        # the axis of the quantities in each array
         axes = (2, 2, 2, 2, 1, 0)
         least, greatest, first, last, sampled, travel = (
-            np.concatenate(each, axis) for each, axis in zip(zip(*found, strict=True), axes, strict=True)
+            np.concatenate(parts, axis) for parts, axis in zip(zip(*blocks, strict=True), axes, strict=True)
         )
         shifts = {name: _shift(trace, column) for column, name in enumerate(trace.names)}
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
@@ -294,7 +298,7 @@ class Observed:
             direction: 0 for the quantity, 1 for its negative.
             surely: whether its lower end is to be, rather than its upper end.
         """
-        values = directed(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
+        values = measure_both_ways(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
         holds = values >= limit if surely else values > limit
         return int(holds.argmax()) if holds.any() else len(holds)
 
@@ -316,15 +320,15 @@ def _shift(trace: Trace, column: int) -> float:
     return float(np.hypot(*(last - first).mean(axis=0)))
 
 
-def directed(scene: TraceScene, quantities: Sequence[Quantity]) -> Floats:
+def measure_both_ways(scene: TraceScene, quantities: Sequence[Quantity]) -> Floats:
     """Return quantities and their negatives, with their ends, in each sample: (2, 2, Q, T)."""
     result = np.empty((2, 2, len(quantities), len(scene)))
-    formulas = [each.formula for each in quantities]
+    formulas = [quantity.formula for quantity in quantities]
     values = leaf_values(scene, formulas, {})
     low, high = low_and_high(len(values), wide=True)
     result[0] = values[low], values[high]
     result[1] = -values[high], -values[low]
-    others = [index for index, each in enumerate(quantities) if each.reach is not each.formula]
+    others = [index for index, quantity in enumerate(quantities) if quantity.reach is not quantity.formula]
     if others:
         # the negative of the least number of all members says nothing about the greatest one
         values = leaf_values(scene, [quantities[index].reach for index in others], {})
