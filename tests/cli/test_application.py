@@ -134,10 +134,10 @@ def test_a_broken_pipe_is_not_an_error(tmp_path: Path) -> None:
 
 
 def test_an_interrupt_ends_with_code_130_and_one_line(tmp_path: Path) -> None:
-    endless = tmp_path / "endless.jsonl"
+    endless = tmp_path / "endless.spatial"
     os.mkfifo(endless)
     process = subprocess.Popen(
-        [*PROGRAM, "info", str(endless)], cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True
+        [*PROGRAM, "check", str(endless)], cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True
     )
     # opening waits until the program reads, so the signal meets it at work
     with process, endless.open("w"):
