@@ -1,10 +1,13 @@
-"""Members of open groups that leave a log within reach of a threshold and come back: nothing judged them."""
+"""Members of open groups that leave a log within reach of a threshold and come back: nothing judged them.
+
+An object counts likewise in a formula that asks whether it is present.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,12 +23,20 @@ from spatial_replay.spec.formula import (
     Enlarged,
     Group,
     Outline,
+    Present,
     SignedDistance,
     Term,
     TrackedName,
     Variable,
 )
-from spatial_replay.spec.walks import base_of, iter_bound, iter_expressions, looks_back, substitute
+from spatial_replay.spec.walks import (
+    base_of,
+    iter_bound,
+    iter_expressions,
+    iter_parts,
+    looks_back,
+    substitute,
+)
 from spatial_replay.text import Instant, Sentence, printable, with_unit
 from spatial_replay.trace.trace import ABSENT, Trace
 
@@ -39,7 +50,7 @@ _STAND_IN: Final = "\0"
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """An absence of a member from its open group.
+    """An absence of a member from its open group, or of an object from the log.
 
     Attributes:
         name: of the object.
@@ -56,10 +67,17 @@ class Departure:
     message: Sentence
 
 
-class _Watch(NamedTuple):
-    """The distance of the members of an open group from something, with its threshold."""
+_Visitors: TypeAlias = Group | TrackedName
 
-    group: Group
+
+class _Watch(NamedTuple):
+    """The distance of some members from something, with its threshold.
+
+    Attributes:
+        visitors: the open group of the members, or the one object that its formula asks to be present.
+    """
+
+    visitors: _Visitors
     member: Term
     other: Term
     threshold: float
@@ -69,7 +87,7 @@ class _Watch(NamedTuple):
 
 
 class Departures:
-    """Members of open groups that leave and come back, collected block by block.
+    """Members that leave and come back, collected block by block.
 
     A member counts if it was less than twice the threshold away before or after, or approached fast enough to
     reach the threshold while it was away.
@@ -87,11 +105,11 @@ class Departures:
         """
         self.departures: list[Departure] = []
         self._regions, self._unit = regions, unit
-        self._watches: dict[Group, list[_Watch]] = {}
+        self._watches: dict[_Visitors, list[_Watch]] = {}
         for watch in dict.fromkeys(watch for instance in instances for watch in _watches_of(instance)):
-            self._watches.setdefault(watch.group, []).append(watch)
+            self._watches.setdefault(watch.visitors, []).append(watch)
         self._past: Trace | None = None
-        self._absent: dict[tuple[Group, str], _Absence] = {}
+        self._absent: dict[tuple[_Visitors, str], _Absence] = {}
 
     def add(self, trace: Trace) -> None:
         """Add the next samples; the ones that fill a pause do not count."""
@@ -101,13 +119,13 @@ class Departures:
         if self._past is not None:
             trace = Trace.concatenate([self._past, trace])
         scene = TraceScene(trace, self._regions)
-        for group in self._watches:
-            self._follow(group, scene)
+        for visitors in self._watches:
+            self._follow(visitors, scene)
         self._past = tail(trace, Reach(1, _APPROACH_NS))
 
-    def _follow(self, group: Group, scene: TraceScene) -> None:
+    def _follow(self, visitors: _Visitors, scene: TraceScene) -> None:
         trace, before = scene.trace, 0 if self._past is None else len(self._past)
-        names, members, _ = scene.members(group)
+        names, members = _memberships(visitors, scene)
         # the first sample of a log is no turn
         start = max(before, 1)
         samples, columns = np.nonzero(np.diff(members[start - 1 :], axis=0))
@@ -116,17 +134,19 @@ class Departures:
             return
         early = [_early(trace, members, *turn) for turn in turns]
         wanted = [(first, sample - 1, sample) for first, (sample, _) in zip(early, turns, strict=True)]
-        distances = self._distances(group, [names[column] for _, column in turns], np.array(wanted), trace)
+        distances = self._distances(visitors, [names[column] for _, column in turns], np.array(wanted), trace)
         for (sample, column), places, own in zip(turns, wanted, distances, strict=True):
-            key, times_ns = (group, names[column]), trace.times_ns[list(places)].tolist()
+            key, times_ns = (visitors, names[column]), trace.times_ns[list(places)].tolist()
             if not members[sample, column]:
-                why = _why_absent(group, names[column], trace, sample)
+                why = _why_absent(visitors, names[column], trace, sample)
                 early_ns, last_ns, start_ns = times_ns
                 self._absent[key] = _Absence(why, early_ns, last_ns, start_ns, own[:, 0], own[:, 1])
             elif key in self._absent:
-                self._return(group, names[column], self._absent.pop(key), times_ns[-1], own[:, 2])
+                self._return(visitors, names[column], self._absent.pop(key), times_ns[-1], own[:, 2])
 
-    def _distances(self, group: Group, names: Sequence[str], samples: Integers, trace: Trace) -> Floats:
+    def _distances(
+        self, visitors: _Visitors, names: Sequence[str], samples: Integers, trace: Trace
+    ) -> Floats:
         """Return the distances (N, watches, 3) of N members in three samples of each (N, 3)."""
         columns = np.array([trace.names.index(name) for name in names])
         rows = trace.rows[samples.ravel()]
@@ -143,21 +163,23 @@ class Departures:
             reported_ns=None,
             signals_reported_ns={},
         )
-        watches = self._watches[group]
+        watches = self._watches[visitors]
         values, _ = measured(
             TraceScene(stand_in, self._regions), [watch.distance(_STAND_IN) for watch in watches]
         )
         by_member: Floats = values.reshape(len(watches), *samples.shape).swapaxes(0, 1)
         return by_member
 
-    def _return(self, group: Group, name: str, absence: _Absence, end_ns: int, distances: Floats) -> None:
+    def _return(
+        self, visitors: _Visitors, name: str, absence: _Absence, end_ns: int, distances: Floats
+    ) -> None:
         """Add the departure of a member that is back, if it was within reach of a threshold."""
         span_ns = max(absence.last_ns - absence.early_ns, 1)
         # a group without members is infinitely far away, and no member approaches it
         with np.errstate(invalid="ignore"):
             approach = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
         for watch, close, last, back in zip(
-            self._watches[group], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
+            self._watches[visitors], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
         ):
             reach = max(watch.threshold, close)
             was_near = last - watch.threshold < reach
@@ -195,18 +217,31 @@ def _early(trace: Trace, members: Flags, sample: int, column: int) -> int:
     return begin + int(members[begin:sample, column].argmax())
 
 
-def _why_absent(group: Group, name: str, trace: Trace, sample: int) -> str:
+def _memberships(visitors: _Visitors, scene: TraceScene) -> tuple[Sequence[str], Flags]:
+    """Return the names (M,) of all members and, (T, M), in which samples they are members: 1 or 0."""
+    if isinstance(visitors, Group):
+        names, members, _ = scene.members(visitors)
+        return names, members
+    trace = scene.trace
+    names = tuple(name for name in trace.names if name == visitors.name)
+    columns = [trace.names.index(name) for name in names]
+    return names, (trace.rows[:, columns] != ABSENT).astype(np.int8)
+
+
+def _why_absent(visitors: _Visitors, name: str, trace: Trace, sample: int) -> str:
     """Return why an object is no member in a sample."""
     row = int(trace.rows[sample, trace.names.index(name)])
-    if row == ABSENT:
+    if row == ABSENT or isinstance(visitors, TrackedName):
         return f"{printable(name)} was not in the log"
     current = trace.classes[trace.class_code[row if row >= 0 else -2 - row]]
     instead = f" but {printable(current)!r}" if current else ""
-    return f"{printable(name)} was not of the class {printable(group.class_name or '')!r}{instead}"
+    return f"{printable(name)} was not of the class {printable(visitors.class_name or '')!r}{instead}"
 
 
 def _watches_of(instance: Instance) -> Iterator[_Watch]:
-    for node, around in iter_bound(substitute(instance.formula, instance.bindings)):
+    formula = substitute(instance.formula, instance.bindings)
+    present_terms = {part.term for part in iter_parts(formula) if isinstance(part, Present)}
+    for node, around in iter_bound(formula):
         distances = list(_distances_of(node)) if isinstance(node, Atom) else []
         if not isinstance(node, Atom) or len(distances) != 1:
             continue
@@ -214,11 +249,12 @@ def _watches_of(instance: Instance) -> Iterator[_Watch]:
         limits = [abs(limit) for limit in node.parameters if isinstance(limit, float)]
         first, second = (_with_group(term, groups) for term in (distances[0].first, distances[0].second))
         for member, other in ((first, second), (second, first)):
-            group = base_of(member)
+            visitors = base_of(member)
             is_now = not looks_back(member) and not looks_back(other)
             is_bound = not isinstance(base_of(other), Variable)
-            if isinstance(group, Group) and group.is_open and is_now and is_bound:
-                yield _Watch(group, member, other, max(limits, default=0.0))
+            may_leave = visitors.is_open if isinstance(visitors, Group) else visitors in present_terms
+            if isinstance(visitors, Group | TrackedName) and may_leave and is_now and is_bound:
+                yield _Watch(visitors, member, other, max(limits, default=0.0))
 
 
 def _distances_of(atom: Atom) -> Iterator[SignedDistance]:

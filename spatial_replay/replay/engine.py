@@ -113,7 +113,8 @@ class Replayed:
         vacuous: templates without instances; what decided nothing within a result is in its own `vacuous`.
         certificate: hashes of what went in and came out; empty if none was asked for.
         semantics: the semantics of the formulas.
-        left: members of open groups that left within reach of a threshold and came back; also in `remarks`.
+        left: members of open groups, and objects of `present`, that left within reach of a threshold and came
+            back; also in `remarks`.
     """
 
     log: str

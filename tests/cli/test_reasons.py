@@ -383,17 +383,19 @@ def test_a_kind_of_failure_that_there_is_not_is_refused(
     assert "--fail-on: 'vacous' is not a kind of result; did you mean 'vacuous'?" in capsys.readouterr().err
 
 
+def _point(name: str, x: float, class_name: str) -> dict[str, object]:
+    return {"name": name, "class": class_name, "parts": [{"vertices": [[x, 0.0]], "radius": 0.0}]}
+
+
 def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def seen(name: str, x: float, class_name: str) -> dict[str, object]:
-        return {"name": name, "class": class_name, "parts": [{"vertices": [[x, 0.0]], "radius": 0.0}]}
-
     samples = []
     for k in range(60):
-        objects = [seen("cart", 0.0, "robot"), seen("person_5", 0.7, "dog" if 41 <= k < 50 else "person")]
-        objects += [] if 22 <= k < 38 else [seen("person_3", 0.6, "person"), seen("person_4", 9.0, "person")]
-        objects += [] if 30 <= k < 58 else [seen("person_6", 9.0 if k < 30 else 0.8, "person")]
+        objects = [_point("cart", 0.0, "robot"), _point("person_5", 0.7, "dog" if 41 <= k < 50 else "person")]
+        people = [_point("person_3", 0.6, "person"), _point("person_4", 9.0, "person")]
+        objects += [] if 22 <= k < 38 else people
+        objects += [] if 30 <= k < 58 else [_point("person_6", 9.0 if k < 30 else 0.8, "person")]
         samples.append({"time_ns": k * 100_000_000, "objects": objects})
     (folder / "visits.jsonl").write_text("\n".join(map(json.dumps, samples)))
     (folder / "safe.spatial").write_text(
@@ -413,6 +415,35 @@ def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
     assert left[0]["message"] in capsys.readouterr().err
     assert run(["batch", "visits.jsonl", "--spec", "safe.spatial", "--fail-on", "left", "-o", "out"]) == 1
     assert f"left: {left[0]['message']}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("specification", "each"),
+    [
+        ("spec s = G (present(person_3) -> (person_3 dist cart >= 0.5))\n", []),
+        ("spec s(p) = G (present(p) -> (p dist cart >= 0.5))\n", ["--each", "p=class:person"]),
+    ],
+)
+def test_an_object_that_may_be_absent_is_remarked_when_it_leaves_within_reach(
+    folder: Path, capsys: pytest.CaptureFixture[str], specification: str, each: list[str]
+) -> None:
+    samples = []
+    for k in range(60):
+        objects = [_point("cart", 0.0, "robot")]
+        people = [_point("person_3", 0.6, "person"), _point("person_4", 9.0, "person")]
+        objects += [] if 22 <= k < 38 else people
+        samples.append({"time_ns": k * 100_000_000, "objects": objects})
+    (folder / "visits.jsonl").write_text("\n".join(map(json.dumps, samples)))
+    (folder / "seen.spatial").write_text(specification)
+    arguments = ["replay", "visits.jsonl", "--spec", "seen.spatial", *each, "--json", "-"]
+    assert run(arguments) == 0
+    message = "person_3 was not in the log from 2.200 s to 3.800 s; it was 0.6 away before, from cart"
+    assert [leave["message"] for leave in json.loads(capsys.readouterr().out)["log"]["left"]] == [message]
+    assert run([*arguments, "--fail-on", "left"]) == 1
+    capsys.readouterr()
+    batch = ["batch", "visits.jsonl", "--spec", "seen.spatial", *each, "--fail-on", "left", "-o", "out"]
+    assert run(batch) == 1
+    assert f"left: {message}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,12 @@ from spatial_replay.monitor.departures import Departures
 from spatial_replay.replay.engine import Replay
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, Selection
 
-SPECIFICATION = sr.parse_specification(
+OF_CLASS = sr.parse_specification(
     'group people = class "person"\nspec safe = G (forall p in people: cart dist p >= 0.5)'
+)
+PRESENT = sr.parse_specification(
+    "spec of_p = G (present(p) -> (p dist cart >= 0.5))\n"
+    "spec of_q = G ((q dist cart >= 0.5) or not present(q))"
 )
 STEP_NS = 300_000_000
 
@@ -47,14 +51,16 @@ def trace_of(samples: list[dict[str, tuple[float, str]]]) -> sr.Trace:
     )
 
 
-def expected(samples: list[dict[str, tuple[float, str]]]) -> set[tuple[str, int, int]]:
+def expected(
+    samples: list[dict[str, tuple[float, str]]], classes: tuple[str, ...]
+) -> set[tuple[str, int, int]]:
     """Name, first sample without it and sample of its return, one object after the other."""
     departures = set()
     for name in ("p", "q"):
         distances = {
             k: people[name][0] - 0.25
             for k, people in enumerate(samples)
-            if name in people and people[name][1] == "person"
+            if name in people and people[name][1] in classes
         }
         members = list(distances)
         for last, back in pairwise(members):
@@ -70,17 +76,23 @@ def expected(samples: list[dict[str, tuple[float, str]]]) -> set[tuple[str, int,
 
 
 @examples(200)
-@given(samples=visits(), data=st.data())
-def test_departures_do_not_depend_on_how_a_log_is_divided(samples, data):
+@given(
+    samples=visits(),
+    case=st.sampled_from([(OF_CLASS, ("person",)), (PRESENT, ("person", "dog"))]),
+    data=st.data(),
+)
+def test_departures_do_not_depend_on_how_a_log_is_divided(samples, case, data):
+    specification, classes = case
     trace = trace_of(samples)
-    replayed = Replay(MemorySource(trace), [SPECIFICATION], certify=False).run()
-    assert {(leave.name, leave.start_ns, leave.end_ns) for leave in replayed.left} == expected(samples)
-    instances = Selection(MemorySource(trace), [SPECIFICATION], DEFAULT_OPTIONS).instances(SPECIFICATION)
-    departures = Departures(instances, SPECIFICATION.regions)
+    replayed = Replay(MemorySource(trace), [specification], certify=False).run()
+    departures = {(leave.name, leave.start_ns, leave.end_ns) for leave in replayed.left}
+    assert departures == expected(samples, classes)
+    instances = Selection(MemorySource(trace), [specification], DEFAULT_OPTIONS).instances(specification)
+    by_block = Departures(instances, specification.regions)
     cuts = data.draw(st.sets(st.integers(1, len(trace))))
     for begin, end in pairwise([0, *sorted(cuts), len(trace)]):
-        departures.add(trace.slice(begin, end))
-    assert set(departures.departures) == set(replayed.left)
+        by_block.add(trace.slice(begin, end))
+    assert set(by_block.departures) == set(replayed.left)
 
 
 def test_a_member_infinitely_far_from_an_empty_group_is_no_departure():
