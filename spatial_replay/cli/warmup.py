@@ -41,6 +41,7 @@ spec timed = G[0s, 2s] (cup oriented[1] jug) and H[0, 2] (cup farfrom[0.1] jug[-
 spec open = G (forall x in things: x dist goal >= 0) and (load >= 1) U[0, 3] (cup touch[1] jug)
 spec nested = G (F[0, 2] G[0, 1] (cup ovlp jug))
 spec crowd = G (forall x, y in things: x dist y >= 0)
+spec calm = G (speed(cup) <= 9 and speed(cup, jug) <= 9)
 """
 _PAPER = "region goal = box(0, 0, 4, 4)\nspec reach = (F (cup enclosedin goal)) and G[0, 2] (cup ovlp jug)"
 
