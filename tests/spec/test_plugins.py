@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -120,11 +121,13 @@ def test_a_batch_evaluates_logs_again_whatever_a_plugin_imports() -> None:
     Path("cell.py").write_text(MODULE + "\nimport floor\nSIGNALS = {'crowd': lambda sample: floor.CROWD}\n")
     Path("crowd.spatial").write_text("use cell\nspec few = G (crowd <= 3)\n")
     batch = ["batch", "cell.mcap", "--spec", "crowd.spatial", "--jobs", "1", "--plugin", "cell.py"]
+    path = os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
     for crowd, code in ((2, 0), (4, 1)):
         Path("floor.py").write_text(f"CROWD = {crowd}\n")
         # another process, as commands are: one process reads a file once
         program = [sys.executable, "-m", "spatial_replay", *batch]
-        done = subprocess.run(program, capture_output=True, text=True, check=False)
+        environment = {**os.environ, "PYTHONPATH": path}
+        done = subprocess.run(program, env=environment, capture_output=True, text=True, check=False)
         assert (done.returncode, "(all evaluated now" in done.stdout) == (code, True), done.stderr
 
 
