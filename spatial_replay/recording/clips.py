@@ -212,6 +212,14 @@ class _Held(NamedTuple):
     size: int = _MESSAGE_BYTES
 
 
+class _ManualTrigger(NamedTuple):
+    """A trigger that was fired by hand, with the newest sample and message queued by then; -1 for none."""
+
+    reason: str
+    sample_ns: int
+    message_ns: int
+
+
 class _Open:
     """A clip that is being written: some of the ring still waits, and what comes follows."""
 
@@ -333,21 +341,24 @@ class ClipLog(RecorderLog):
         self._newest_ns = self._evicted_ns = -1
         self._progress: dict[type, tuple[int, float]] = {}
         self._open: _Open | None = None
-        self._fired: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._manual: deque[_ManualTrigger] = deque()
         self._remarks: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._has_overflowed = False
         self.written: tuple[TriggeredClip, ...] = ()
 
     @property
     def is_busy(self) -> bool:
-        """Whether a clip waits to be written, or a trigger was fired by hand."""
-        return (self._newest_ns >= 0 and not self._fired.empty()) or (
-            self._open is not None and bool(self._open.waiting)
-        )
+        """Whether a clip waits to be written, or a trigger that was fired by hand."""
+        return self._is_due or (self._open is not None and bool(self._open.waiting))
 
-    def fire(self, reason: str) -> None:
-        """Fire by hand, from any thread."""
-        self._fired.put(reason)
+    def fire(self, reason: str, sample_ns: int, message_ns: int) -> None:
+        """Fire by hand, from any thread.
+
+        Args:
+            sample_ns, message_ns: times of the newest queued sample and message, -1 for none. The clip is
+                around the later one; around the first to come if there is none.
+        """
+        self._manual.append(_ManualTrigger(reason, sample_ns, message_ns))
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what happened since the last call."""
@@ -361,15 +372,13 @@ class ClipLog(RecorderLog):
         """Take the next samples and messages into the ring; write what belongs to an open clip."""
         come = [*self._held_messages(messages)]
         come += [_Held(each.time_ns, each, _sample_bytes(each)) for each in samples]
+        self._begin_due()
         # in the order of time, so that the ring holds what is around the sample that fires
         for item in sorted(come, key=lambda each: each.time_ns):
             self._hold(item)
             if isinstance(item.content, Sample):
                 self._evaluate(item.content)
-        with suppress(queue.Empty):
-            # before anything came, there is nothing to keep: the first of it fires
-            while self._newest_ns >= 0:
-                self._begin(self._fired.get_nowait(), self._newest_ns)
+            self._begin_due()
         if self._open is not None:
             self._open.write()
             while self._open.waiting_bytes > self._trigger.most_bytes:
@@ -422,6 +431,21 @@ class ClipLog(RecorderLog):
                 self._begin(reason, sample.time_ns)
             self._held_before[text] = reason is not None and text != EVENT
 
+    @property
+    def _is_due(self) -> bool:
+        """Whether the ring has come to the oldest trigger by hand; before anything came, it has not."""
+        if not self._manual or self._newest_ns < 0:
+            return False
+        evaluated_ns, _ = self._progress.get(Sample, (-1, 0.0))
+        return self._manual[0].sample_ns <= evaluated_ns and self._manual[0].message_ns <= self._newest_ns
+
+    def _begin_due(self) -> None:
+        """Open the clips of triggers by hand to which the ring has come."""
+        while self._is_due:
+            manual = self._manual.popleft()
+            time_ns = max(manual.sample_ns, manual.message_ns)
+            self._begin(manual.reason, self._newest_ns if time_ns < 0 else time_ns)
+
     def _is_past(self, time_ns: int) -> bool:
         """Return whether neither samples nor messages up to a time are expected any more."""
         now_s = time.monotonic()
@@ -452,9 +476,11 @@ class ClipLog(RecorderLog):
             clip.put(item)
 
     def _begin(self, reason: str, at_ns: int) -> None:
-        """Open a clip around a time, or make the open one longer where that leaves no hole in it."""
-        if self._open is not None and self._evicted_ns > self._open.until_ns:
-            self._finish(is_interrupted=False)
+        """Open a clip around a time, or make the open one longer if it is not past, and has no hole then."""
+        if self._open is not None:
+            until_ns = self._open.until_ns
+            if self._evicted_ns > until_ns or (at_ns > until_ns and self._is_past(until_ns)):
+                self._finish(is_interrupted=False)
         if self._open is not None:
             clip = self._open
             clip.reasons.append(reason)

@@ -269,6 +269,7 @@ class MessageQueue:
     the writing thread.
 
     Attributes:
+        newest_ns: the latest time of a queued message, -1 before the first.
         is_closed: whether no more messages are taken.
         process: the one that the recorder belongs to.
         failure: why nothing can be written any more, or None.
@@ -294,6 +295,7 @@ class MessageQueue:
         self._declared: Mapping[int, Channel] = MappingProxyType({})
         self._queue: queue.SimpleQueue[Row] = queue.SimpleQueue()
         self._bytes_in = self._bytes_out = 0
+        self.newest_ns = -1
         self.is_closed = False
         self.process = os.getpid()
         self.failure: SpatialReplayError | None = None
@@ -434,6 +436,7 @@ class MessageChannel:
         self._last_ns = time_ns
         if self._queue.put(Row(self._number, self.written, time_ns, publish_ns, payload)):
             self.written += 1
+            self._queue.newest_ns = max(self._queue.newest_ns, time_ns)
         else:
             self.dropped += 1
             self._queue.missed(time_ns)
@@ -557,7 +560,7 @@ class SampleWriter:
         missed = partial(log.miss, kind="message")
         self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring, missed=missed)
         self.dropped = 0
-        self._last_ns = -1
+        self._last_ns = self._queued_ns = -1
         self._unsafe_s: float | None = None
         self._drains = False
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
@@ -610,6 +613,7 @@ class SampleWriter:
         if self._unsafe_s is None:
             self._unsafe_s = time.monotonic()
         self._queue.put(sample)
+        self._queued_ns = sample.time_ns
         if self._queue.qsize() >= self._enough:
             self._ring()
 
@@ -936,12 +940,14 @@ class Recorder(SampleWriter):
     def trigger(self, reason: str = "by hand") -> None:
         """Fire the trigger now, whatever it waits for; from any thread, and from a signal handler.
 
+        The clip is around the newest sample or message at the call, or around the first one to come.
+
         Raises:
             UsageError: the recorder has none.
         """
         if self._clips is None:
             raise UsageError(f"{self.name} is written as a whole; open a Recorder with a trigger")
-        self._clips.fire(reason)
+        self._clips.fire(reason, self._queued_ns, self._messages.newest_ns)
         self._ring()
 
     @property

@@ -528,6 +528,40 @@ def test_clips_of_triggers_far_apart_have_no_holes(tmp_path: Path) -> None:
     assert second == [tick * 10**8 for tick in range(75, 86)]
 
 
+@pytest.mark.parametrize("period_ms", [10, 100])
+def test_each_trigger_by_hand_keeps_what_is_around_its_own_sample(tmp_path: Path, period_ms: int) -> None:
+    period_ns, near = period_ms * MS, 500 // period_ms
+    firing = {100: "at100", 300: "at300", 500: "at500"}
+    with sr.Recorder(tmp_path, trigger=Trigger("manual", before_s=0.5, after_s=0.5)) as recorder:
+        recorder.trigger("start")
+        # a loop that is faster than its clock
+        for tick in range(600):
+            recorder.write(Sample(tick * period_ns, signals={"load": 1.0}))
+            if tick in firing:
+                recorder.trigger(firing[tick])
+    assert [(clip.reason, clip.time_ns) for clip in recorder.clips] == [
+        ("start", 0),
+        *((reason, tick * period_ns) for tick, reason in firing.items()),
+    ]
+    for tick, clip in zip((0, *firing), recorder.clips, strict=True):
+        times_ns = sr.read_trace(clip.path).times_ns.tolist()
+        assert times_ns == [at * period_ns for at in range(max(tick - near, 0), tick + near + 1)]
+
+
+def test_a_trigger_by_hand_keeps_what_is_around_its_message_where_samples_stopped(tmp_path: Path) -> None:
+    with sr.Recorder(tmp_path, trigger=Trigger("manual", before_s=0.5, after_s=0.5)) as recorder:
+        camera = recorder.channel("/camera")
+        recorder.write(Sample(0, signals={"load": 1.0}))
+        for tick in range(600):
+            camera.write(tick * 10**8, {"tick": tick})
+            if tick == 300:
+                recorder.trigger("looked odd")
+    [clip] = recorder.clips
+    assert clip.time_ns == 300 * 10**8
+    ticks = [json.loads(data)["tick"] for topic, _, data in messages_of(clip.path) if topic == "/camera"]
+    assert ticks == [*range(295, 306)]
+
+
 def test_a_ring_stays_within_its_bytes_and_says_what_it_cannot_hold(tmp_path: Path) -> None:
     recorder = kept_by(
         tmp_path, Trigger("violated", before_s=3, after_s=0, most_bytes=2**21), size=2**18, pause_ms=10
