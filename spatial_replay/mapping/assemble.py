@@ -28,7 +28,7 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
 from spatial_replay.mapping.binding import BY_PLACE, Codes
-from spatial_replay.mapping.mapping_file import DEFAULT_MAX_AGE_NS, parse_mapping
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.topic_reader import MISFITS, Extractor, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
@@ -115,7 +115,7 @@ class _Assembling:
             report=self._add_fault,
         )
         self._sample_times = _SampleTimes(plan, name, self._window_ns[0])
-        self._sampled_ends = _SampledEnds(plan, self._readers, self._window_ns)
+        self._silences = _Silences(plan, self._readers, self._window_ns)
         self._begin_ns: int | None = None
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
@@ -147,7 +147,9 @@ class _Assembling:
         if not self._is_live:
             self._remarks.add_pauses()
             self._remarks.add_silences()
-        self._remark_ends()
+        others = " and ".join(sorted(self._plan.fallback_topics))
+        for text in self._silences.remarks(self._plan.sampled_topic or "", others):
+            self._remarks.add(text)
         for text in self._tree.remarks():
             self._remarks.add(text)
         # of a system that runs, there is no log to cut
@@ -179,21 +181,6 @@ class _Assembling:
         self._check_fixed_frame()
         self._settled_ns = LATEST_NS
         return trace
-
-    def _remark_ends(self) -> None:
-        """Remark where samples are taken at other topics than the sampled one."""
-        ends, sampled = self._sampled_ends, self._plan.sampled_topic
-        others = " and ".join(sorted(self._plan.fallback_topics))
-        if ends.before_ns is not None and ends.first_ns is None:
-            self._remarks.add(f"samples are taken at {others}, since {sampled} has no message")
-        if ends.before_ns is not None and ends.first_ns is not None:
-            before = f"samples are taken at {sampled}, which begins at "
-            how = ("; those before, from ", Instant(ends.before_ns, 0), f" on, are at {others}")
-            self._remarks.add(Sentence(before, Instant(ends.first_ns, 0), *how))
-        if ends.after_ns is not None and ends.last_ns is not None:
-            before = f"samples are taken at {sampled}, which ends at "
-            how = ("; those after, until ", Instant(ends.after_ns, 0), f", are at {others}")
-            self._remarks.add(Sentence(before, Instant(ends.last_ns, 0), *how))
 
     def _check_fixed_frame(self) -> None:
         """Raise UsageError if a whole log has frames, but not the fixed one."""
@@ -317,10 +304,6 @@ class _Assembling:
         # samples up to here are out already: a late message counts from now on
         return np.maximum(times_ns, self._settled_ns + 1), np.ones(len(times_ns), np.bool_)
 
-    def _comes_again(self, last_ns: int) -> bool | None:
-        """Return whether the sampled topic goes on after a silence; None if that is not known."""
-        return None
-
     def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
         """Return the samples up to a time; messages before it that come later count from then on.
 
@@ -332,8 +315,8 @@ class _Assembling:
         """
         newest_ns = max(self._newest_ns, self._latest_ns)
         # while a system runs, messages from before its newest one may still come
-        known_ns = upto_ns if self._is_live else newest_ns
-        upto_ns = self._sampled_ends.limit(upto_ns, known_ns, self._comes_again, is_last=is_last)
+        known_ns = upto_ns if self._is_live or is_last else newest_ns - self._plan.late_ns
+        upto_ns = self._silences.limit(upto_ns, known_ns, is_last=is_last)
         if upto_ns <= self._settled_ns:
             return Trace.empty()
         start_ns, end_ns = self._window_ns
@@ -341,7 +324,7 @@ class _Assembling:
         # logs contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
             sampled_ns, others_ns = self._tracker.advance(upto_ns)
-            others_ns = self._sampled_ends.besides(sampled_ns, others_ns)
+            others_ns = self._silences.sampled_in(others_ns)
             times_ns = self._sample_times.upto(np.concatenate([sampled_ns, others_ns]), upto_ns)
             times_ns = times_ns[(times_ns >= start_ns) & (times_ns < end_ns)]
             self._remarks.samples.add(times_ns)
@@ -380,8 +363,7 @@ class Assembler(_Assembling):
     messages are divided.
 
     Args:
-        goes_on: whether the log has a message of the sampled topic after a log time. Without it, the samples
-            after a long silence of that topic wait until it goes on, or the log ends.
+        goes_on: says whether the log has messages after the last one that is added; without it, it has none.
     """
 
     _step, _count, _bytes = _FIRST_STEP, 0, 0
@@ -391,13 +373,11 @@ class Assembler(_Assembling):
         plan: ReadingPlan,
         decoder: Callable[[str], Decoder],
         *,
-        goes_on: Callable[[int], bool] | None = None,
+        goes_on: Callable[[], bool] = lambda: False,
         **options: Any,
     ) -> None:
         super().__init__(plan, decoder, **options)
-        self._goes_on = goes_on
-        self._silence: tuple[int, bool] = -1, False
-        self._newest_log_ns = -1
+        self._silences.goes_on = goes_on
 
     def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
         """Note the times of the first messages of the log, where reading begins after them.
@@ -406,14 +386,7 @@ class Assembler(_Assembling):
             sampled_ns: of the sampled topic, if that one is not read.
             others_ns: of the topics that are sampled before it begins.
         """
-        self._sampled_ends.know_start(sampled_ns, others_ns)
-
-    def _comes_again(self, last_ns: int) -> bool | None:
-        if self._goes_on is None:
-            return None
-        if self._silence[0] != last_ns:
-            self._silence = last_ns, self._goes_on(self._newest_log_ns)
-        return self._silence[1]
+        self._silences.know_start(sampled_ns, others_ns)
 
     def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
         """Add messages in the order of the log; return the samples that are final now.
@@ -430,7 +403,6 @@ class Assembler(_Assembling):
             read = int(ends[begin - 1]) if begin else 0
             by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
             stop = min(begin + self._step - self._count, by_size, len(columns))
-            self._newest_log_ns = max(self._newest_log_ns, int(columns.log_time_ns[begin:stop].max()))
             self._add_step(select(columns, slice(begin, stop)))
             self._count += stop - begin
             self._bytes += int(ends[stop - 1]) - read
@@ -438,7 +410,7 @@ class Assembler(_Assembling):
             if self._count == self._step or self._bytes >= _STEP_BYTES:
                 self._count = self._bytes = 0
                 self._step = min(2 * self._step, _LONGEST_STEP)
-                traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
+                traces.append(self._settle(self._newest_ns - self._plan.wait_ns))
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
     def know_static(self, messages: Iterable[Message]) -> None:
@@ -565,109 +537,141 @@ class _SampleTimes:
         return np.arange(first, max(first, stop), dtype=np.int64) * step_ns
 
 
-class _SampledEnds:
-    """Decides where other topics are sampled: before the sampled topic begins, and after it ends.
+class _Silences:
+    """Decides where other topics are sampled: where the sampled topic is silent for longer than its limit.
 
-    Samples wait until that is decided: for a second, the plan's `silence_ns` or five intervals of the topic.
+    The limit of a silence depends on the two messages before it alone, and is at most the plan's
+    `longest_silence_ns`. So a log, a window of it and a running system decide alike.
 
     Attributes:
-        first_ns, last_ns: times of the first and the last message of the sampled topic; None without any.
-        before_ns: time of the first sample before these; None without any.
-        after_ns: time of the last sample after these; None without any.
+        first_ns: time of the first message of the sampled topic; None without any.
+        before_ns: time of the first sample before that; None without any.
+        goes_on: says whether the log has messages after those that are read.
     """
 
     def __init__(
         self, plan: ReadingPlan, readers: Mapping[str, TopicReader], window_ns: tuple[int, int]
     ) -> None:
-        self._silence_ns = max(plan.silence_ns, DEFAULT_MAX_AGE_NS)
+        self._least_ns, self._most_ns = plan.silence_ns, plan.longest_silence_ns
         self._window_ns = window_ns
         self._sampled = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
         self._others = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
         self._others_begin_ns: int | None = None
-        self._interval_ns: int | None = None
-        self._longest_ns = 0
-        self._has_ended = self._begins_late = False
+        # messages of the sampled topic, from the last two before the next samples on
+        self._past_ns = self._times_ns = np.empty(0, np.int64)
+        # whether the others are sampled after each of these and, in the last place, before the first
+        self._is_filled = np.zeros(1, np.bool_)
+        self._unread_ns: int | None = None
+        self._first_pause_ns: tuple[int, int | None] | None = None
+        self._pauses, self._last_pause_ns, self._last_ns = 0, -1, -1
         self.first_ns: int | None = None
-        self.last_ns: int | None = None
         self.before_ns: int | None = None
-        self.after_ns: int | None = None
+        self.goes_on: Callable[[], bool] = lambda: False
 
     def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
         """Note the times of the first messages of the log, where reading begins after them."""
-        self.first_ns = self.last_ns = sampled_ns
         self._others_begin_ns = others_ns
+        if sampled_ns is not None:
+            self.first_ns = self._unread_ns = sampled_ns
+            self._past_ns = np.array([sampled_ns], np.int64)
 
-    def limit(
-        self, upto_ns: int, newest_ns: int, comes_again: Callable[[int], bool | None], *, is_last: bool
-    ) -> int:
+    def limit(self, upto_ns: int, known_ns: int, *, is_last: bool) -> int:
         """Return the time up to which samples are decided.
 
         Args:
-            upto_ns: time up to which all messages have come.
-            newest_ns: time of the newest message.
-            comes_again: says by the time of its last message whether the sampled topic goes on after a long
-                silence; None if that is not known yet.
-            is_last: whether the log ends here.
+            upto_ns: time up to which samples are asked for.
+            known_ns: time up to which all messages have come.
+            is_last: whether none comes any more.
         """
         if self._sampled is None or not self._others:
             return upto_ns
-        if self._others_begin_ns is None:
-            begins_ns = [int(pending.times_ns.min()) for pending in self._others if len(pending)]
-            self._others_begin_ns = min(begins_ns, default=None)
         waiting_ns = self._sampled.times_ns
-        past_ns, next_ns = waiting_ns[waiting_ns <= upto_ns], waiting_ns[waiting_ns > upto_ns]
-        last_ns = int(past_ns.max()) if len(past_ns) else self.last_ns
-        if last_ns is None:
-            return self._limit_at_start(upto_ns, newest_ns, next_ns, is_last=is_last)
-        silence_ns = newest_ns - last_ns
-        self._has_ended = False
-        if len(next_ns):
-            return upto_ns
-        # a topic that is sampled slowly on purpose is not taken for one that has ended
-        usual_ns = max(self._silence_ns, LONG_PAUSE * self._longest_ns)
-        if silence_ns > (self._tail_ns(past_ns) if is_last else usual_ns):
-            again = comes_again(last_ns)
-            self._has_ended = not again if is_last else again is False
-            return upto_ns if is_last or again is not None else min(upto_ns, last_ns)
-        return upto_ns if is_last else min(upto_ns, last_ns)
-
-    def _limit_at_start(self, upto_ns: int, newest_ns: int, next_ns: Integers, *, is_last: bool) -> int:
+        times_ns = np.unique(np.concatenate([self._past_ns, waiting_ns[waiting_ns <= known_ns]]))
         if self._others_begin_ns is None:
-            return upto_ns
-        silence_ns = int(next_ns.min(initial=newest_ns)) - self._others_begin_ns
-        self._begins_late = silence_ns > self._silence_ns or (is_last and not len(next_ns))
-        is_decided = self._begins_late or is_last or len(next_ns) > 0
-        return upto_ns if is_decided else min(upto_ns, self._others_begin_ns - 1)
+            begin_ns = min(int(pending.times_ns.min(initial=LATEST_NS)) for pending in self._others)
+            self._others_begin_ns = begin_ns if begin_ns <= upto_ns else None
+        is_filled = self._silences(times_ns, known_ns, is_last=is_last)
+        if is_last:
+            if len(times_ns) and not is_filled[-2] and times_ns[-1] < self._window_ns[1]:
+                is_filled[-2] = self.goes_on()
+        elif len(times_ns):
+            last_ns = int(times_ns[-1])
+            upto_ns = upto_ns if last_ns > upto_ns or is_filled[-2] else last_ns
+        elif self._others_begin_ns is not None and not is_filled[-1]:
+            upto_ns = min(upto_ns, self._others_begin_ns - 1)
+        self._times_ns, self._is_filled = times_ns, is_filled
+        # those of before stay, also where fewer samples are asked for than there are
+        past_ns = max(upto_ns, int(self._past_ns.max(initial=-1)))
+        self._past_ns = times_ns[times_ns <= past_ns][-2:]
+        if len(times_ns) and self.first_ns is None:
+            self.first_ns = int(times_ns[0])
+        return upto_ns
 
-    def _tail_ns(self, past_ns: Integers) -> int:
-        """Return how long the sampled topic is silent at most before the log ends."""
-        times_ns = np.unique(past_ns if self.last_ns is None else np.append(past_ns, self.last_ns))
-        interval_ns = int(times_ns[-1] - times_ns[-2]) if len(times_ns) > 1 else self._interval_ns
-        return self._silence_ns if interval_ns is None else min(self._silence_ns, LONG_PAUSE * interval_ns)
+    def _silences(self, times_ns: Integers, known_ns: int, *, is_last: bool) -> Booleans:
+        """Return whether the sampled topic is silent for too long after each message; last, before all."""
+        limits_ns = np.full(len(times_ns), self._most_ns)
+        limits_ns[1:] = np.clip(LONG_PAUSE * np.diff(times_ns), self._least_ns, self._most_ns)
+        # without a message up to `known_ns`, the next one comes later
+        next_ns = np.append(times_ns, known_ns if is_last else known_ns + 1)
+        if is_last and len(times_ns):
+            # a log is judged up to its end, as far as that is no usual interval
+            interval_ns = int(np.diff(times_ns)[-1]) if len(times_ns) > 1 else self._least_ns
+            limits_ns[-1] = min(self._least_ns, LONG_PAUSE * interval_ns)
+        is_late = False
+        if self._others_begin_ns is not None and not len(self._past_ns):
+            is_late = int(next_ns[0]) - self._others_begin_ns > self._least_ns
+            is_late = is_late or (is_last and not len(times_ns))
+        return np.append(next_ns[1:] - times_ns > limits_ns, is_late)
 
-    def besides(self, sampled_ns: Integers, others_ns: Integers) -> Integers:
-        """Return the times of other topics that are sampled, given the messages up to the `limit`."""
-        is_before, is_after = np.full((2, len(others_ns)), [[self._begins_late], [False]])
-        if len(sampled_ns):
-            times_ns = np.unique(sampled_ns if self.last_ns is None else np.append(sampled_ns, self.last_ns))
-            if len(times_ns) > 1:
-                self._interval_ns = int(times_ns[-1] - times_ns[-2])
-                self._longest_ns = max(self._longest_ns, int(np.diff(times_ns).max()))
-            self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
-            self.last_ns = int(times_ns[-1])
-        if self.first_ns is not None and self.last_ns is not None:
-            begins_ns = self.first_ns if self._others_begin_ns is None else self._others_begin_ns
-            is_late = self.first_ns - begins_ns > self._silence_ns
-            is_before = (others_ns < self.first_ns) & is_late
-            is_after = (others_ns > self.last_ns) & self._has_ended
+    def sampled_in(self, others_ns: Integers) -> Integers:
+        """Return the times of other topics that are sampled, of those up to the `limit`."""
+        place = np.searchsorted(self._times_ns, others_ns, "right") - 1
+        is_sampled = self._is_filled[place]
         start_ns, end_ns = self._window_ns
-        is_inside = (others_ns >= start_ns) & (others_ns < end_ns)
-        if (is_before & is_inside).any() and self.before_ns is None:
-            self.before_ns = int(others_ns[is_before & is_inside].min())
-        if (is_after & is_inside).any():
-            self.after_ns = int(others_ns[is_after & is_inside].max())
-        chosen: Integers = others_ns[is_before | is_after]
+        is_inside = is_sampled & (others_ns >= start_ns) & (others_ns < end_ns)
+        self._note(others_ns[is_inside], place[is_inside])
+        chosen: Integers = others_ns[is_sampled]
         return chosen
+
+    def _note(self, others_ns: Integers, place: Integers) -> None:
+        """Note samples at other topics, with the place of the message of the sampled topic before each."""
+        before_ns = others_ns[place < 0]
+        if len(before_ns) and self.before_ns is None:
+            self.before_ns = int(before_ns.min())
+        for start_ns in np.unique(self._times_ns[place[place >= 0]]).tolist():
+            if start_ns != self._last_pause_ns:
+                self._pauses, self._last_pause_ns = self._pauses + 1, start_ns
+                self._first_pause_ns = self._first_pause_ns or (start_ns, None)
+        self._last_ns = max(self._last_ns, int(others_ns.max(initial=-1)))
+        if self._first_pause_ns is not None and self._first_pause_ns[1] is None:
+            later_ns = self._times_ns[self._times_ns > self._first_pause_ns[0]]
+            self._first_pause_ns = self._first_pause_ns[0], int(later_ns[0]) if len(later_ns) else None
+
+    def remarks(self, sampled: str, others: str) -> Iterator[str]:
+        """Yield remarks on samples at other topics, after the last of them."""
+        subject = f"samples are taken at {sampled}, which "
+        if self.before_ns is not None and self.first_ns is None:
+            yield f"samples are taken at {others}, since {sampled} has no message"
+        elif self.before_ns is not None and self.first_ns is not None:
+            how = "; those before, from ", Instant(self.before_ns, 0), f" on, are at {others}"
+            yield Sentence(f"{subject}begins at ", Instant(self.first_ns, 0), *how)
+        if self._first_pause_ns is None:
+            return
+        is_open = self._last_pause_ns == int(self._times_ns[-1])
+        more = self._pauses - is_open - 1
+        start_ns, end_ns = self._first_pause_ns
+        if end_ns is not None:
+            start = () if start_ns == self._unread_ns else ("from ", Instant(start_ns, 0), " ")
+            until = "until " if start_ns == self._unread_ns else "to "
+            between = f" and in {counted(more, 'more pause')}" if more else ""
+            then = f"; those between{between} are at {others}"
+            yield Sentence(f"{subject}pauses ", *start, until, Instant(end_ns, 0), then)
+        if is_open and self._last_pause_ns == self._unread_ns:
+            yield f"samples are taken at {others}, since {sampled} is silent"
+        elif is_open:
+            how = "; those after, until ", Instant(self._last_ns, 0), f", are at {others}"
+            ends = "is silent after " if self.goes_on() else "ends at "
+            yield Sentence(f"{subject}{ends}", Instant(self._last_pause_ns, 0), *how)
 
 
 _MOMENT_S: Final = 0.001
@@ -854,9 +858,6 @@ class LiveAssembler(_Assembling):
         lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
         self._tracker.forget(lost_ns)
         return Trace.concatenate([so_far, lost])
-
-    def _comes_again(self, last_ns: int) -> bool | None:
-        return False
 
     def _counting(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers

@@ -104,10 +104,12 @@ class MappedSource(FileSource):
         copied = _CopiedMessages(channels)
         read = mapped | copied.topics
         first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
+        moving = [topic.name for topic in plan.planned if not topic.is_static]
+        read_end_ns = FOREVER if end_ns is None or not plan.by_log_time else end_ns + plan.margin_ns
         assembler = Assembler(
             plan,
             lambda topic: reader.decoder(by_name[topic]),
-            goes_on=lambda log_ns: first_ns([plan.sampled_topic], log_ns + 1) is not None,
+            goes_on=cache(lambda: read_end_ns < FOREVER and first_ns(moving, read_end_ns) is not None),
             name=self.name,
             start_ns=start_ns,
             end_ns=end_ns,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, compress
 from math import nan
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -76,7 +76,10 @@ from spatial_replay.mapping.message_types import (
 )
 from spatial_replay.mapping.transforms import HISTORY_NS, LEAST_STEP_NS, TransformReader
 from spatial_replay.text import counted, names_from_unit, nearest_hint, text_number
-from spatial_replay.trace.trace import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS, LONG_PAUSE
+
+_LONGEST_SILENCE_NS: Final = 10 * 10**9
+"""A longer silence of the sampled topic is a pause, however rarely it came before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,25 +119,29 @@ class ReadingPlan:
         by_log_time: whether the times of samples are log times. If not, the messages of a window are known
             only when all have been decoded.
         late_ns: how far messages may be out of order; it is also how long samples wait for late messages.
+        wait_ns: how long they wait for messages that change them.
         margin_ns: how far beyond the end of a window messages still count.
         planned: how each topic is read, in the order of `topics`.
         lost: topics with transforms that cannot be decoded, with the reason.
         absent: optional topics that the log lacks.
         sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
-        fallback_topics: the topics that are sampled before that one begins and after it ends.
-        silence_ns: silence of that topic at either end of the log before these are sampled.
+        fallback_topics: the topics that are sampled where that one is silent.
+        silence_ns: that topic is silent for at least so long before these are sampled.
+        longest_silence_ns: if it is silent for longer than that, they are, however rarely it came before.
         remarks: what is doubtful about the choice of that topic.
     """
 
     mapping: LogMapping
     topics: tuple[str, ...]
     by_log_time: bool
+    wait_ns: int
     margin_ns: int
     late_ns: int = DISORDER_NS
     planned: tuple[PlannedTopic, ...] = ()
     sampled_topic: str | None = None
     fallback_topics: frozenset[str] = frozenset()
     silence_ns: int = DEFAULT_MAX_AGE_NS
+    longest_silence_ns: int = 0
     lost: tuple[tuple[str, str], ...] = ()
     absent: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -163,20 +170,23 @@ class ReadingPlan:
             names.append(sampled)
         planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
         waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
-        silence_ns = max((topic.silence_ns for topic in planned if topic.name == sampled), default=0)
-        if sampled is not None:
-            silence_ns = max(silence_ns, DEFAULT_MAX_AGE_NS)
-        longest_ns = max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0, silence_ns)
+        fallback_topics = _fallback_topics(planned, sampled)
+        silences_ns = (topic.silence_ns for topic in planned if topic.name == sampled)
+        silence_ns = max([DEFAULT_MAX_AGE_NS, *silences_ns])
+        longest_silence_ns = max(silence_ns, _LONGEST_SILENCE_NS) if sampled and fallback_topics else 0
+        wait_ns = late_ns + max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0)
         return cls(
             mapping=mapping,
             topics=tuple(names),
             by_log_time=all(topic.clock == "log" for topic in planned),
             late_ns=late_ns,
-            margin_ns=late_ns + longest_ns,
+            wait_ns=wait_ns,
+            margin_ns=max(wait_ns, late_ns + longest_silence_ns),
             planned=planned,
             sampled_topic=sampled,
-            fallback_topics=_fallback_topics(planned, sampled),
+            fallback_topics=fallback_topics,
             silence_ns=silence_ns,
+            longest_silence_ns=longest_silence_ns,
             lost=tuple(lost),
             absent=tuple(topic for topic in mapped if topic not in known),
             remarks=(
@@ -196,7 +206,8 @@ class ReadingPlan:
         ]
         own = planned.max_age_ns if planned.mapping is not None else 0
         if topic == self.sampled_topic:
-            own = max(own, self.silence_ns)
+            # its last message before a pause, and the one before that
+            own = max(own, self.longest_silence_ns + self.longest_silence_ns // LONG_PAUSE)
         if planned.is_transforms and not planned.is_static:
             # an observation of the window may be that old, and is placed by a transform of its time
             own = max(own, HISTORY_NS + max(ages, default=0))

@@ -106,15 +106,49 @@ def test_samples_begin_where_another_topic_begins(folder: Path, capsys: pytest.C
         assert window["log"]["samples"] == count
 
 
-def test_a_pause_of_the_sampled_topic_gets_no_samples(
+def test_a_pause_of_the_sampled_topic_is_judged_at_the_others(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapping = PAIR.replace("robot, ", "robot, max_age: forever, ")
+    # the cart drives through the robot and away again while the robot says nothing
+    robot = positions("/robot", range(0, 5_000, 20)) + positions("/robot", range(10_000, 12_000, 20))
+    robot += positions("/robot", range(14_000, 15_000, 20))
+    away, near = (
+        positions("/cart", range(0, 6_500, 100), 0, 6.0),
+        positions("/cart", range(6_500, 8_500, 100)),
+    )
+    write(folder, mapping, robot, away, near, positions("/cart", range(8_500, 15_000, 100), 0, 6.0))
+    document, said = replay(capsys, code=1)
+    assert document["log"]["samples"] == 250 + 50 + 100 + 20 + 50
+    assert (
+        "samples are taken at /robot, which pauses from 4.980 s to 10.000 s;"
+        " those between and in 1 more pause are at /cart" in said
+    )
+    for start, end, code, count in ((4, 6, 0, 50 + 10), (6, 9, 1, 30), (9, 11, 0, 10 + 50), (12, 14, 0, 20)):
+        window, _ = replay(capsys, "--from", f"{start}s", "--to", f"{end}s", code=code)
+        assert window["log"]["samples"] == count
+
+
+def test_objects_of_a_sampled_topic_grow_stale_in_its_pause(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = positions("/robot", range(0, 5_000, 20)) + positions("/robot", range(9_000, 12_000, 20))
     write(folder, PAIR, robot, positions("/cart", range(0, 12_000, 100), 0, 6.0))
+    _, said = replay(capsys, code=4)
+    assert "/robot: robot is unknown in up to 30 samples, the first at 6.000 s" in said
+    replay(capsys, "--to", "5.9s", code=0)
+
+
+@pytest.mark.parametrize("period_ms", [500, 2_000, 9_000])
+def test_a_topic_that_is_sampled_slowly_makes_all_samples(
+    folder: Path, capsys: pytest.CaptureFixture[str], period_ms: int
+) -> None:
+    mapping = "sample: {topic: /robot}\n" + PAIR
+    robot = positions("/robot", range(0, 6 * period_ms, period_ms))
+    write(folder, mapping, robot, positions("/cart", range(0, 5 * period_ms + 1, 100), 0, 6.0))
     document, said = replay(capsys, code=0)
-    assert document["log"]["samples"] == 250 + 150
-    assert "samples pause for 4.020 s" in said
-    assert replay(capsys, "--from", "3s", "--to", "8s")[0]["log"]["samples"] == 100
+    assert document["log"]["samples"] == 6
+    assert "those" not in said
 
 
 def test_a_latched_topic_that_came_regularly_and_stops_is_remarked(
