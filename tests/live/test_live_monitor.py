@@ -854,7 +854,7 @@ def test_a_run_begins_where_its_recording_does(
     # the last sample is not evaluated before the end, as no message follows
     with rude_server(*sent) as address:
         command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "-o", str(output)]
-        assert run([*command, "--for", "2s"]) == code
+        assert run([*command, "--for", "4s"]) == code
     said = capsys.readouterr().out
     begin_ns = int(sr.read_trace(output).times_ns[0])
     if code:
@@ -877,7 +877,7 @@ def test_remarks_of_a_run_count_times_from_its_first_sample(
         pose(number, tick, 2.0 * (number == 1)) for tick in ticks for number in (2, 1)[: 2 - (tick > 10_010)]
     ]
     with rude_server(*sent) as address:
-        assert run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "--for", "2s"]) == 0
+        assert run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "--for", "4s"]) == 0
     assert "samples are taken at /robot, which ends at 0.100 s" in capsys.readouterr().err
 
 
@@ -946,19 +946,27 @@ def test_a_run_waits_as_long_as_start_within_says(tmp_path: Path) -> None:
 
 def test_a_message_that_comes_too_late_is_said(tmp_path: Path) -> None:
     mapped, spec = files(tmp_path, MAPPING, SPEC)
+    is_sampled = threading.Event()
+
+    def is_last(update: LiveUpdate) -> bool:
+        if update.time_ns == 100 * MS:
+            is_sampled.set()
+        return update.time_ns == 200 * MS
+
     with robot() as own:
 
         def drive_late() -> None:
             until(own.is_heard)
-            for tick in (0, 10, 20):
-                own.send("/robot", tick * 10 * MS, x=2.0, y=0.0)
-                time.sleep(0.5 * (tick == 10))
-                own.send("/vase", tick * 10 * MS, x=0.0, y=0.0)
+            for time_ns in (0, 100 * MS, 200 * MS):
+                own.send("/robot", time_ns, x=2.0, y=0.0)
+                if time_ns == 100 * MS:
+                    until(is_sampled.is_set)
+                own.send("/vase", time_ns, x=0.0, y=0.0)
 
         driving = threading.Thread(target=drive_late)
         driving.start()
-        found = asyncio.run(updates_of(own.address, spec, mapped, 3))
+        updates = asyncio.run(updates_of(own.address, spec, mapped, is_last))
         driving.join()
-    assert [each.time_ns for each in found] == [0, 100 * MS, 200 * MS]
-    notes = [note for each in found for note in each.notes if "it came after the samples" in note]
+    assert [update.time_ns for update in updates] == [0, 100 * MS, 200 * MS]
+    notes = [note for update in updates for note in update.notes if "it came after the samples" in note]
     assert len(notes) == 1 and "/vase at 0.100 s" in notes[0] and "the next sample has it" in notes[0]
