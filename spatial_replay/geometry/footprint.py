@@ -394,6 +394,14 @@ class FootprintBatch:
         return len(self.part_start) - 1
 
     @property
+    def sizes(self) -> Floats:
+        """The diagonal of each footprint's box, (R,); of a disc its diameter."""
+        start = self.vertex_start[self.part_start[:-1]]
+        spans = [np.maximum.reduceat(x, start) - np.minimum.reduceat(x, start) for x in self.vertices.T]
+        sizes: Floats = np.hypot(*spans) + 2.0 * np.maximum.reduceat(self.radius, self.part_start[:-1])
+        return sizes
+
+    @property
     def nbytes(self) -> int:
         """The size of its arrays in bytes."""
         numbers = (self.vertices, self.radius, self.bottom, self.top)

@@ -75,6 +75,8 @@ class _Watch(NamedTuple):
 
     Attributes:
         visitors: the open group of the members, or the one object that its formula asks to be present.
+        member, other: not enlarged.
+        threshold: enlargements are part of it.
     """
 
     visitors: _Visitors
@@ -90,7 +92,7 @@ class Departures:
     """Members that leave and come back, collected block by block.
 
     A member counts if it was less than twice the threshold away before or after, or approached fast enough to
-    reach the threshold while it was away.
+    reach the threshold while it was away. At a threshold of 0 it counts if it was nearer than its own size.
 
     Attributes:
         departures: the ones so far.
@@ -134,21 +136,24 @@ class Departures:
             return
         early = [_early(trace, members, *turn) for turn in turns]
         wanted = [(first, sample - 1, sample) for first, (sample, _) in zip(early, turns, strict=True)]
-        distances = self._distances(visitors, [names[column] for _, column in turns], np.array(wanted), trace)
-        for (sample, column), places, own in zip(turns, wanted, distances, strict=True):
+        own_columns = np.array([trace.names.index(names[column]) for _, column in turns])
+        distances = self._distances(visitors, own_columns, np.array(wanted), trace)
+        sizes = _sizes(trace, np.array(wanted)[:, 1:], own_columns)
+        for (sample, column), places, own, (last_size, size) in zip(
+            turns, wanted, distances, sizes.tolist(), strict=True
+        ):
             key, times_ns = (visitors, names[column]), trace.times_ns[list(places)].tolist()
             if not members[sample, column]:
                 why = _why_absent(visitors, names[column], trace, sample)
                 early_ns, last_ns, start_ns = times_ns
-                self._absent[key] = _Absence(why, early_ns, last_ns, start_ns, own[:, 0], own[:, 1])
+                self._absent[key] = _Absence(
+                    why, early_ns, last_ns, start_ns, own[:, 0], own[:, 1], last_size
+                )
             elif key in self._absent:
-                self._return(visitors, names[column], self._absent.pop(key), times_ns[-1], own[:, 2])
+                self._return(visitors, names[column], self._absent.pop(key), times_ns[-1], own[:, 2], size)
 
-    def _distances(
-        self, visitors: _Visitors, names: Sequence[str], samples: Integers, trace: Trace
-    ) -> Floats:
+    def _distances(self, visitors: _Visitors, columns: Integers, samples: Integers, trace: Trace) -> Floats:
         """Return the distances (N, watches, 3) of N members in three samples of each (N, 3)."""
-        columns = np.array([trace.names.index(name) for name in names])
         rows = trace.rows[samples.ravel()]
         own = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
         # one object stands for each member in its samples, so that all are measured at once
@@ -171,7 +176,7 @@ class Departures:
         return by_member
 
     def _return(
-        self, visitors: _Visitors, name: str, absence: _Absence, end_ns: int, distances: Floats
+        self, visitors: _Visitors, name: str, absence: _Absence, end_ns: int, distances: Floats, size: float
     ) -> None:
         """Add the departure of a member that is back, if it was within reach of a threshold."""
         span_ns = max(absence.last_ns - absence.early_ns, 1)
@@ -181,9 +186,8 @@ class Departures:
         for watch, close, last, back in zip(
             self._watches[visitors], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
         ):
-            reach = max(watch.threshold, close)
-            was_near = last - watch.threshold < reach
-            if was_near or back - watch.threshold < watch.threshold:
+            was_near = last - watch.threshold < max(watch.threshold or absence.size, close)
+            if was_near or back - watch.threshold < (watch.threshold or size):
                 start, end = Instant(absence.start_ns, 0), Instant(end_ns, 0)
                 distance, when = (last, "before") if was_near else (back, "after")
                 away = f"it was {with_unit(distance, self._unit)} away {when}"
@@ -201,6 +205,7 @@ class _Absence(NamedTuple):
         early_ns, last_ns: a sample at most a second before the last one with the member, and that.
         start_ns: the first sample without it.
         early, last: (watches,), its distances in the first two.
+        size: its own in the second.
     """
 
     why: str
@@ -209,12 +214,21 @@ class _Absence(NamedTuple):
     start_ns: int
     early: Floats
     last: Floats
+    size: float
 
 
 def _early(trace: Trace, members: Flags, sample: int, column: int) -> int:
     """Return the first sample with a member in the second before the one before a sample."""
     begin = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
     return begin + int(members[begin:sample, column].argmax())
+
+
+def _sizes(trace: Trace, samples: Integers, columns: Integers) -> Floats:
+    """Return the sizes (N, K) of N objects in K samples of each (N, K); 0 where they are unknown."""
+    rows = trace.rows[samples, columns[:, None]]
+    sizes = np.zeros(rows.shape)
+    sizes[rows >= 0] = trace.footprints.select(rows[rows >= 0]).sizes
+    return sizes
 
 
 def _memberships(visitors: _Visitors, scene: TraceScene) -> tuple[Sequence[str], Flags]:
@@ -246,15 +260,17 @@ def _watches_of(instance: Instance) -> Iterator[_Watch]:
         if not isinstance(node, Atom) or len(distances) != 1:
             continue
         groups = {variable: scope.group for scope in around for variable in scope.variables}
-        limits = [abs(limit) for limit in node.parameters if isinstance(limit, float)]
-        first, second = (_with_group(term, groups) for term in (distances[0].first, distances[0].second))
+        terms = distances[0].first, distances[0].second
+        limits = (abs(limit) for limit in node.parameters if isinstance(limit, float))
+        threshold = max(limits, default=0.0) + sum(map(_enlargement, terms))
+        first, second = (_with_group(_without_enlargement(term), groups) for term in terms)
         for member, other in ((first, second), (second, first)):
             visitors = base_of(member)
             is_now = not looks_back(member) and not looks_back(other)
             is_bound = not isinstance(base_of(other), Variable)
             may_leave = visitors.is_open if isinstance(visitors, Group) else visitors in present_terms
             if isinstance(visitors, Group | TrackedName) and may_leave and is_now and is_bound:
-                yield _Watch(visitors, member, other, max(limits, default=0.0))
+                yield _Watch(visitors, member, other, threshold)
 
 
 def _distances_of(atom: Atom) -> Iterator[SignedDistance]:
@@ -262,9 +278,17 @@ def _distances_of(atom: Atom) -> Iterator[SignedDistance]:
     return (part for part in dict.fromkeys(parts) if isinstance(part, SignedDistance))
 
 
+def _enlargement(term: Term) -> float:
+    return term.radius + _enlargement(term.term) if isinstance(term, Enlarged) else 0.0
+
+
+def _without_enlargement(term: Term) -> Term:
+    return _without_enlargement(term.term) if isinstance(term, Enlarged) else term
+
+
 def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
-    """Return a term in which what it enlarges, or is the centre of, is changed."""
-    if isinstance(term, Enlarged | Centre):
+    """Return a term in which the object that it is the centre of, or itself, is changed."""
+    if isinstance(term, Centre):
         inner: Any = _with_base(term.term, change)
         return replace(term, term=inner)
     return change(term)

@@ -175,7 +175,4 @@ def _size(trace: Trace, name: str) -> float:
     rows = rows[rows >= 0]
     if not len(rows):
         return 0.0
-    batch = trace.footprints.select(rows[:: -(-len(rows) // _MOST_SIZES)])
-    start = batch.vertex_start[batch.part_start[:-1]]
-    spans = [np.maximum.reduceat(x, start) - np.minimum.reduceat(x, start) for x in batch.vertices.T]
-    return float(np.median(np.hypot(*spans) + 2.0 * np.maximum.reduceat(batch.radius, batch.part_start[:-1])))
+    return float(np.median(trace.footprints.select(rows[:: -(-len(rows) // _MOST_SIZES)]).sizes))

@@ -422,6 +422,7 @@ def test_a_member_that_leaves_within_reach_is_remarked_and_can_fail_a_gate(
     [
         ("spec s = G (present(person_3) -> (person_3 dist cart >= 0.5))\n", []),
         ("spec s(p) = G (present(p) -> (p dist cart >= 0.5))\n", ["--each", "p=class:person"]),
+        ('spec s = G (forall p in class "person": not (enlarge(p, 0.4) ovlp cart))\n', []),
     ],
 )
 def test_an_object_that_may_be_absent_is_remarked_when_it_leaves_within_reach(

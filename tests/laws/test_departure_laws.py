@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +22,10 @@ PRESENT = sr.parse_specification(
     "spec of_p = G (present(p) -> (p dist cart >= 0.5))\n"
     "spec of_q = G ((q dist cart >= 0.5) or not present(q))"
 )
+ENLARGED = sr.parse_specification(
+    'spec safe = G (forall p in class "person": not (enlarge(p, 0.25) ovlp enlarge(cart, 0.25)))'
+)
+OVERLAP = sr.parse_specification('spec safe = G (forall p in class "person": not (p ovlp cart))')
 STEP_NS = 300_000_000
 
 
@@ -30,7 +35,7 @@ def visits(draw) -> list[dict[str, tuple[float, str]]]:
     samples = []
     for _ in range(draw(st.integers(1, 10))):
         names = draw(st.sets(st.sampled_from(["p", "q"])))
-        places = st.sampled_from([0.25, 0.75, 1.5, 2.0])
+        places = st.sampled_from([0.25, 0.375, 0.75, 1.5, 2.0])
         samples.append(
             {name: (draw(places), draw(st.sampled_from(["person"] * 4 + ["dog"]))) for name in names}
         )
@@ -52,7 +57,7 @@ def trace_of(samples: list[dict[str, tuple[float, str]]]) -> sr.Trace:
 
 
 def expected(
-    samples: list[dict[str, tuple[float, str]]], classes: tuple[str, ...]
+    samples: list[dict[str, tuple[float, str]]], classes: tuple[str, ...], threshold: float
 ) -> set[tuple[str, int, int]]:
     """Name, first sample without it and sample of its return, one object after the other."""
     departures = set()
@@ -69,24 +74,30 @@ def expected(
             # the approach over the last second, which is three steps
             early = min(k for k in members if last - 3 <= k <= last)
             speed = (distances[early] - distances[last]) / (last - early) if early < last else 0.0
-            reach = max(0.5, speed * (back - last))
-            if distances[last] - 0.5 < reach or distances[back] - 0.5 < 0.5:
+            near = threshold or 0.25  # the diameter of each disc
+            reach = max(near, speed * (back - last))
+            if distances[last] - threshold < reach or distances[back] - threshold < near:
                 departures.add((name, (last + 1) * STEP_NS, back * STEP_NS))
     return departures
 
 
-@examples(200)
-@given(
-    samples=visits(),
-    case=st.sampled_from([(OF_CLASS, ("person",)), (PRESENT, ("person", "dog"))]),
-    data=st.data(),
+@pytest.mark.parametrize(
+    ("specification", "classes", "threshold"),
+    [
+        (OF_CLASS, ("person",), 0.5),
+        (PRESENT, ("person", "dog"), 0.5),
+        (ENLARGED, ("person",), 0.5),
+        (OVERLAP, ("person",), 0.0),
+    ],
+    ids=["of a class", "present", "enlarged", "overlap"],
 )
-def test_departures_do_not_depend_on_how_a_log_is_divided(samples, case, data):
-    specification, classes = case
+@examples(200)
+@given(samples=visits(), data=st.data())
+def test_departures_do_not_depend_on_how_a_log_is_divided(specification, classes, threshold, samples, data):
     trace = trace_of(samples)
     replayed = Replay(MemorySource(trace), [specification], certify=False).run()
     departures = {(leave.name, leave.start_ns, leave.end_ns) for leave in replayed.left}
-    assert departures == expected(samples, classes)
+    assert departures == expected(samples, classes, threshold)
     instances = Selection(MemorySource(trace), [specification], DEFAULT_OPTIONS).instances(specification)
     by_block = Departures(instances, specification.regions)
     cuts = data.draw(st.sets(st.integers(1, len(trace))))
