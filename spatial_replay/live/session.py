@@ -30,7 +30,7 @@ from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.mapping.topic_reader import ReadingPlan
-from spatial_replay.monitor.ends import Needs, RunEnds, trim_trace
+from spatial_replay.monitor.ends import Needs, RunEnds
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -279,7 +279,7 @@ class LiveSession:
         self._monitors = [Monitor(file, units=units) for file in self.files]
         self._changes = VerdictChanges(self.files)
         within_ns = None if start_within_s is None else round(start_within_s * 1e9)
-        self._ends = RunEnds(Needs.of(self.files, {}), end=False, within_ns=within_ns)
+        self._ends = RunEnds(Needs.of(self.files, {}), within_ns=within_ns)
         rehearse()
         self._assembler: LiveAssembler | ObjectsAssembler | None = None
         self._channels: tuple[Channel, ...] = ()
@@ -390,8 +390,11 @@ class LiveSession:
                     self._begin(inbox, time.monotonic())
                 async for update in self._turn(inbox):
                     yield update
-            async for update in self._evaluated(self._finish(), time.monotonic()):
-                yield update
+            if self._assembler is not None:
+                trace = self._assembler.finish()
+                async for update in self._evaluated(trace, time.monotonic(), self._ends.finish):
+                    yield update
+                self.remarks = counted_from(self._assembler.take_remarks(), self._ends.begin_ns or 0)
         finally:
             listening.cancel()
             with suppress(asyncio.CancelledError, Exception):
@@ -492,14 +495,15 @@ class LiveSession:
                         # the run begins after the pause, so that no value holds on in it
                         self._early = Inbox()
                     else:
-                        async for update in self._evaluated(self._assembler.flush(), at_s):
+                        trace = self._assembler.flush()
+                        async for update in self._evaluated(trace, at_s, self._ends.release):
                             yield update
                     self._notes.append(
                         f"the connection to {self._address} is lost: {reason}; everything is unknown until"
                         " it is back"
                     )
-                    trace = self._lose(list(self._planned), "connection lost")
-                    async for update in self._evaluated(trace, at_s):
+                    lost = self._lose(list(self._planned), "connection lost")
+                    async for update in self._evaluated(lost, at_s, self._ends.release):
                         yield update
         async for update in self._evaluated(self._add(messages), arrived_s):
             yield update
@@ -512,7 +516,8 @@ class LiveSession:
             self._notes.append(
                 f"no message on {listed} for {self._topic_timeout_s:g} s: what it reports is unknown"
             )
-            async for update in self._evaluated(self._lose(silent, f"silence on {listed}"), now_s):
+            lost = self._lose(silent, f"silence on {listed}")
+            async for update in self._evaluated(lost, now_s, self._ends.release):
                 yield update
 
     def _note_return(self, topic: str, arrived_s: float) -> None:
@@ -654,10 +659,16 @@ class LiveSession:
 
     # ------------------------------------------------------------------------------ evaluating
 
-    async def _evaluated(self, trace: Trace | None, arrived_s: float) -> AsyncIterator[LiveUpdate]:
-        """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait."""
+    async def _evaluated(
+        self, trace: Trace | None, arrived_s: float, remaining: Callable[[], list[Trace]] | None = None
+    ) -> AsyncIterator[LiveUpdate]:
+        """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait.
+
+        Args:
+            remaining: returns the samples that would wait for later ones, as far as they count.
+        """
         if trace is not None:
-            trace = self._since_begin(trace)
+            trace = self._counting(trace, remaining)
         if trace is None or not len(trace):
             return
         turn_s = time.monotonic()
@@ -677,22 +688,25 @@ class LiveSession:
                 turn_s = now_s
             yield self._update(sample, arrived_s)
 
-    def _since_begin(self, trace: Trace, *, is_last: bool = False) -> Trace:
-        """Return the samples that count: none before each needed topic can be judged."""
+    def _counting(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
+        """Return the samples that count: none before each needed topic can be judged, nor where the run may
+        have ended."""
         ends = self._ends
-        had_begun = ends.begin_ns is not None
-        if had_begun:
-            return trace
-        counting = [*ends.add(trace), *(ends.finish() if is_last else ())]
+        had_begun, remarks = ends.begin_ns is not None, ends.remarks
+        # a sample that can be judged does not wait for the next one, which may not be
+        parts = [trace.slice(place, place + 1) for place in range(len(trace))]
+        counting = [part for added in (parts if had_begun else [trace]) for part in ends.add(added)]
+        if remaining is not None:
+            counting += remaining()
         if ends.begin_ns is not None:
-            self._notes += counted_from(ends.remarks, ends.begin_ns)
-            if ends.late:
+            self._notes += counted_from(ends.remarks[len(remarks) :], ends.begin_ns)
+            if ends.late and not had_begun:
                 listed = ", ".join(ends.late)
                 self._notes.append(
                     f"the run begins although {listed} cannot be judged yet: until then, what it reports is"
                     " unknown, and groups lack its objects; --start-within (start_within_s) waits longer"
                 )
-        return Trace.concatenate(counting)
+        return counting[0] if len(counting) == 1 else Trace.concatenate(counting)
 
     def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
         updates = tuple(monitor.update(sample) for monitor in self._monitors)
@@ -712,16 +726,6 @@ class LiveSession:
             recorder.write(sample)
         changes = tuple(self._changes.after(updates))
         return LiveUpdate(sample, changes, self.take_notes(), self._delay_s, self._dropped, updates)
-
-    def _finish(self) -> Trace | None:
-        if self._assembler is None:
-            return None
-        trace = self._since_begin(self._assembler.finish(), is_last=True)
-        trace, left_out = trim_trace(trace, self._ends.needs, start=False, is_rest=self._samples > 0)
-        begin_ns = self._ends.begin_ns or 0
-        self._notes += counted_from(left_out, begin_ns)
-        self.remarks = counted_from(self._assembler.take_remarks(), begin_ns)
-        return trace
 
 
 _WAITING = 65_536

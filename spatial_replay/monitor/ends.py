@@ -113,6 +113,7 @@ class RunEnds:
         self._spans: dict[str, TopicSpan] = {}
         self._since_ns: dict[str, int | None] = {}
         self._held: list[Trace] = []
+        self._released_ns = -1
         self.log_begin_ns = self._log_end_ns = 0
         self._is_empty = True
         self.begin_ns: int | None = None
@@ -138,6 +139,10 @@ class RunEnds:
         if self.begin_ns is None and not self._decide_begin():
             return []
         return self._release(self._open_since_ns())
+
+    def release(self) -> list[Trace]:
+        """Return the samples that wait, which count, too; none before evaluation begins."""
+        return [] if self.begin_ns is None else self._release(FOREVER)
 
     def finish(self) -> list[Trace]:
         """Return the remaining samples that count, at the end of the log."""
@@ -234,8 +239,8 @@ class RunEnds:
             return
         for span in self.needs.choose(tuple(self._spans.values())):
             since_ns = self._since_ns[span.topic]
-            begin_ns = -1 if self._is_rest else self.begin_ns or 0
-            if since_ns is not None and since_ns > begin_ns and self._log_end_ns - since_ns <= span.limit_ns:
+            before_ns = max(self._released_ns, -1 if self._is_rest else self.begin_ns or 0)
+            if since_ns is not None and since_ns > before_ns and self._log_end_ns - since_ns <= span.limit_ns:
                 yield span
 
     def _open_since_ns(self) -> int:
@@ -248,6 +253,8 @@ class RunEnds:
         for trace in self._held:
             if len(trace) and int(trace.times_ns[-1]) >= before_ns:
                 break
+            if len(trace):
+                self._released_ns = int(trace.times_ns[-1])
             count += 1
         released, self._held = self._held[:count], self._held[count:]
         return [self.trim(trace) for trace in released]

@@ -171,9 +171,11 @@ def _verdict(updates: Sequence[Update], name: str) -> str:
 _SLICE_BYTES: Final = 8 * 2**20
 """About the most bytes that are written to a clip before what has come is taken in."""
 
-_LATE_S: Final = 1.0
+_LATE_S: Final = 2.0
+"""How long a clip waits for samples, which may wait for a second at what may be the end of a run."""
+
 _LATE_NS: Final = 10**9
-"""How far samples may come behind messages, and messages behind samples."""
+"""How far messages may come behind samples."""
 
 _MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES = 320, 400, 600
 """Memory of a message without its payload, of a sample, and of each of its objects without corners, in

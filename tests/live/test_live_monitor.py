@@ -11,8 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import aclosing, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import aclosing, contextmanager, suppress
 from pathlib import Path
 
 import foxglove
@@ -24,6 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 import spatial_replay as sr
+from bags.bag_files import write_mcap
 from cli.program import PROGRAM, environment
 from live.robots import (
     MAPPING,
@@ -889,50 +890,141 @@ topics:
 """
 
 
+def placed_from(at: int) -> dict[str, object]:
+    """A transform at a time in ms."""
+    names = {"timestamp": {"sec": at // 1000, "nsec": at % 1000 * MS}, "parent_frame_id": "map"}
+    rotation = {"x": 0, "y": 0, "z": 0, "w": 1}
+    return names | {"child_frame_id": "odom", "translation": {"x": 0, "y": 0, "z": 0}, "rotation": rotation}
+
+
+@contextmanager
+def sending(messages: Sequence[tuple[str, int, dict[str, object]]]) -> Iterator[str]:
+    """A server of the Foxglove SDK that sends messages at once, by topic and time in ms."""
+    context = foxglove.Context()
+    channels = {
+        topic: foxglove.Channel(
+            topic,
+            schema=foxglove.Schema(
+                name="foxglove.FrameTransform" if topic == "/tf" else "Pose",
+                encoding="jsonschema",
+                data=b"{}",
+            ),
+            message_encoding="json",
+            context=context,
+        )
+        for topic in dict.fromkeys(topic for topic, _, _ in messages)
+    }
+    server = foxglove.start_server(name="robot", host="127.0.0.1", port=0, context=context)
+
+    def send() -> None:
+        until(lambda: all(channel.has_sinks() for channel in channels.values()))
+        for topic, at, content in messages:
+            channels[topic].log(json.dumps(content).encode(), log_time=at * MS)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        yield f"ws://127.0.0.1:{server.port}"
+    finally:
+        sender.join()
+        server.stop()
+
+
 def test_transforms_that_come_after_max_delay_are_said_with_the_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mapped, spec = files(
         tmp_path, FRAMED, "region home = circle((0, 0), 9)\nspec near = G (robot dist home <= 1)"
     )
-    context = foxglove.Context()
-    schemas = {"/odom": "Pose", "/tf": "foxglove.FrameTransform"}
-    odom, frames = (
-        foxglove.Channel(
-            topic,
-            schema=foxglove.Schema(name=name, encoding="jsonschema", data=b"{}"),
-            message_encoding="json",
-            context=context,
-        )
-        for topic, name in schemas.items()
-    )
-    server = foxglove.start_server(name="robot", host="127.0.0.1", port=0, context=context)
-
-    def place(at: int) -> None:
-        stamp = {"sec": at // 1000, "nsec": at % 1000 * MS}
-        placed = {"translation": {"x": 0, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
-        names = {"timestamp": stamp, "parent_frame_id": "map", "child_frame_id": "odom"}
-        frames.log(json.dumps(names | placed).encode(), log_time=at * MS)
-
-    def drive() -> None:
-        until(lambda: odom.has_sinks() and frames.has_sinks())
-        for at in range(1_000, 1_500, 100):
-            place(at)
-            odom.log(b'{"x": 0, "y": 0}', log_time=at * MS)
-        # the transform behind the last report never comes
-        odom.log(b'{"x": 0, "y": 0}', log_time=1_450 * MS)
-
-    driving = threading.Thread(target=drive)
-    driving.start()
-    try:
-        command = ["monitor", f"ws://127.0.0.1:{server.port}", "--mapping", str(mapped), "--spec", str(spec)]
+    sent = [(topic, at, placed_from(at)) for at in range(1_000, 1_500, 100) for topic in ("/tf", "/odom")]
+    # the transforms behind the last reports never come
+    sent += [("/odom", at, {"x": 0, "y": 0}) for at in range(1_450, 2_600, 50)]
+    messages = [(topic, at, content if topic == "/tf" else {"x": 0, "y": 0}) for topic, at, content in sent]
+    with sending(messages) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec)]
         assert run([*command, "--for", "2s"]) == 4
-    finally:
-        driving.join()
-        server.stop()
     said = capsys.readouterr().out
     assert said.count("/odom is unknown where no transform of 'odom' came within 0.2 s") == 1
     assert "give --max-delay (max_delay_s) more" in said
+
+
+@pytest.mark.parametrize(
+    ("odom_ms", "tf_ms", "code", "left_out"),
+    [
+        (range(1_000, 2_000, 50), range(1_000, 2_000, 100), 0, "1 sample at the end is left out"),
+        (range(1_000, 2_000, 50), range(1_000, 1_700, 100), 0, "7 samples at the end are left out"),
+        (range(1_000, 4_000, 50), range(1_000, 1_700, 100), 4, ""),
+    ],
+    ids=["last sample", "transforms end earlier", "transforms end long before"],
+)
+def test_a_run_that_stops_sending_ends_where_its_recording_does(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    odom_ms: range,
+    tf_ms: range,
+    code: int,
+    left_out: str,
+) -> None:
+    listed = [("/tf", at, placed_from(at)) for at in tf_ms]
+    listed += [("/odom", at, {"x": 0.0, "y": 0.0}) for at in odom_ms]
+    spec = "region home = circle((0, 0), 9)\nspec near = G (robot dist home <= 1)"
+    assert_ends_alike(tmp_path, capsys, (FRAMED, spec), listed, code, left_out)
+
+
+@pytest.mark.parametrize(
+    ("vase_ms", "code", "left_out"),
+    [
+        (
+            [range(1_000, 2_700, 100)],
+            0,
+            "3 samples at the end are left out, from 1.850 s to 1.950 s: /vase ends",
+        ),
+        ([range(1_000, 2_000, 100), range(2_300, 3_000, 100)], 4, ""),
+        ([range(1_000, 2_400, 100)], 4, ""),
+    ],
+    ids=["a topic ends", "a hole", "a topic ends long before"],
+)
+def test_a_topic_that_ends_is_no_hole_in_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], vase_ms: list[range], code: int, left_out: str
+) -> None:
+    listed = [("/vase", at, {"x": 0.0, "y": 0.0}) for times in vase_ms for at in times]
+    listed += [("/robot", at, {"x": 2.0, "y": 0.0}) for at in range(1_000, 3_000, 50)]
+    spec = "spec clear = G (robot dist vase >= 0.5)"
+    assert_ends_alike(tmp_path, capsys, (MAPPING.replace("10s", "200ms"), spec), listed, code, left_out)
+
+
+def assert_ends_alike(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    texts: tuple[str, str],
+    listed: Sequence[tuple[str, int, dict[str, object]]],
+    code: int,
+    left_out: str,
+) -> None:
+    """A run evaluates the samples of a bag of its messages, and leaves out the same ones."""
+    messages = sorted(listed, key=lambda message: message[1])
+    mapped, spec = files(folder, *texts)
+    log, output = folder / "robot.mcap", folder / "live.mcap"
+    channels = [
+        (topic, "json", "foxglove.FrameTransform" if topic == "/tf" else "Pose", "jsonschema", b"{}")
+        for topic in dict.fromkeys(topic for topic, _, _ in messages)
+    ]
+    write_mcap(log, channels, [(topic, at * MS, json.dumps(text).encode()) for topic, at, text in messages])
+    options = ["--mapping", str(mapped), "--spec", str(spec)]
+    assert run(["replay", str(log), *options, "--json", "-"]) == code
+    replayed = capsys.readouterr()
+    expected = json.loads(replayed.out)["log"]
+    with sending(messages) as address:
+        assert run(["monitor", address, *options, "--for", "2s", "-o", str(output)]) == code
+    said = capsys.readouterr().out
+    assert left_out in said and left_out in replayed.err
+    assert bool(left_out) == ("at the end" in said) == ("at the end" in replayed.err)
+    times_ns = sr.read_trace(output).times_ns
+    assert (len(times_ns), int(times_ns[-1])) == (expected["samples"], expected["end_ns"])
+    assert run(["replay", str(output), "--spec", str(spec)]) == code
+    # the robot's own messages stay
+    assert {topic for topic, _, _ in messages} <= {topic for topic, _, _ in messages_of(output)}
+    assert max(time_ns for _, time_ns, _ in messages_of(output)) == messages[-1][1] * MS
 
 
 def test_a_run_waits_as_long_as_start_within_says(tmp_path: Path) -> None:
