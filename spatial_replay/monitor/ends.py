@@ -67,8 +67,10 @@ class Needs:
 
         A run does not know these, and begins where its recording does.
         """
-        fixed = {name for name in self.objects for span in spans if span.pattern == re.escape(name)}
-        return [span for span in spans if self._is_needed(span, self.objects - fixed)]
+        patterns = {span.pattern for span in spans}
+        fixed = {name: re.escape(name) for name in self.objects if re.escape(name) in patterns}
+        unseen = self.objects - fixed.keys()
+        return [span for span in spans if span.pattern in fixed.values() or self._is_needed(span, unseen)]
 
     def _is_needed(self, span: TopicSpan, unseen: frozenset[str]) -> bool:
         if not (self.objects.isdisjoint(span.objects) and self.signals.isdisjoint(span.signals)):
