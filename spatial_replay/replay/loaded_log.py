@@ -104,8 +104,9 @@ class OwnMessages:
         times_ns = self._selection.inside(block.trace).times_ns
         self._span(times_ns)
         if len(times_ns):
-            first_ns = self._samples_ns[0] or int(times_ns[0])
-            self._samples_ns = first_ns, int(times_ns[-1]) + 1
+            first_ns, end_ns = self._samples_ns
+            # a log may begin at 0
+            self._samples_ns = (first_ns if end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
         self._count(messages)
         # a log without messages is played from memory; others are read again
         if self._counts:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +34,7 @@ from spatial_replay.logs.messages import (
     SCENE,
     SPECIFICATION,
     STANDING,
+    Block,
     Channel,
     Messages,
     Source,
@@ -177,6 +179,23 @@ def test_external_messages_are_played_and_sent_again_after_a_seek(tmp_path: Path
     for topic in others:
         before = [each for each in whole if each[0] == topic and each[1] <= middle_ns]
         assert [each for each in found if each[0] == topic] == before[-1:]
+
+
+@dataclass(frozen=True)
+class SpokenSource(PiecewiseSource):
+    """A trace whose blocks begin with a message of another program."""
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        channel = Channel("/words", "json", None)
+        for block in super().iter_blocks(start_ns, end_ns):
+            times_ns = block.trace.times_ns[:1]
+            yield replace(block, messages=messages_of(channel, times_ns, [b"1"] * len(times_ns), 0))
+
+
+def test_a_playback_of_several_blocks_from_time_0_has_all_samples(tmp_path: Path) -> None:
+    source = SpokenSource(run(COUNT), 5)
+    expected = annotated(source, tmp_path / "annotated.mcap")
+    assert apart(played(playback(source), 0)) == apart(expected)
 
 
 def talking(path: Path) -> Path:
