@@ -168,8 +168,8 @@ class RunEnds:
             # the first sample after the last one in which the topic could be judged
             after = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
             since_ns = int(times_ns[after]) if after < len(times_ns) else None
-            if after == 0 and before is not None:
-                since_ns = self._since_ns[span.topic] or since_ns
+            if after == 0 and before is not None and self._since_ns[span.topic] is not None:
+                since_ns = self._since_ns[span.topic]
             self._since_ns[span.topic] = since_ns
 
     def _limit_ns(self, span: TopicSpan) -> int:

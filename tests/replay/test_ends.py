@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 import spatial_replay as sr
 from bags.bag_files import SECOND, write_json_mcap, write_mcap
 from spatial_replay.cli import run
+from spatial_replay.monitor.ends import Needs, RunEnds
+from spatial_replay.trace.spans import TopicSpan
 
 MS = SECOND // 1000
 START = 100 * SECOND
@@ -412,3 +415,17 @@ def test_times_may_count_from_the_last_sample(folder: Path, capsys: pytest.Captu
     assert run(["batch", "log.mcap", *arguments]) == 0
     assert run(["replay", "log.mcap", "--mapping", "m.yaml", "--spec", "s.spatial", "--to", "-3h"]) == 2
     assert "-200ms before its last" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("start_ns", [0, 1_000_000_000])
+def test_a_topic_that_never_comes_leaves_a_hole_from_time_0_on_too(start_ns: int) -> None:
+    span = TopicSpan("/cup", frozenset(), "cup", frozenset(), None, 1_000_000_000, None, None, None, None)
+    ends = RunEnds(Needs(frozenset({"cup"})))
+    counting = [
+        trace
+        for offset_ns in (0, 500_000_000, 1_100_000_000, 1_200_000_000)
+        for trace in ends.add(
+            replace(sr.Trace.from_samples([sr.Sample(start_ns + offset_ns)]), spans=(span,))
+        )
+    ]
+    assert sum(map(len, [*counting, *ends.finish()])) == 4
