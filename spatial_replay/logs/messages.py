@@ -22,6 +22,7 @@ from spatial_replay.geometry.arrays import Integers, concatenated, equal_places,
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.logs.remote import LogFile, each_ahead
 from spatial_replay.text import Sentence, encodable
+from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import LATEST_NS, Pauses, ReportsBack, Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -173,11 +174,13 @@ class Block:
             sources that are not a log of messages. A copy gets a topic for the samples where they have none.
         remarks: what is worth knowing although nothing was lost: how many observations are out of date, which
             transforms are missing.
+        doubts: assumptions that the log contradicts.
     """
 
     trace: Trace
     messages: Messages = field(default_factory=Messages)
     remarks: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
 
 def merge(streams: Sequence[Messages]) -> Messages:
