@@ -390,7 +390,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
             "tr",
             element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
             element("td", *_named(row)),
-            _number("td", "" if math.isnan(row["robustness"]) else f"{row['robustness']:.4g}"),
+            _number("td", "" if row["robustness"] is None else f"{row['robustness']:.4g}"),
             element("td", text(row["failure"])),
             element("td", *_with_code(row["reason"])),
         )
@@ -499,15 +499,13 @@ def _cell(row: Values | None) -> Html:
     number, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
     kind = f"number is-{verdict}{' fails' if fails else ''}"
     was = row.get(BASELINE_ROBUSTNESS)
-    before = (
-        f" (was {was:.4g})" if fails and was is not None and was != number and not math.isnan(was) else ""
-    )
+    before = f" (was {was:.4g})" if fails and was is not None and was != number else ""
     if row["verdict"] is None:
         return element(
             "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
         )
-    shown = verdict if math.isnan(number) or verdict == "untested" else f"{number:.4g}"
-    value = "0" if math.isnan(number) else f"{max(-1e300, min(1e300, number)):.17g}"
+    shown = verdict if number is None or verdict == "untested" else f"{number:.4g}"
+    value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
     why = f": {row['failure'].rstrip('.')}" if fails else ""
     tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
     tip = " ".join([tip, *(each for each in row["untested"] or () if each.rstrip(".") not in why)])

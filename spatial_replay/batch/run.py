@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import glob, has_magic
+from math import nan
 from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
@@ -722,8 +723,7 @@ _JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "left", "dropped
 
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:
     """Return why a row does not pass, in a few words; None if it does."""
-    return (
-        row["error"]
-        if row["verdict"] is None
-        else expectation.failure(cast(ResultRow, SimpleNamespace(**row)), fail_on)
-    )
+    if row["verdict"] is None:
+        return row["error"]
+    lower = nan if row["lower"] is None else row["lower"]
+    return expectation.failure(cast(ResultRow, SimpleNamespace(**{**row, "lower": lower})), fail_on)

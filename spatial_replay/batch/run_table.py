@@ -141,7 +141,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     if WORSE in table.column_names:
         counted["worse"] = table.column(WORSE)
     columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
-    columns["least"] = pc.if_else(pc.is_nan(number), None, number)
+    columns["least"] = number
     sums = [(f"n_{name}", "sum") for name in counted]
     about = ("requirement", "title") if by == "spec" else ()
     columns |= {name: table.column(name) for name in about}
@@ -359,14 +359,14 @@ class Tolerance:
             f"{self.amount:g}% for a part of it"
         )
 
-    def allows(self, before: float, now: float, unit: str = "") -> bool:
+    def allows(self, before: float | None, now: float | None, unit: str = "") -> bool:
         """Return whether a number is not worse than before by more than this.
 
         Args:
             unit: of both; an amount in another unit allows nothing.
         """
-        if math.isnan(before) or math.isnan(now):
-            return math.isnan(before)
+        if before is None or now is None:
+            return before is None
         if math.isinf(before) or math.isinf(now):
             return now >= before
         if self.is_relative:
@@ -382,7 +382,7 @@ class Difference:
         change: "worse" by more than the tolerance, another "verdict" that is worse, "gone", or "better".
         case, log, file, spec, object: which result.
         before, now: its verdicts; None for an error, and for what is gone now.
-        before_robustness, robustness: NaN where not determined.
+        before_robustness, robustness: None where not determined.
     """
 
     change: Change
@@ -393,8 +393,8 @@ class Difference:
     object: str | None
     before: str | None
     now: str | None
-    before_robustness: float
-    robustness: float
+    before_robustness: float | None
+    robustness: float | None
 
     @property
     def fails(self) -> bool:
@@ -485,7 +485,6 @@ def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     nothing: dict[str, Any] = {
         name: [] for name in ("explanation", "untested", "vacuous", "left", "faults", "remarks", "missing")
     }
-    nothing |= dict.fromkeys(("robustness", "lower", "upper"), math.nan)
     return {
         **nothing,
         **{name: row.get(name) for name in kept},
@@ -502,14 +501,14 @@ def _keys(table: pa.Table) -> list[Key]:
     return list(zip(*(table.column(name).to_pylist() for name in _KEY), strict=True))
 
 
-def _by_key(table: pa.Table) -> dict[Key, tuple[str | None, float]]:
+def _by_key(table: pa.Table) -> dict[Key, tuple[str | None, float | None]]:
     values = zip(table.column("verdict").to_pylist(), table.column("robustness").to_pylist(), strict=True)
     return dict(zip(_keys(table), values, strict=True))
 
 
 def _differences(
-    now: dict[Key, tuple[str | None, float]],
-    before: dict[Key, tuple[str | None, float]],
+    now: dict[Key, tuple[str | None, float | None]],
+    before: dict[Key, tuple[str | None, float | None]],
     tolerance: Tolerance,
     units: Mapping[Key, str | None],
 ) -> Iterator[Difference]:
@@ -518,7 +517,7 @@ def _differences(
         found = now.get(key) or now.get((*key[:-1], None))
         if found is None:
             yield Difference(
-                "gone", *key, before=old, now=None, before_robustness=old_number, robustness=math.nan
+                "gone", *key, before=old, now=None, before_robustness=old_number, robustness=None
             )
             continue
         new, number = found
@@ -533,11 +532,11 @@ def _differences(
             )
 
 
-def _least_first(number: float) -> float:
-    return math.inf if math.isnan(number) else number
+def _least_first(number: float | None) -> float:
+    return math.inf if number is None else number
 
 
-def _described(verdict: str | None, number: float) -> str:
+def _described(verdict: str | None, number: float | None) -> str:
     if verdict is None:
         return "an error"
-    return f"{verdict} with robustness {'not determined' if math.isnan(number) else f'{number:.6g}'}"
+    return f"{verdict} with robustness {'not determined' if number is None else f'{number:.6g}'}"

@@ -144,7 +144,7 @@ def result_files(folder: str | PathLike[str]) -> ResultFiles:
     return BucketFolder(fspath(folder)) if is_address(folder) else LocalFolder(Path(folder))
 
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 """The version of the layout; rows of another version are never read."""
 LAST_RUN: Final = "last_run.parquet"
 SOURCE: Final = "source"
@@ -165,11 +165,11 @@ def columns() -> pa.Schema:
     """Return the columns of stored rows: a key, and the fields of `ResultRow`."""
     pa = _pyarrow()
     kinds = {"int": pa.int64(), "float": pa.float64(), "tuple[str, ...]": pa.list_(pa.string())}
-    own = {
-        each.name: kinds.get(str(each.type).removesuffix(" | None"), pa.string())
-        for each in fields(ResultRow)
+    types = {
+        column.name: kinds.get(str(column.type).removesuffix(" | None"), pa.string())
+        for column in fields(ResultRow)
     }
-    return pa.schema([pa.field("key", pa.string(), nullable=False), *{**own, "line": pa.int32()}.items()])
+    return _schema([pa.field("key", pa.string(), nullable=False), *{**types, "line": pa.int32()}.items()])
 
 
 def run_columns() -> pa.Schema:
@@ -177,16 +177,34 @@ def run_columns() -> pa.Schema:
     pa = _pyarrow()
     text = pa.string()
     asked = [(name, text) for name in ("case", "log", "file", "meaning", "expected", "failure")]
-    return pa.schema([*asked, *(each for each in columns() if each.name != SOURCE)])
+    return _schema([*asked, *(column for column in columns() if column.name != SOURCE)])
+
+
+def _schema(columns: Sequence[Any]) -> pa.Schema:
+    """Return a schema whose integers stay integers in pandas, also in columns with nulls."""
+    schema = _pyarrow().schema(columns)
+    integers = [
+        {"name": column.name, "field_name": column.name, "numpy_type": "Int64", "metadata": None}
+        | {"pandas_type": "int64"}
+        for column in schema
+        if str(column.type) == "int64"
+    ]
+    pandas = {"index_columns": [], "column_indexes": [], "columns": integers}
+    return schema.with_metadata({"pandas": json.dumps(pandas)})
 
 
 def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
-    """Return rows, by their keys, as a table."""
+    """Return rows, by their keys, as a table; an unknown number is null."""
     pa, schema = _pyarrow(), columns()
+    key, *values = schema
     listed = [row for several in rows.values() for row in several]
-    arrays = [pa.array([key for key, several in rows.items() for _ in several], schema.field("key").type)]
+    arrays = [pa.array([key for key, several in rows.items() for _ in several], key.type)]
     # column by column: three times as fast as row by row
-    arrays += [pa.array([getattr(row, each.name) for row in listed], each.type) for each in list(schema)[1:]]
+    arrays += [
+        # DuckDB and polars hold a NaN for greater than every number
+        pa.array([getattr(row, column.name) for row in listed], column.type, from_pandas=True)
+        for column in values
+    ]
     return pa.Table.from_arrays(arrays, schema=schema)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -113,8 +112,8 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
         name = row["spec"] or row["file"]
         name = result_name(name, row["object"])
         verdict = Coloured(f"{verdict_word(row)}{damage_word(row)}", _COLOURS[verdict_word(row)])
-        robustness = with_unit(row["robustness"], row["unit"] or "")
-        number = "" if math.isnan(row["robustness"]) else f", robustness {robustness}"
+        robustness = row["robustness"]
+        number = "" if robustness is None else f", robustness {with_unit(robustness, row['unit'] or '')}"
         show((f"  {row['log']}: {name}: ", verdict, number))
         usual = f"{row['verdict']}, expected satisfied"
         failure = None if row["failure"] == usual else row["failure"]

@@ -16,9 +16,12 @@ from tempfile import TemporaryDirectory
 from urllib.request import Request, urlopen
 from xml.etree import ElementTree
 
+import pandas
+import pyarrow.compute as pc
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from pyarrow import parquet
 
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
@@ -755,6 +758,28 @@ def test_results_are_summed_up_and_searched(fleet: Path) -> None:
         done = command("results", "results", "--where", wrong)
         assert (done.code, message in done.err) == (2, True), done.err
     assert command("results", "logs").code == 2
+
+
+def test_unknown_numbers_are_null_and_times_stay_integers_in_pandas(fleet: Path) -> None:
+    Path("logs/empty.jsonl").write_text('{"time_ns": 0, "objects": []}\n')
+    Path("logs/broken.jsonl").write_text("{")
+    batch("logs", "--spec", "gate.spatial", "--baseline", "main", "--update-baseline")
+    # the second run reads the rows that the first one stored
+    batch("logs", "--spec", "gate.spatial")
+    for file in (Path("results/last_run.parquet"), *Path("results/rows").iterdir()):
+        table = parquet.read_table(file)
+        for name in ("robustness", "lower", "upper"):
+            assert not pc.any(pc.is_nan(table[name])).as_py()
+        frame = pandas.read_parquet(file)
+        names = ["first_satisfied_ns", "violated_at_ns", "satisfied_at_ns", "atom_time_ns", "start_ns"]
+        assert {str(frame[name].dtype) for name in [*names, "duration_ns", "samples"]} == {"Int64"}
+    assert (frame.violated_at_ns == 0).sum() == 2 and frame.violated_at_ns.isna().any()
+    unknown = command("results", "results", "--where", "robustness == none", "--json", "-").out.splitlines()
+    rows = [json.loads(line) for line in unknown]
+    assert [(row["log"], row["verdict"]) for row in rows] == [
+        ("logs/broken.jsonl", None), ("logs/broken.jsonl", None),
+        ("logs/empty.jsonl", "unknown"), ("logs/empty.jsonl", "unknown"),
+    ]  # fmt: skip
 
 
 def test_a_page_over_all_logs_links_to_those_that_fail(fleet: Path) -> None:
