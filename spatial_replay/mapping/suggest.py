@@ -133,7 +133,7 @@ class Guess:
             self.orientation or self.yaw,
             self.class_name,
         )
-        has_place = any(each is not None for each in (self.polygon, self.bounds, self.position))
+        has_place = any(place is not None for place in (self.polygon, self.bounds, self.position))
         return 10 * has_place + sum(map(bool, parts))
 
 
@@ -146,9 +146,9 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
     if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
         return None
     best = _best(messages)
-    if any(isinstance(each, dict) for each in messages):
+    if any(isinstance(message, dict) for message in messages):
         with suppress(FieldError):
-            zeros = _best([sparse(each) for each in messages])
+            zeros = _best([sparse(message) for message in messages])
             if zeros is not None and isinstance(zeros.position, str) and _lacks_coordinates(zeros, messages):
                 return replace(zeros, has_zeros_left_out=True)
     return best
@@ -160,17 +160,17 @@ def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
     for message in messages:
         try:
             things = iter_elements(FieldPath.of(guess.objects), message) if guess.objects else [message]
-            places = [walk(FieldPath.of(str(guess.position)), each) for each in things]
+            places = [walk(FieldPath.of(str(guess.position)), thing) for thing in things]
         except FieldError:
             return False
-        if not all(isinstance(each, dict) for each in places):
+        if not all(isinstance(place, dict) for place in places):
             return False
-        counts |= {len({"x", "y"} & each.keys()) for each in places if isinstance(each, dict)}
+        counts |= {len({"x", "y"} & place.keys()) for place in places if isinstance(place, dict)}
     return bool(counts - {2})
 
 
 def _best(messages: Sequence[object]) -> Guess | None:
-    guesses = [guess for each in messages if (guess := _guess(each)) is not None]
+    guesses = [guess for message in messages if (guess := _guess(message)) is not None]
     if not guesses:
         return None
     # an outline at a pose near the origin may be in either frame, which another message decides
@@ -190,12 +190,14 @@ def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
         path = FieldPath.of(f"{prefix}.{name}" if prefix else name)
         objects = FieldPath.of(guess.objects)
         try:
-            pairs = [(walk(path, each), sum(1 for _ in iter_elements(objects, each))) for each in messages]
+            pairs = [
+                (walk(path, message), sum(1 for _ in iter_elements(objects, message))) for message in messages
+            ]
         except FieldError:
             continue
         texts = [list(map(str, names)) for names, _ in pairs if is_list(names)]
         counts = [count for _, count in pairs]
-        if [len(each) for each in texts] == [len(set(each)) for each in texts] == counts:
+        if [len(names) for names in texts] == [len(set(names)) for names in texts] == counts:
             yield f"$.{path.text}[{INDEX}]"
 
 
@@ -234,11 +236,11 @@ def _guess(message: object) -> Guess | None:
     itself = _object_in(message)
     lists = sorted(
         ((guess, path) for path, guess in _iter_lists(message)),
-        key=lambda each: (-_list_rank(each[1]), -each[0].score),
+        key=lambda pair: (-_list_rank(pair[1]), -pair[0].score),
     )
     if lists and (itself is None or itself.polygon is None):
         best, path = lists[0]
-        return replace(best, objects=path, others=tuple(other for _, other in lists[1:]))
+        return replace(best, objects=path, others=tuple(path for _, path in lists[1:]))
     return itself
 
 
@@ -249,7 +251,8 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
     for message in messages:
         try:
             values = [
-                walk(FieldPath.of(name), each) for each in iter_elements(FieldPath.of(guess.objects), message)
+                walk(FieldPath.of(name), thing)
+                for thing in iter_elements(FieldPath.of(guess.objects), message)
             ]
         except FieldError:
             return False
@@ -274,7 +277,7 @@ def _table_of_objects(value: object) -> list[object]:
     """Return the objects that a JSON object has by their names: at least two, and all alike."""
     keys = keys_of(value) if isinstance(value, dict) else []
     objects = list(map(value.get, keys)) if isinstance(value, dict) else []
-    fields = {frozenset(field_names(each)) for each in objects}
+    fields = {frozenset(field_names(thing)) for thing in objects}
     is_table = len(objects) > 1 and len(fields) == 1 and _PARTS.isdisjoint(keys)
     return objects if is_table and not any(map(_is_no_place, keys)) else []
 
@@ -284,7 +287,7 @@ def _object_in(value: object) -> Guess | None:
     fields = dict(_iter_fields(value))
     position, turn = _pose_in(fields)
     polygon, corners = _outline_in(fields)
-    bounds = next((path for path in _named(fields, _BOUNDS) if _numbers(fields[path], 4)), None)
+    bounds = next((path for path in _paths_by_name(fields, _BOUNDS) if _numbers(fields[path], 4)), None)
     is_own = False
     if polygon is not None and turn is not None and isinstance(position, str):
         place = _point(fields[position]) or (0.0, 0.0)
@@ -310,28 +313,28 @@ def _object_in(value: object) -> Guess | None:
         bounds=bounds,
         size=_size_in(fields) if polygon is None else (),
         names=_names_in(fields),
-        class_name=_first(fields, _CLASSES, lambda each: isinstance(each, str)),
+        class_name=_first(fields, _CLASSES, lambda value: isinstance(value, str)),
         is_in_pixels=not is_own and _are_pixels(corners),
     )
 
 
 def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float, ...]]]:
     """Return the path of an outline and its corners, if there is one."""
-    for path in _named(fields, _OUTLINES):
+    for path in _paths_by_name(fields, _OUTLINES):
         value = fields[path]
         if not is_list(value) and "points" in field_names(value):
             path, value = f"{path}.points", get_field(value, "points")
         if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
-            return path, [point for each in value if (point := _point(each)) is not None]
+            return path, [point for corner in value if (point := _point(corner)) is not None]
     return None, []
 
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
     """Return the paths of a position and an orientation, of one pose if there is one."""
-    turns = [path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")]
+    turns = [path for path in _paths_by_name(fields, _TURNS) if _has(fields[path], "xyzw")]
     places = [
         path
-        for path in _named(fields, _POSITIONS)
+        for path in _paths_by_name(fields, _POSITIONS)
         # the positions of joints stand beside a list of their names
         if _point(fields[path]) is not None
         and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
@@ -349,8 +352,8 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
 def _point(value: object) -> tuple[float, ...] | None:
     """Return the coordinates of a point: of a message with x and y, or of a list of two or three numbers."""
     if _has(value, "xy"):
-        known = "xy" if isinstance(value, Sparse) else field_names(value)
-        return tuple(float(get_field(value, name)) for name in "xyz" if name in known)  # type: ignore[arg-type]
+        names = "xy" if isinstance(value, Sparse) else field_names(value)
+        return tuple(float(get_field(value, name)) for name in "xyz" if name in names)  # type: ignore[arg-type]
     return tuple(_numbers(value, 2) or _numbers(value, 3)) or None
 
 
@@ -358,13 +361,13 @@ def _numbers(value: object, count: int) -> list[float]:
     """Return the numbers of a list that has so many; an empty list for anything else."""
     if not is_list(value) or len(value) != count:
         return []
-    numbers = [float(each) for each in value if is_number(each) and each is not None]  # type: ignore[arg-type]
+    numbers = [float(number) for number in value if is_number(number) and number is not None]  # type: ignore[arg-type]
     return numbers if len(numbers) == count else []
 
 
 def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
     """Return whether an outline lies around a place; at most its own size apart."""
-    low, high = (tuple(pick(each[axis] for each in corners) for axis in (0, 1)) for pick in (min, max))
+    low, high = (tuple(pick(corner[axis] for corner in corners) for axis in (0, 1)) for pick in (min, max))
     size = sum(high) - sum(low)
     return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
 
@@ -382,11 +385,11 @@ def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
 
 
 def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
-    for path in _named(fields, _SIZES):
+    for path in _paths_by_name(fields, _SIZES):
         for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
-            known = field_names(fields[path])
-            if all(name in known and _is_number(get_field(fields[path], name)) for name in names[:2]):
-                return tuple(f"{path}.{name}" for name in names if name in known)
+            inner = field_names(fields[path])
+            if all(name in inner and _is_number(get_field(fields[path], name)) for name in names[:2]):
+                return tuple(f"{path}.{name}" for name in names if name in inner)
     for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
         if all(_is_number(fields.get(name)) for name in names[:2]):
             return tuple(name for name in names if name in fields)
@@ -401,7 +404,9 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
         if (words := _words(path.split(".")[-1]))[-1] in ("id", "uuid") and not _NO_IDENTITIES & {*words}
     ]
     names: list[str] = []
-    for path in dict.fromkeys([*_named(fields, _NAMES), *sorted(others, key=lambda path: path.count("."))]):
+    for path in dict.fromkeys(
+        [*_paths_by_name(fields, _NAMES), *sorted(others, key=lambda path: path.count("."))]
+    ):
         value = fields[path]
         if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
             names.append(path)
@@ -418,7 +423,7 @@ def _words(name: str) -> list[str]:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().split("_")
 
 
-def _named(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
+def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
     """Return the paths that end in one of some names, by depth, then in the order of the names."""
     ends = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
     paths = [path for path in fields if ends[path] in names]
@@ -426,7 +431,7 @@ def _named(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
 
 
 def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
-    return next((path for path in _named(fields, names) if fits(fields[path])), None)
+    return next((path for path in _paths_by_name(fields, names) if fits(fields[path])), None)
 
 
 def _is_no_place(name: str) -> bool:
@@ -461,11 +466,11 @@ def _is_number(value: object) -> bool:
 
 def _has(value: object, names: str) -> bool:
     """Return whether a message has numbers as fields with these names of one letter."""
-    known = field_names(value)
+    fields = field_names(value)
     if isinstance(value, Sparse):
         allowed = "xyz" if names == "xy" else names
-        return all(name in allowed and _is_number(value[name]) for name in known)
-    return all(name in known and _is_number(get_field(value, name)) for name in names)
+        return all(name in allowed and _is_number(value[name]) for name in fields)
+    return all(name in fields and _is_number(get_field(value, name)) for name in names)
 
 
 EXAMPLES = 20
@@ -531,8 +536,8 @@ class TopicSuggestion:
         """An entry that takes the numbers as signals; empty without any."""
         prefix = _topic_words(self.topic.name)
         names = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
-        listed = _flow({_text(name): _text(path) for name, path in names.items()})
-        return f"{{signals: {listed}}}" if names else ""
+        signals = _flow({_text(name): _text(path) for name, path in names.items()})
+        return f"{{signals: {signals}}}" if names else ""
 
 
 def suggest_topics(
@@ -563,15 +568,22 @@ def suggest_mapping(
         first_ns: log time of the first message of each topic, by its name.
     """
     suggestions = suggest_topics(topics, examples)
-    usable = [each for each in suggestions if len(_text(each.topic.name)) <= _LONGEST_KEY]
-    mapped = [each for each in usable if each.entry and not each.is_transforms]
-    transforms = [each for each in suggestions if each.is_transforms]
-    axes: _Axes = next((axes for axes in _AXES if any(each.axes == axes for each in mapped)), "plane")
-    mapped = [each for each in mapped if each.axes == axes]
-    active = _distinguished(mapped or [each for each in usable if each.entry and each.is_transforms])
-    if any(each.frames for each in active):
-        active = [_with_frame_remark(each) if examples.get(each.topic.name) else each for each in active]
-    signals = [] if active else [each for each in usable if each.signals]
+    usable = [suggestion for suggestion in suggestions if len(_text(suggestion.topic.name)) <= _LONGEST_KEY]
+    mapped = [suggestion for suggestion in usable if suggestion.entry and not suggestion.is_transforms]
+    transforms = [suggestion for suggestion in suggestions if suggestion.is_transforms]
+    axes: _Axes = next(
+        (axes for axes in _AXES if any(suggestion.axes == axes for suggestion in mapped)), "plane"
+    )
+    mapped = [suggestion for suggestion in mapped if suggestion.axes == axes]
+    active = _with_distinct_names(
+        mapped or [suggestion for suggestion in usable if suggestion.entry and suggestion.is_transforms]
+    )
+    if any(suggestion.frames for suggestion in active):
+        active = [
+            _with_frame_remark(suggestion) if examples.get(suggestion.topic.name) else suggestion
+            for suggestion in active
+        ]
+    signals = [] if active else [suggestion for suggestion in usable if suggestion.signals]
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
     if not active:
         lines.append(f"# Nothing looks like an object{': these are signals' if signals else ''}.")
@@ -586,62 +598,64 @@ def suggest_mapping(
     if not active and not signals:
         lines.append(f"  # {NO_TOPIC}, such as")
         lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
-    entries = {each.topic.name: "\n".join(_entry_lines(each)) for each in active or signals}
-    kept = _bounded(list(entries.items()), _LARGEST_SUGGESTION - len("\n".join(lines)))
-    rest = [each for each in suggestions if each.topic.name not in dict(kept)]
-    unused = {each.topic.name: _unused(each, axes) for each in rest}
-    left = _LARGEST_SUGGESTION - len("\n".join([*lines, *dict(kept).values()]))
-    listed = _bounded(list(unused.items()), left)
-    lines += dict(kept).values()
-    if listed:
-        lines += ["", "  # not used:", *dict(listed).values()]
-    if len(listed) < len(unused):
-        lines.append(f"  # … and {counted(len(unused) - len(listed), 'topic')} more")
+    entries = {suggestion.topic.name: "\n".join(_entry_lines(suggestion)) for suggestion in active or signals}
+    entries_that_fit = _first_that_fit(list(entries.items()), _LARGEST_SUGGESTION - len("\n".join(lines)))
+    rest = [suggestion for suggestion in suggestions if suggestion.topic.name not in dict(entries_that_fit)]
+    unused = {suggestion.topic.name: _unused_line(suggestion, axes) for suggestion in rest}
+    left = _LARGEST_SUGGESTION - len("\n".join([*lines, *dict(entries_that_fit).values()]))
+    unused_that_fit = _first_that_fit(list(unused.items()), left)
+    lines += dict(entries_that_fit).values()
+    if unused_that_fit:
+        lines += ["", "  # not used:", *dict(unused_that_fit).values()]
+    if len(unused_that_fit) < len(unused):
+        lines.append(f"  # … and {counted(len(unused) - len(unused_that_fit), 'topic')} more")
     return "\n".join(lines) + "\n"
 
 
-def _entry_lines(each: TopicSuggestion) -> Iterator[str]:
-    yield from (f"  # {text}" for text in (_described(each.topic), *each.remarks))
-    yield f"  {_text(each.topic.name)}: {each.entry or each.signals}"
+def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
+    yield from (f"  # {text}" for text in (_description(suggestion.topic), *suggestion.remarks))
+    yield f"  {_text(suggestion.topic.name)}: {suggestion.entry or suggestion.signals}"
 
 
-def _bounded(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
+def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
     """Return the first texts, up to a number of bytes."""
-    kept: list[tuple[str, str]] = []
+    texts_that_fit: list[tuple[str, str]] = []
     for name, text in texts:
         most -= len(text.encode()) + 1
         if most < 0:
             break
-        kept.append((name, text))
-    return kept
+        texts_that_fit.append((name, text))
+    return texts_that_fit
 
 
-def _distinguished(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
+def _with_distinct_names(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
     """Return suggestions with the topic in those names that several topics share."""
-    shared = Counter(each.name for each in active)
-    return [_with_own_name(each) if shared[each.name] > 1 else each for each in active]
+    shared = Counter(suggestion.name for suggestion in active)
+    return [
+        _with_own_name(suggestion) if shared[suggestion.name] > 1 else suggestion for suggestion in active
+    ]
 
 
-def _with_frame_remark(each: TopicSuggestion) -> TopicSuggestion:
-    return each if each.frames else replace(each, remarks=(*each.remarks, _FRAMELESS))
+def _with_frame_remark(suggestion: TopicSuggestion) -> TopicSuggestion:
+    return suggestion if suggestion.frames else replace(suggestion, remarks=(*suggestion.remarks, _FRAMELESS))
 
 
-def _with_own_name(each: TopicSuggestion) -> TopicSuggestion:
-    prefix = _topic_words(each.topic.name)
-    name = f"{prefix}_{each.name}" if "{" in each.name else prefix
-    fields = {**(each.fields or {}), "name": _text(name)}
+def _with_own_name(suggestion: TopicSuggestion) -> TopicSuggestion:
+    prefix = _topic_words(suggestion.topic.name)
+    name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
+    fields = {**(suggestion.fields or {}), "name": _text(name)}
     # of a list, its path comes first
     ordered = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
-    return replace(each, fields=dict(ordered))
+    return replace(suggestion, fields=dict(ordered))
 
 
 def _origin_lines(
     active: Sequence[TopicSuggestion], examples: Mapping[str, Sequence[object]]
 ) -> Iterator[str]:
     """Yield the line about where local metres are counted from: the first fix."""
-    for each in active:
-        if short_type(each.topic.type) in GEODETIC_TYPES:
-            for message in examples.get(each.topic.name, ()):
+    for suggestion in active:
+        if short_type(suggestion.topic.type) in GEODETIC_TYPES:
+            for message in examples.get(suggestion.topic.name, ()):
                 place = [float(getter(FieldPath.of(name), style_of(message))(message)) for name in GEODETIC]
                 if all(map(isfinite, place)):
                     yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
@@ -675,17 +689,17 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
         remarks = () if has_outline else _SIZELESS
         if _is_by_place(topic, reading, examples):
             remarks = (*remarks, BY_PLACE)
-        return _placed(topic, reading, examples, fields, name, remarks)
+        return _with_frames(topic, reading, examples, fields, name, remarks)
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
         return TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())
     name = _name(topic, guess)
     layout = layout_of_topic(topic.type, TopicMapping(topic.name, objects=guess.objects))
-    made = _placed(topic, layout, examples, _fields(name, guess), name, _remarks(guess))
-    return replace(made, axes="image") if guess.is_in_pixels else made
+    suggestion = _with_frames(topic, layout, examples, _fields(name, guess), name, _remarks(guess))
+    return replace(suggestion, axes="image") if guess.is_in_pixels else suggestion
 
 
-def _placed(
+def _with_frames(
     topic: Topic,
     layout: MessageLayout,
     examples: Sequence[object],
@@ -695,7 +709,7 @@ def _placed(
 ) -> TopicSuggestion:
     """Return a suggestion with the frames and axes of its coordinates, and how long they stay valid."""
     frames = frozenset(_iter_frames(layout, examples))
-    kept = {**fields, "max_age": "forever"} if layout.stays or topic.latched else fields
+    fields = {**fields, "max_age": "forever"} if layout.stays or topic.latched else fields
     axes: _Axes = "plane"
     if short_type(topic.type) in _IN_IMAGES:
         axes = "image"
@@ -703,7 +717,7 @@ def _placed(
         axes = "north"
     elif any(map(_MAVROS.search, (topic.name, topic.type))):
         remarks = (*remarks, _OF_MAVROS)
-    return TopicSuggestion(topic, kept, name, remarks, frames=frames, axes=axes)
+    return TopicSuggestion(topic, fields, name, remarks, frames=frames, axes=axes)
 
 
 def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]) -> bool:
@@ -733,7 +747,7 @@ def _iter_objects(layout: MessageLayout, examples: Sequence[object]) -> Iterator
     path = FieldPath.of(layout.objects) if layout.objects else None
     for message in examples:
         try:
-            yield from ((message, each) for each in (iter_elements(path, message) if path else (message,)))
+            yield from ((message, thing) for thing in (iter_elements(path, message) if path else (message,)))
         except FieldError:
             continue
 
@@ -837,8 +851,8 @@ def _frame_lines(
     examples: Mapping[str, Sequence[object]],
 ) -> Iterator[str]:
     """Yield the lines about the fixed frame, which coordinates in more than one frame need."""
-    frames = sorted(frozenset().union(*(each.frames for each in active)))
-    messages = (message for each in transforms for message in examples.get(each.topic.name, ()))
+    frames = sorted(frozenset().union(*(suggestion.frames for suggestion in active)))
+    messages = (message for suggestion in transforms for message in examples.get(suggestion.topic.name, ()))
     edges = sorted({edge for message in messages for edge in _edges(message)})
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
     if len(frames) > 1:
@@ -862,13 +876,15 @@ def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
 
 def _edges(message: object) -> Iterator[tuple[str, str]]:
     """Iterate over the pairs (parent, child) of frames in a message with transforms."""
-    listed = getattr(message, "transforms", None)
+    transforms = getattr(message, "transforms", None)
     if isinstance(message, dict):
-        listed = message.get("transforms")
-    for each in [message] if listed is None else listed:
-        known = field_names(each)
-        parent = frame_of(each) or ("parent_frame_id" in known and get_field(each, "parent_frame_id"))
-        child = "child_frame_id" in known and get_field(each, "child_frame_id")
+        transforms = message.get("transforms")
+    for transform in [message] if transforms is None else transforms:
+        names = field_names(transform)
+        parent = frame_of(transform) or (
+            "parent_frame_id" in names and get_field(transform, "parent_frame_id")
+        )
+        child = "child_frame_id" in names and get_field(transform, "child_frame_id")
         if isinstance(parent, str) and isinstance(child, str) and parent and child:
             yield parent.removeprefix("/"), child.removeprefix("/")
 
@@ -876,14 +892,14 @@ def _edges(message: object) -> Iterator[tuple[str, str]]:
 def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Iterator[str]:
     yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
     if active:
-        topic = _text(_sampled(active, first_ns).name)
+        topic = _text(_topic_to_sample(active, first_ns).name)
         yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
         yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
 
 
-def _sampled(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
+def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
     """Choose the topic to sample: the last to start of those that start together, so that none is missing."""
-    topics = [each.topic for each in active]
+    topics = [suggestion.topic for suggestion in active]
     begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
     often = max(topic.count or 0 for topic in topics)
     together = [
@@ -894,24 +910,26 @@ def _sampled(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> 
     return max(together, key=itemgetter(0))[1] if together else topics[0]
 
 
-def _unused(each: TopicSuggestion, axes: _Axes) -> str:
-    topic, what = _text(each.topic.name), _described(each.topic)
-    if each.entry and each.axes != axes and not each.is_transforms:
-        apart = f"{_AXES[each.axes]}: for a mapping of its own with y down"
-        return f"  # {topic}: {each.entry}    # {what}; {apart}"
-    if each.entry or each.signals:
-        return f"  # {topic}: {each.entry or each.signals}    # {what}"
-    return "; ".join([f"  # {topic}: {what}", *each.remarks])
+def _unused_line(suggestion: TopicSuggestion, axes: _Axes) -> str:
+    topic, what = _text(suggestion.topic.name), _description(suggestion.topic)
+    if suggestion.entry and suggestion.axes != axes and not suggestion.is_transforms:
+        apart = f"{_AXES[suggestion.axes]}: for a mapping of its own with y down"
+        return f"  # {topic}: {suggestion.entry}    # {what}; {apart}"
+    if suggestion.entry or suggestion.signals:
+        return f"  # {topic}: {suggestion.entry or suggestion.signals}    # {what}"
+    return "; ".join([f"  # {topic}: {what}", *suggestion.remarks])
 
 
-def _described(topic: Topic) -> str:
+def _description(topic: Topic) -> str:
     kind = _comment(topic.type) or "type unknown"
     return kind if topic.count is None else f"{kind}, {counted(topic.count, 'message')}"
 
 
 def _comment(text: str) -> str:
     """Return a text that fits on one line."""
-    return " ".join("".join(each if each.isprintable() else " " for each in text).split())[:200]
+    return " ".join("".join(character if character.isprintable() else " " for character in text).split())[
+        :200
+    ]
 
 
 def _text(text: str) -> str:
