@@ -1,0 +1,444 @@
+"""Fields of messages that look like those of an object: decoded messages in, their paths out.
+
+They are found by their names and the types of their values, for messages of unknown types.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+from spatial_replay.mapping.field_paths import (
+    INDEX,
+    FieldError,
+    FieldPath,
+    Sparse,
+    field_names,
+    get_field,
+    is_list,
+    is_number,
+    iter_elements,
+    keys_of,
+    sparse,
+    walk,
+)
+
+_DEEPEST = 4
+"""Levels of nested fields to search."""
+_POSITIONS = ("position", "center", "centre", "translation", "location", "point")
+_TURNS = ("orientation", "rotation", "quaternion")
+_YAWS = ("yaw", "theta", "heading", "angle")
+_SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
+_OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
+_BOUNDS = ("xyxy", "bounds", "bbox_xyxy", "box_xyxy")
+_NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
+_NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
+"""Lists with a name for each element of another list."""
+_NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
+"""Fields such as `class_id` and `frame_id` are the same for several objects."""
+_CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
+_PARTS = frozenset(
+    {
+        *(*_POSITIONS, *_TURNS, *_YAWS, *_SIZES, *_OUTLINES, *_NAMES, *_CLASSES),
+        *("pose", "min", "max", "start", "end", "from", "to", "goal", "offset", "base"),
+    }
+)
+"""Keys of parts of one object; other keys of a JSON object may be names of objects."""
+_LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
+_NOT_PLACES = frozenset(
+    {
+        *("velocity", "velocities", "vel", "speed", "acceleration", "accel", "twist", "linear", "angular"),
+        *("force", "torque", "wrench", "covariance", "header", "stamp", "timestamp", "origin"),
+        *("mount", "mounting", "sensor", "camera", "extrinsic", "extrinsics", "calibration"),
+    }
+)
+"""Words in the names of fields whose points are no places of objects, such as sensors' mounts."""
+_VECTORS = re.compile(r"twist|vector3|accel|wrench|imu|cmd_vel|velocity", re.IGNORECASE)
+"""Topics and types whose x and y are no place."""
+_TIMES = frozenset({"time", "stamp", "timestamp", "sec", "secs", "nsec", "nsecs", "nanosec", "nanos", "seq"})
+"""Words in the names of numbers that say when, and not what."""
+_UUID_BYTES = 16
+_FIELD = re.compile(r"[A-Za-z_][\w-]*", re.ASCII)
+_KEY = re.compile(r"[^\[\]{}|=\s]{1,100}", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """Fields of a message that look like those of an object; texts are field paths.
+
+    Attributes:
+        objects: of the list of objects, or None for a single one.
+        position: of a point, or of x and y.
+        bounds: of two opposite corners of a box.
+        is_own: whether the outline is in the object's own frame, at its pose.
+        size: of length, width and maybe height; or of a radius.
+        names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
+        is_in_pixels: whether coordinates look like pixels.
+        has_zeros_left_out: whether some objects lack coordinates that others have.
+        others: of further lists whose elements look like objects.
+    """
+
+    objects: str | None = None
+    position: str | tuple[str, ...] | None = None
+    orientation: str | None = None
+    yaw: str | None = None
+    polygon: str | None = None
+    is_own: bool = False
+    bounds: str | None = None
+    size: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    class_name: str | None = None
+    is_in_pixels: bool = False
+    has_zeros_left_out: bool = False
+    others: tuple[str, ...] = ()
+
+    @property
+    def score(self) -> int:
+        """How many fields of an object there are; a place counts most."""
+        parts = (
+            self.polygon or self.bounds,
+            self.size,
+            self.names,
+            self.orientation or self.yaw,
+            self.class_name,
+        )
+        has_place = any(place is not None for place in (self.polygon, self.bounds, self.position))
+        return 10 * has_place + sum(map(bool, parts))
+
+
+def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | None:
+    """Find an object, or a list of them, in the messages of a topic; None if nothing looks like one.
+
+    Args:
+        kind: the type of the messages.
+    """
+    if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
+        return None
+    best = _best(messages)
+    if any(isinstance(message, dict) for message in messages):
+        with suppress(FieldError):
+            zeros = _best([sparse(message) for message in messages])
+            if zeros is not None and isinstance(zeros.position, str) and _lacks_coordinates(zeros, messages):
+                return replace(zeros, has_zeros_left_out=True)
+    return best
+
+
+def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
+    """Return whether every object has a position, some without x or y."""
+    counts = set()
+    for message in messages:
+        try:
+            things = iter_elements(FieldPath.of(guess.objects), message) if guess.objects else [message]
+            places = [walk(FieldPath.of(str(guess.position)), thing) for thing in things]
+        except FieldError:
+            return False
+        if not all(isinstance(place, dict) for place in places):
+            return False
+        counts |= {len({"x", "y"} & place.keys()) for place in places if isinstance(place, dict)}
+    return bool(counts - {2})
+
+
+def _best(messages: Sequence[object]) -> Guess | None:
+    guesses = [guess for message in messages if (guess := _guess(message)) is not None]
+    if not guesses:
+        return None
+    # an outline at a pose near the origin may be in either frame, which another message decides
+    best = max(guesses, key=lambda guess: (guess.score, guess.is_own))
+    if best.names == (INDEX,):
+        return best
+    names = tuple(name for name in best.names if _distinguishes(name, best, messages))
+    return replace(best, names=names or tuple(_names_beside(best, messages)))
+
+
+def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
+    """Yield paths of lists next to that of the objects, which have a name for each of them."""
+    if guess.objects is None or guess.objects.count("[*]") > 1:
+        return
+    prefix = guess.objects.rpartition(".")[0]
+    for name in _NAMES_BESIDE:
+        path = FieldPath.of(f"{prefix}.{name}" if prefix else name)
+        objects = FieldPath.of(guess.objects)
+        try:
+            pairs = [
+                (walk(path, message), sum(1 for _ in iter_elements(objects, message))) for message in messages
+            ]
+        except FieldError:
+            continue
+        texts = [list(map(str, names)) for names, _ in pairs if is_list(names)]
+        counts = [count for _, count in pairs]
+        if [len(names) for names in texts] == [len(set(names)) for names in texts] == counts:
+            yield f"$.{path.text}[{INDEX}]"
+
+
+def signals_in(message: object) -> tuple[str, ...]:
+    """Return the paths of the numbers and truth values in a message, but for times and the header.
+
+    A list is found only next to a list `name`, such as `position[name=elbow]`; a text only where it is the
+    whole message, as of `std_msgs/String`.
+    """
+    paths: list[str] = []
+    for path, value in _iter_fields(message, is_skipped=_is_time):
+        if isinstance(value, int | float) or (isinstance(value, str) and path == "data"):
+            paths.append(path)
+        elif is_list(value) and len(value) and isinstance(value[0], int | float):
+            prefix, _, last = path.rpartition(".")
+            keys = [
+                names
+                for name, names in _iter_fields(message, is_skipped=_is_time)
+                if name == (f"{prefix}.name" if prefix else "name") and is_list(names)
+            ]
+            if keys and len(keys[0]) == len(value):
+                usable = [key for key in keys[0] if isinstance(key, str) and _KEY.fullmatch(key)]
+                paths += [f"{prefix + '.' if prefix else ''}{last}[name={key}]" for key in usable]
+    return tuple(paths)
+
+
+def frame_of(message: object) -> str | None:
+    """Return the frame of a message's coordinates, if the message names it."""
+    for path, value in _iter_fields(message, is_skipped=lambda name: False):
+        if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
+            return value.removeprefix("/")
+    return None
+
+
+def _guess(message: object) -> Guess | None:
+    itself = _object_in(message)
+    lists = sorted(
+        ((guess, path) for path, guess in _iter_lists(message)),
+        key=lambda pair: (-_list_rank(pair[1]), -pair[0].score),
+    )
+    if lists and (itself is None or itself.polygon is None):
+        best, path = lists[0]
+        return replace(best, objects=path, others=tuple(path for _, path in lists[1:]))
+    return itself
+
+
+def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
+    """Return whether no two objects of a message share the value of a field."""
+    if guess.objects is None:
+        return True
+    for message in messages:
+        try:
+            values = [
+                walk(FieldPath.of(name), thing)
+                for thing in iter_elements(FieldPath.of(guess.objects), message)
+            ]
+        except FieldError:
+            return False
+        if len(set(map(str, values))) < len(values):
+            return False
+    return True
+
+
+def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
+    for path, value in (("", message), *_iter_fields(message)):
+        table = _table_of_objects(value)
+        if table and (guess := _object_in(table[0])) is not None:
+            yield f"{path}[*]", replace(guess, names=(INDEX,))
+        elif is_list(value) and len(value) and field_names(value[0]):
+            guess = _object_in(value[0])
+            # the corners of an outline are points, not objects
+            if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
+                yield f"{path}[*]", guess
+
+
+def _table_of_objects(value: object) -> list[object]:
+    """Return the objects that a JSON object has by their names: at least two, and all alike."""
+    keys = keys_of(value) if isinstance(value, dict) else []
+    objects = list(map(value.get, keys)) if isinstance(value, dict) else []
+    fields = {frozenset(field_names(thing)) for thing in objects}
+    is_table = len(objects) > 1 and len(fields) == 1 and _PARTS.isdisjoint(keys)
+    return objects if is_table and not any(map(_is_no_place, keys)) else []
+
+
+def _object_in(value: object) -> Guess | None:
+    """Find the fields of one object in a message or an element of a list."""
+    fields = dict(_iter_fields(value))
+    position, turn = _pose_in(fields)
+    polygon, corners = _outline_in(fields)
+    bounds = next((path for path in _paths_by_name(fields, _BOUNDS) if _numbers(fields[path], 4)), None)
+    is_own = False
+    if polygon is not None and turn is not None and isinstance(position, str):
+        place = _point(fields[position]) or (0.0, 0.0)
+        is_own = not _is_around(corners, place) and _is_around(corners, (0.0, 0.0))
+        if not is_own and not _is_around(corners, place):
+            # such as pixels beside a pose in metres
+            polygon, corners = None, []
+    if polygon is not None or position is not None:
+        bounds = None
+    if polygon is None and position is None and bounds is None:
+        return None
+    is_posed = polygon is None or is_own
+    if bounds is not None:
+        corners = [tuple(_numbers(fields[bounds], 4))]
+    elif polygon is None and isinstance(position, str) and _IMAGES.search(position):
+        corners = [_point(fields[position]) or ()]
+    return Guess(
+        position=position if is_posed else None,
+        orientation=turn if is_posed else None,
+        yaw=_first(fields, _YAWS, _is_number) if is_posed and not turn else None,
+        polygon=polygon,
+        is_own=is_own,
+        bounds=bounds,
+        size=_size_in(fields) if polygon is None else (),
+        names=_names_in(fields),
+        class_name=_first(fields, _CLASSES, lambda value: isinstance(value, str)),
+        is_in_pixels=not is_own and _are_pixels(corners),
+    )
+
+
+def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float, ...]]]:
+    """Return the path of an outline and its corners, if there is one."""
+    for path in _paths_by_name(fields, _OUTLINES):
+        value = fields[path]
+        if not is_list(value) and "points" in field_names(value):
+            path, value = f"{path}.points", get_field(value, "points")
+        if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
+            return path, [point for corner in value if (point := _point(corner)) is not None]
+    return None, []
+
+
+def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
+    """Return the paths of a position and an orientation, of one pose if there is one."""
+    turns = [path for path in _paths_by_name(fields, _TURNS) if _has(fields[path], "xyzw")]
+    places = [
+        path
+        for path in _paths_by_name(fields, _POSITIONS)
+        # the positions of joints stand beside a list of their names
+        if _point(fields[path]) is not None
+        and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
+    ]
+    for place in places:
+        for turn in turns:
+            if place.rpartition(".")[0] == turn.rpartition(".")[0]:
+                return place, turn
+    position: str | tuple[str, ...] | None = places[0] if places else None
+    if position is None and all(_is_number(fields.get(name)) for name in "xy"):
+        position = None if _is_number(fields.get("w")) else ("x", "y")
+    return position, turns[0] if turns else None
+
+
+def _point(value: object) -> tuple[float, ...] | None:
+    """Return the coordinates of a point: of a message with x and y, or of a list of two or three numbers."""
+    if _has(value, "xy"):
+        names = "xy" if isinstance(value, Sparse) else field_names(value)
+        return tuple(float(get_field(value, name)) for name in "xyz" if name in names)  # type: ignore[arg-type]
+    return tuple(_numbers(value, 2) or _numbers(value, 3)) or None
+
+
+def _numbers(value: object, count: int) -> list[float]:
+    """Return the numbers of a list that has so many; an empty list for anything else."""
+    if not is_list(value) or len(value) != count:
+        return []
+    numbers = [float(number) for number in value if is_number(number) and number is not None]  # type: ignore[arg-type]
+    return numbers if len(numbers) == count else []
+
+
+def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
+    """Return whether an outline lies around a place; at most its own size apart."""
+    low, high = (tuple(pick(corner[axis] for corner in corners) for axis in (0, 1)) for pick in (min, max))
+    size = sum(high) - sum(low)
+    return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
+
+
+_PIXELS = 50
+"""Coordinates in pixels reach beyond this as a rule, and are not below 0."""
+_IMAGES = re.compile("pixel|image|bbox|keypoint", re.IGNORECASE)
+
+
+def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
+    """Return whether points, whose z is 0 if there is one, or two corners in a row, look like pixels."""
+    flat = [number for point in points for number in (point if len(point) > 3 else point[:2])]
+    is_flat = not any(point[2] for point in points if len(point) == 3)
+    return bool(flat) and is_flat and min(flat) >= 0 and max(flat) >= _PIXELS
+
+
+def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
+    for path in _paths_by_name(fields, _SIZES):
+        for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
+            inner = field_names(fields[path])
+            if all(name in inner and _is_number(get_field(fields[path], name)) for name in names[:2]):
+                return tuple(f"{path}.{name}" for name in names if name in inner)
+    for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
+        if all(_is_number(fields.get(name)) for name in names[:2]):
+            return tuple(name for name in names if name in fields)
+    return ("radius",) if _is_number(fields.get("radius")) else ()
+
+
+def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
+    """Return the paths of what may distinguish objects: a name or an id, then such as `fiducial_id`."""
+    others = [
+        path
+        for path in fields
+        if (words := _words(path.split(".")[-1]))[-1] in ("id", "uuid") and not _NO_IDENTITIES & {*words}
+    ]
+    names: list[str] = []
+    for path in dict.fromkeys(
+        [*_paths_by_name(fields, _NAMES), *sorted(others, key=lambda path: path.count("."))]
+    ):
+        value = fields[path]
+        if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
+            names.append(path)
+        elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
+            # ids in lists, of one number or of the bytes of a UUID
+            names.append(path)
+        elif inner := next((name for name in ("value", "uuid") if name in field_names(value)), None):
+            names.append(f"{path}.{inner}")
+    return tuple(dict.fromkeys(names))
+
+
+def _words(name: str) -> list[str]:
+    """Return the words in the name of a field: `trackId` and `track_id` → track, id."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().split("_")
+
+
+def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
+    """Return the paths that end in one of some names, by depth, then in the order of the names."""
+    ends = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
+    paths = [path for path in fields if ends[path] in names]
+    return sorted(paths, key=lambda path: (path.count("."), names.index(ends[path])))
+
+
+def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
+    return next((path for path in _paths_by_name(fields, names) if fits(fields[path])), None)
+
+
+def _is_no_place(name: str) -> bool:
+    return not _NOT_PLACES.isdisjoint(_words(name.removesuffix("_with_covariance")))
+
+
+def _is_time(name: str) -> bool:
+    return name == "header" or not _TIMES.isdisjoint(_words(name))
+
+
+def _iter_fields(
+    value: object, path: str = "", depth: int = 0, *, is_skipped: Callable[[str], bool] = _is_no_place
+) -> Iterator[tuple[str, object]]:
+    """Iterate over the fields of a message and its parts, with their paths; lists are not entered."""
+    for name in field_names(value) if depth < _DEEPEST else ():
+        if not is_skipped(name) and _FIELD.fullmatch(name):
+            inner = get_field(value, name)
+            full = f"{path}.{name}" if path else name
+            yield full, inner
+            yield from _iter_fields(inner, full, depth + 1, is_skipped=is_skipped)
+
+
+def _list_rank(path: str) -> int:
+    """Return how well the name of a list suits objects that move."""
+    last = path.removesuffix("[*]").split(".")[-1].lower()
+    return 2 * ("moving" in last or "dynamic" in last) + bool(_LISTS.search(last))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _has(value: object, names: str) -> bool:
+    """Return whether a message has numbers as fields with these names of one letter."""
+    fields = field_names(value)
+    if isinstance(value, Sparse):
+        allowed = "xyz" if names == "xy" else names
+        return all(name in allowed and _is_number(value[name]) for name in fields)
+    return all(name in fields and _is_number(get_field(value, name)) for name in names)
