@@ -497,6 +497,18 @@ class CameraView:
         self._sharpness["blurred"] += larger > _BLURRED
         return pose._replace(spread=pose.spread * larger**2)
 
+    def _why_no_plane(self) -> str:
+        if self.fit is not None:
+            return "the reference tags stopped fitting each other, as the camera or a tag moved"
+        absent = [str(tag.id) for tag in self.tags.references if tag.id not in self.seen]
+        if len(self.tags.references) - len(absent) >= LEAST_REFERENCES:
+            return (
+                "enough reference tags were seen, but fewer than"
+                f" {LEAST_REFERENCES} of them once in a frame while the camera stood still"
+            )
+        were = "was" if len(absent) == 1 else "were"
+        return f"fewer than {LEAST_REFERENCES} reference tags were seen; {tags_listed(absent)} {were} not"
+
     def remarks(self) -> list[str]:
         """Return what is worth knowing: that the camera saw nothing, not the plane, or has moved."""
         frames, lines = counted(self.frames, "frame"), []
@@ -509,11 +521,7 @@ class CameraView:
             )
             return lines
         if self.frames and self.tags.references and self._plane is None:
-            absent = [str(each.id) for each in self.tags.references if each.id not in self.seen]
-            lines.append(
-                f"the plane{of_it} is not known: fewer than {LEAST_REFERENCES} reference tags were seen;"
-                f" {tags_listed(absent)} {'was' if len(absent) == 1 else 'were'} not"
-            )
+            lines.append(f"the plane{of_it} is not known: {self._why_no_plane()}")
         for number, count in sorted(self.twice.items()):
             lines.append(
                 f"tag {number} is in {counted(count, 'frame')}{of_it} more than once, and left out there"

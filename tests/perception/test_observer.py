@@ -26,6 +26,7 @@ from spatial_replay import TrackedObject, UsageError
 from spatial_replay.perception import Frame, TagObserver, observe_frames, parse_tags
 from spatial_replay.perception.opencv import (
     Camera,
+    Detection,
     TagDetector,
     corners_from_apriltag,
     pose_looking_at,
@@ -283,6 +284,19 @@ def test_a_hidden_object_is_unknown_and_a_held_one_ever_less_certain() -> None:
     for hold_ns, frames in ((None, 3), (0, 2), (2 * PERIOD_NS, 4)):
         samples = [seen.sample for seen in observe_frames(film(poses_at, 5), own, hold_ns=hold_ns)]
         assert sum("red" in each.objects for each in samples) == frames
+
+
+def test_a_plane_that_is_not_known_says_which_reference_tags_lack() -> None:
+    square = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], np.float64)
+    for numbers, why in (
+        ((10, 11, 12), "fewer than 4 reference tags were seen; tag 13 was not"),
+        ((10, 11), "fewer than 4 reference tags were seen; tags 12, 13 were not"),
+        ((10, 11, 12, 13, 13), "enough reference tags were seen, but fewer than 4 of them once in a frame"),
+    ):
+        observer = TagObserver(parse_tags(FLAT))
+        seen = tuple(Detection(number, square + 20 * place) for place, number in enumerate(numbers))
+        observer.observe(Frame(0, np.zeros((0, 0), np.uint8), detections=seen))
+        assert any(line.startswith(f"the plane is not known: {why}") for line in observer.remarks())
 
 
 def test_what_is_strange_about_tags_is_listed_at_the_end() -> None:
