@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import cast
 
 import numpy as np
@@ -169,13 +169,18 @@ class EvaluationHashes:
             _take_in(hashed, _floats(block.series.transpose(2, 0, 1)))
 
     def certificate(
-        self, files: Sequence[Specification], plan: Mapping[str, str] | None = None
+        self,
+        files: Sequence[Specification],
+        plan: Mapping[str, str] | None = None,
+        doubts: Iterable[str] = (),
     ) -> Mapping[str, str]:
         """Return the certificate of the evaluation, once it is finished.
 
         Args:
             plan: the metadata of a planned run.
+            doubts: titles of the doubts that the log was read with.
         """
+        titles = ", ".join(sorted(doubts))
         specifications, results = hashlib.sha256(), hashlib.sha256()
         for file in files:
             specifications.update(_text(format_specification(file)))
@@ -187,6 +192,7 @@ class EvaluationHashes:
             "specification_sha256": specifications.hexdigest(),
             "results_sha256": results.hexdigest(),
             **({} if plan is None else {PLAN_SHA256: plan_sha256(plan)}),
+            **({"doubts": titles} if titles else {}),
             "spatial_replay_version": __version__,
         }
 

@@ -438,6 +438,9 @@ RECOVERY = "spatial_replay_recovery"
 VERDICTS = "spatial_replay_verdicts"
 """The metadata record with the verdict and robustness of each result of a replay."""
 
+DOUBTS = "spatial_replay_doubts"
+"""The metadata record with the assumptions that a log's source contradicts; see `Doubt`."""
+
 AUTOMATA = "spatial_replay_automata"
 """The metadata record with the sizes of automata, and why a specification has none."""
 
@@ -595,11 +598,11 @@ class MemorySource(Source):
         """See `Source.iter_blocks`."""
         window = within(self.trace, start_ns, end_ns)
         if len(window) <= BLOCK_SAMPLES:
-            yield Block(window)
+            yield Block(window, doubts=window.doubts)
             return
         for begin in range(0, len(window), BLOCK_SAMPLES):
             block = window.slice(begin, begin + BLOCK_SAMPLES)
-            yield Block(block if begin == 0 else replace(block, faults=()))
+            yield Block(block if begin == 0 else replace(block, faults=()), doubts=block.doubts)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed, data_frame
+from spatial_replay.monitor.doubtful import doubts_of_instances
 from spatial_replay.monitor.ends import Needs, trim_trace
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import checked_semantics
@@ -56,6 +57,7 @@ from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit, nodes_of
 from spatial_replay.text import Instant, Sentence, counted_from, named_arguments, shortened_formula
+from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace, require_time, window_of
 
 _UNTESTED: Final = Sentence("Nothing tested the verdict.")
@@ -117,6 +119,7 @@ class SpecResult(Displayed):
         series: (N, 4, T): value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
         leaves: (C, A, T), the instance's leaves, from which the methods compute; None if not stored.
         evidence: the samples, to be read again.
+        doubts: assumptions that its verdict rests on, and that the log contradicts.
     """
 
     name: str
@@ -132,6 +135,7 @@ class SpecResult(Displayed):
     has_series: bool
     leaves: Floats | None
     evidence: Evidence
+    doubts: tuple[Doubt, ...] = ()
 
     @classmethod
     def from_stream(
@@ -143,6 +147,7 @@ class SpecResult(Displayed):
         name: str | None = None,
         has_series: bool = True,
         has_leaves: bool = True,
+        doubts: tuple[Doubt, ...] = (),
     ) -> SpecResult:
         """Collect the result of a stream that has seen all samples.
 
@@ -150,6 +155,7 @@ class SpecResult(Displayed):
             block: what was stored of every sample, if anything.
             name: of the spec, unless it is the instance's.
             has_series, has_leaves: whether the block holds its series, and its leaves.
+            doubts: those that its verdict rests on.
         """
         instance = stream.instance
         has_series = has_series and block is not None
@@ -168,6 +174,7 @@ class SpecResult(Displayed):
             has_series,
             block.leaves if block is not None and has_leaves else None,
             evidence,
+            doubts,
         )
 
     @property
@@ -353,11 +360,12 @@ class SpecResult(Displayed):
 
     @property
     def remarks(self) -> tuple[Sentence, ...]:
-        """Sentences on the parts that decided nothing, the window that the end of the log cut, and goals that
-        hold in the first sample already."""
+        """Sentences on doubts, the parts that decided nothing, the window that the end of the log cut, and
+        goals that hold in the first sample already."""
+        doubts = [Sentence("The verdict is doubtful: ", doubt.text, ".") for doubt in self.doubts]
         parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
         own = [_UNTESTED] if self._is_untested else []
-        return (*own, *(each.message for each in parts), *self.goals_at_the_start)
+        return (*doubts, *own, *(part.message for part in parts), *self.goals_at_the_start)
 
     @cached_property
     def goals_at_the_start(self) -> tuple[Sentence, ...]:
@@ -580,6 +588,7 @@ class Evaluation(Displayed):
         objects, signals, classes: the names in the trace.
         each: the objects that templates were evaluated for, by parameter.
         left_out: sentences on the samples that were left out at the ends.
+        doubts: assumptions that the log contradicts; each result has those that it rests on.
     """
 
     results: tuple[SpecResult, ...]
@@ -590,6 +599,7 @@ class Evaluation(Displayed):
     classes: tuple[str, ...]
     each: Mapping[str, str]
     left_out: tuple[Sentence, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     @cached_property
     def remarks(self) -> tuple[Diagnostic, ...]:
@@ -748,11 +758,21 @@ def evaluate(
     stream = EvaluationStream(
         find_instances(specification, each or {}, [trace], *window), specification.regions, semantics
     )
+    instances = [own.instance for own in stream.streams]
+    doubts = distinct_doubts(trace.doubts, first_ns)
     results = tuple(
         SpecResult.from_stream(
-            own, Evidence(own.instance, specification.regions, lambda: [trace], trace.units), block
+            own,
+            Evidence(own.instance, specification.regions, lambda: [trace], trace.units),
+            block,
+            doubts=of_result,
         )
-        for own, block in zip(stream.streams, stream.extend(trace), strict=True)
+        for own, block, of_result in zip(
+            stream.streams,
+            stream.extend(trace),
+            doubts_of_instances(instances, doubts, lambda: [trace]),
+            strict=True,
+        )
     )
     return Evaluation(
         results,
@@ -763,6 +783,7 @@ def evaluate(
         _classes(trace),
         dict(each or {}),
         counted_from(left_out, first_ns),
+        doubts,
     )
 
 

@@ -324,10 +324,13 @@ def verdict_sentence(
 _TESTED = {"nothing": ", tested by nothing", "cut": ", cut by the end of the log"}
 
 
-def verdict_text(verdict: Verdict, robustness: float, unit: str, tested: str = "full") -> str:
+def verdict_text(
+    verdict: Verdict, robustness: float, unit: str, tested: str = "full", *, is_doubtful: bool = False
+) -> str:
     """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03 m"."""
+    doubtful = ", doubtful" if is_doubtful else ""
     number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
-    return f"{verdict}{_TESTED.get(tested, '')}, robustness {number}"
+    return f"{verdict}{_TESTED.get(tested, '')}{doubtful}, robustness {number}"
 
 
 def divisor_of(atom: Formula) -> float:

@@ -37,6 +37,7 @@ from spatial_replay.logs.messages import (
     AUTOMATA,
     CERTIFICATE,
     DERIVED,
+    DOUBTS,
     ENDING,
     METADATA,
     PLAN_METADATA,
@@ -128,6 +129,7 @@ class Recording:
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
         self._plan: Mapping[str, str] | None = None
+        self._doubts: tuple[str, ...] = ()
         self._images: set[str] = set()
         self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
@@ -214,8 +216,10 @@ class Recording:
         return written
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Write a metadata record; the certificate covers that of a plan."""
+        """Write a metadata record; the certificate covers that of a plan, and of doubts."""
         self._sink.add_metadata(name, data)
+        if name == DOUBTS:
+            self._doubts = tuple(data)
         if name == PLAN_METADATA:
             self._plan = dict(data)
 
@@ -241,7 +245,7 @@ class Recording:
             }
             self._sink.add_metadata(VERDICTS, texts)
         self._sink.add_metadata(ENDING, ending)
-        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self.files, self._plan))
+        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self.files, self._plan, self._doubts))
 
     def break_off(self, end: RunEnd) -> None:
         """Write the end of a log whose last samples could not be written: it has no certificate."""

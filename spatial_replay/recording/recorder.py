@@ -28,6 +28,7 @@ from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.errors import LogError, OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import (
+    DOUBTS,
     GRADIENT_MAP,
     PLAN_DECISION,
     PLAN_PATH,
@@ -55,6 +56,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted_from, listed, named_arguments, times_apart
+from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
 from spatial_replay.trace.trace import LATEST_NS, Sample, Trace, require_sample
 from spatial_replay.trace.units import Axes, checked_units
 
@@ -1046,12 +1048,14 @@ def record_source(
                 with uninterrupted():
                     recording.add(trace)
                 advance(len(trace))
+            if tally.doubts:
+                recording.add_metadata(DOUBTS, tally.doubts_metadata())
     except OutputError:
         # a disk that is full: half of a log that can be recorded again is worth less than none
         if output.is_file():
             output.unlink(missing_ok=True)
         raise
-    return tally.recorded(files)
+    return tally.recorded(source.name, files)
 
 
 def _units_metadata(source: Source, unit: str) -> dict[str, str]:
@@ -1073,6 +1077,7 @@ def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
     for block in read_blocks(source):
         tally.add(block.trace)
         tally.remarks += block.remarks
+        tally.doubts += block.doubts
         if len(block.trace):
             any_sample = True
             yield block.trace
@@ -1114,6 +1119,7 @@ class _Tally:
         self._signals: set[str] = set()
         self.faults: list[str] = []
         self.remarks: list[str] = []
+        self.doubts: list[Doubt] = []
         self._samples = self._unreadable = 0
 
     def add(self, trace: Trace) -> None:
@@ -1125,9 +1131,10 @@ class _Tally:
         if len(trace):
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
 
-    def recorded(self, files: Sequence[Specification]) -> Recorded:
+    def recorded(self, name: str, files: Sequence[Specification]) -> Recorded:
         names, signals = sorted(self._names), sorted(self._signals)
         remarks = [remark for file in files for remark in check_names(file, names, signals)]
+        doubts = (doubt.remark(name) for doubt in dict.fromkeys(self.doubts))
         return Recorded(
             self._samples,
             self._times[0],
@@ -1136,5 +1143,9 @@ class _Tally:
             counted_from(self.faults, self._times[0]),
             self._unreadable,
             tuple(remark for remark in remarks if remark.severity == "error"),
-            counted_from(self.remarks, self._times[0]),
+            counted_from((*doubts, *self.remarks), self._times[0]),
         )
+
+    def doubts_metadata(self) -> dict[str, str]:
+        """Return the metadata record of the doubts; {} without any."""
+        return metadata_from_doubts(distinct_doubts(self.doubts, self._times[0]))

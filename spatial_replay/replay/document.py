@@ -18,6 +18,7 @@ from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import nodes_of, units_of, units_text
 from spatial_replay.text import Sentence, counted_from, json_fields, json_number, names_of
+from spatial_replay.trace.doubts import json_doubt
 
 
 def document_from_replay(
@@ -37,6 +38,7 @@ def document_from_replay(
             "name": replayed.log,
             **json_fields(replayed, "samples", "start_ns", "end_ns", "faults", "remarks"),
             "damaged": bool(replayed.faults),
+            "doubts": [json_doubt(doubt) for doubt in replayed.doubts],
             "missing": [each.message for each in replayed.missing],
             "left": [
                 json_fields(departure, "name", "start_ns", "end_ns", "distance", "message")
@@ -65,6 +67,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         "tested": result.tested,
         "untested": [_untested(each, first_ns) for each in result.untested],
         "vacuous": [_untested(each, first_ns) for each in result.vacuous],
+        "doubts": [doubt.assumption for doubt in result.doubts],
         "remarks": list(counted_from(result.remarks, first_ns)),
         "nodes": [
             {**json_fields(node, "id", "parent", "operator", "text"), **_of_node(node)}

@@ -23,6 +23,7 @@ from spatial_replay.logs.messages import (
     AUTOMATA,
     AUTOMATA_PREFIX,
     CERTIFICATE,
+    DOUBTS,
     ENDING,
     LAYOUT,
     METADATA,
@@ -40,6 +41,7 @@ from spatial_replay.logs.messages import (
     read_ahead,
 )
 from spatial_replay.monitor.departures import Departure, Departures
+from spatial_replay.monitor.doubtful import doubts_of_instances
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stillness import Stillness
@@ -62,6 +64,7 @@ from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications, parse_specification
 from spatial_replay.text import Instant, Sentence, counted, counted_from
+from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
 from spatial_replay.trace.trace import FOREVER, LONG_PAUSE, Trace
 
 if TYPE_CHECKING:
@@ -105,7 +108,7 @@ class Replayed:
         first_ns: time of the log's first sample, evaluated or not.
         start_ns, end_ns: times of the first and the last of those evaluated.
         faults: what was lost while reading, each with its place.
-        remarks: what the source reports about its samples where nothing was lost.
+        remarks: what the source reports about its samples where nothing was lost; doubts come first.
         missing: a warning for each name in the specifications that the log never has: it is unknown.
         dropped: the samples that the recorder of the log had no time for.
         unreadable: how many observations have no usable value: a number is not finite, or too old.
@@ -115,6 +118,7 @@ class Replayed:
         semantics: the semantics of the formulas.
         left: members of open groups, and objects of `present`, that left within reach of a threshold and came
             back; also in `remarks`.
+        doubts: assumptions that the log contradicts; each result has those that it rests on.
     """
 
     log: str
@@ -132,6 +136,7 @@ class Replayed:
     certificate: Mapping[str, str]
     semantics: Semantics = "ltlf"
     left: tuple[Departure, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -196,6 +201,7 @@ class Replay:
         )
         self._faults: list[str] = []
         self._remarks: list[str] = []
+        self._doubts: list[Doubt] = []
         self._topics: set[str] = set()
         self._images: set[str] = set()
         self._names = LogNames()
@@ -233,6 +239,7 @@ class Replay:
                 own = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
             self._remarks += block.remarks
+            self._doubts += block.doubts
             if not layer:
                 self._topics.update(channel.topic for channel in own.channels.values())
                 self._images |= image_topics(own.channels.values())
@@ -308,6 +315,7 @@ class Replay:
         options = self._selection.options
         first_ns = first_sample_ns(self._source) if options.window.start_ns else self._ends.log_begin_ns
         left = self._left(first_ns)
+        doubts = distinct_doubts(self._doubts, first_ns)
         return Replayed(
             log=self._source.name,
             samples=self._samples,
@@ -316,6 +324,7 @@ class Replay:
             end_ns=self._times[-1],
             faults=counted_from(self._faults, first_ns),
             remarks=(
+                *(doubt.remark(self._source.name) for doubt in doubts),
                 *counted_from(self._remarks, first_ns),
                 *dropped.remarks,
                 *self._empty_ends(first_ns),
@@ -332,6 +341,7 @@ class Replay:
                 self._traces.read,
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
+                doubts=doubts,
             ),
             vacuous=idle_templates(
                 (spec for file in self.files for spec in file.results),
@@ -342,10 +352,13 @@ class Replay:
             certificate={}
             if self._hashes is None
             else self._hashes.certificate(
-                self._written_files, dict(self._source.metadata()).get(PLAN_METADATA)
+                self._written_files,
+                dict(self._source.metadata()).get(PLAN_METADATA),
+                (doubt.title for doubt in doubts),
             ),
             semantics=options.semantics,
             left=left,
+            doubts=doubts,
         )
 
     def _left(self, first_ns: int) -> tuple[Departure, ...]:
@@ -412,6 +425,7 @@ def replayed_specs(
     *,
     has_series: bool = True,
     has_leaves: bool = True,
+    doubts: Sequence[Doubt] = (),
 ) -> tuple[SpecResult, ...]:
     """Return the results of an evaluation that has taken in all samples.
 
@@ -419,8 +433,9 @@ def replayed_specs(
         kept: for each of its trees every sample, or None if nothing was kept.
         traces: reads the samples again.
         has_series, has_leaves: whether the stretches hold the numbers, and the atoms.
+        doubts: those about the log.
     """
-
+    doubts_by_result = doubts_of_instances([stream.instance for stream in evaluation.streams], doubts, traces)
     return tuple(
         SpecResult.from_stream(
             stream,
@@ -429,8 +444,11 @@ def replayed_specs(
             name=tree.name,
             has_series=has_series,
             has_leaves=has_leaves,
+            doubts=own_doubts,
         )
-        for tree, stream, block in zip(evaluation.trees, evaluation.streams, kept, strict=True)
+        for tree, stream, block, own_doubts in zip(
+            evaluation.trees, evaluation.streams, kept, doubts_by_result, strict=True
+        )
     )
 
 
@@ -508,10 +526,14 @@ def run_replay(
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
-            each.title: verdict_text(each.verdict, each.robustness, each.unit, each.tested)
+            each.title: verdict_text(
+                each.verdict, each.robustness, each.unit, each.tested, is_doubtful=bool(each.doubts)
+            )
             for each in (replayed.results[place] for place in worst_first(replayed.results))
         }
         sink.add_metadata(VERDICTS, texts)
+        if replayed.doubts:
+            sink.add_metadata(DOUBTS, metadata_from_doubts(replayed.doubts))
         sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
 
@@ -584,7 +606,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
 def _copy_attached(sink: Sink, source: Source) -> None:
     """Copy the source's metadata and attachments, except those that a replay replaces."""
     for name, data in source.metadata():
-        if name not in (METADATA, AUTOMATA, VERDICTS, CERTIFICATE):
+        if name not in (METADATA, AUTOMATA, VERDICTS, DOUBTS, CERTIFICATE):
             sink.add_metadata(name, data)
     for attachment in source.attachments():
         if not attachment.name.startswith(_REPLACED) and attachment.name != LAYOUT:

@@ -62,6 +62,7 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.text import counted_from, listed
+from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import Trace, within
 
 _FEW: Final = 2_000
@@ -247,6 +248,7 @@ class LoadedLog:
         inside: those in the window.
         own: the messages of the log itself.
         faults, remarks: what was lost while reading, and what else the source reports.
+        doubts: assumptions that the log contradicts.
         missing: a warning for each name in the specifications that the log never has.
         dropped: the samples that its recorder had no time for.
     """
@@ -282,10 +284,12 @@ class LoadedLog:
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
+        doubts: list[Doubt] = []
         ends = selection.run_ends()
         for block, trace in read_ahead(selection.read_blocks(ends=ends)):
             traces.append(trace)
             remarks += block.remarks
+            doubts += block.doubts
             self.own.add(block)
             advance(len(trace))
         self.trace = replace(Trace.concatenate(traces), units=source.axes.units)
@@ -296,6 +300,7 @@ class LoadedLog:
         self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
         self.first_ns = first_sample_ns(source) if options.window.start_ns else ends.log_begin_ns
+        self.doubts = distinct_doubts(doubts, self.first_ns)
         self._needs, self._has_spans = ends.needs, ends.has_spans
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
@@ -457,12 +462,20 @@ class Evaluated:
             start_ns=int(times_ns[0]),
             end_ns=int(times_ns[-1]),
             faults=counted_from(loaded.faults, loaded.first_ns),
-            remarks=(*counted_from(loaded.remarks, loaded.first_ns), *loaded.dropped.remarks),
+            remarks=(
+                *(doubt.remark(loaded.name) for doubt in loaded.doubts),
+                *counted_from(loaded.remarks, loaded.first_ns),
+                *loaded.dropped.remarks,
+            ),
             missing=loaded.missing,
             dropped=loaded.dropped,
             unreadable=loaded.inside.unreadable_count,
             results=replayed_specs(
-                self.evaluation, self.edited.files, self.stretches, self.selection.iter_traces
+                self.evaluation,
+                self.edited.files,
+                self.stretches,
+                self.selection.iter_traces,
+                doubts=loaded.doubts,
             ),
             vacuous=idle_templates(
                 (spec for file in self.edited.files for spec in file.results),
@@ -472,6 +485,7 @@ class Evaluated:
             ),
             certificate=MappingProxyType({}),
             semantics=loaded.options.semantics,
+            doubts=loaded.doubts,
         )
 
     @cached_property

@@ -232,6 +232,11 @@ def explain_differences(
         lines.append(
             Sentence(f"{'plan settings':<14} {'the same' if is_same else 'differ from those certified'}")
         )
+    doubts = [certificate.get("doubts", "none") for certificate in (recorded, computed)]
+    if doubts != ["none", "none"]:
+        is_same = doubts[0] == doubts[1]
+        what = "the same" if is_same else f"{doubts[1]} now, {doubts[0]} recorded"
+        lines.append(Sentence(f"{'doubts':<14} {what}"))
     version = recorded.get("spatial_replay_version", "unknown")
     is_same = version == __version__
     lines.append(
@@ -308,9 +313,10 @@ _HASHES: Mapping[str, str] = MappingProxyType(
         "specification_sha256": "another specification",
         "results_sha256": "other results",
         PLAN_SHA256: "other plan settings",
+        "doubts": "other doubts",
     }
 )
-"""The meaning of a difference, for each hash of a certificate."""
+"""The meaning of a difference, for each entry of a certificate."""
 
 _NOT_COVERED = (
     "plan settings are not covered by this certificate; --decisions recomputes what followed from them"

@@ -42,6 +42,7 @@ from spatial_replay.logs.remote import (
     log_file,
 )
 from spatial_replay.text import counted_from, printable
+from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -108,15 +109,19 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
     """
     source = open_source(path, **reading)
     blocks = source.keeping().iter_blocks()
-    traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
+    traces = [replace(block.trace, remarks=block.remarks, doubts=block.doubts) for block in blocks]
     trace = Trace.concatenate(traces)
     first_ns = int(trace.times_ns[0]) if len(trace) else 0
-    faults, remarks = counted_from(trace.faults, first_ns), counted_from(trace.remarks, first_ns)
+    faults, doubts = counted_from(trace.faults, first_ns), distinct_doubts(trace.doubts, first_ns)
+    remarks = (
+        *(doubt.remark(source.name) for doubt in doubts),
+        *counted_from(trace.remarks, first_ns),
+    )
     if faults and not allow_damage:
         others = count_of(trace.faults) - 1
         more = f"\n… and {others} more" if others else ""
         raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
-    return replace(trace, remarks=remarks, faults=faults, units=source.axes.units)
+    return replace(trace, remarks=remarks, doubts=doubts, faults=faults, units=source.axes.units)
 
 
 def readable_file(path: str | PathLike[str]) -> LogFile:

@@ -24,6 +24,7 @@ from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence
+from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import Pauses, Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -336,6 +337,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     """
     tally = _Tally()
     remarks: list[str] = []
+    doubts: list[Doubt] = []
     container = summarise_mcap(source) if isinstance(source, McapSource) else None
     # an external log has no samples, and yet a container to list
     if container is None or container.has_objects:
@@ -345,6 +347,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
             for block in read.iter_blocks():
                 tally.add(block.trace)
                 remarks += block.remarks
+                doubts += block.doubts
                 advance(len(block.trace))
         except UsageError as error:
             # a scenario without objects is not damaged; a mapping that does not fit is a mistake of the user
@@ -364,7 +367,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         # reading the samples and listing the container report the same damage
         faults=tuple(dict.fromkeys(faults)),
         container=container,
-        remarks=tuple(remarks),
+        remarks=(*(doubt.remark(source.name) for doubt in dict.fromkeys(doubts)), *remarks),
         axes=source.axes,
     )
 

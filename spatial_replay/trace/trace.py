@@ -32,6 +32,7 @@ from spatial_replay.text import (
     text_number,
     times_apart,
 )
+from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.spans import TopicSpan, join_spans
 from spatial_replay.trace.units import checked_units
 
@@ -333,8 +334,8 @@ class Trace(Displayed):
     that is not finite is stored too, so that nothing is lost, but under the row number -2 - row: the
     object is unknown there (unreadable).
 
-    Two traces are equal if they hold the same samples; `faults`, `remarks`, `units`, `spans`, the order of
-    observations and names that no sample uses do not matter.
+    Two traces are equal if they hold the same samples; `faults`, `remarks`, `doubts`, `units`, `spans`, the
+    order of observations and names that no sample uses do not matter.
 
     Attributes:
         times_ns: (T,) int64.
@@ -353,6 +354,7 @@ class Trace(Displayed):
         lasting: the objects that stand where they are until they are reported again.
         faults: messages about samples lost or left out while reading, each with its place.
         remarks: other messages about the log, where nothing was lost.
+        doubts: assumptions by which the log was read, and which it contradicts.
         units: those that are declared, of signals by their names, of lengths by "".
         spans: when each mapped topic could be judged, for logs whose ends are trimmed.
         cache: measurements already taken from this trace.
@@ -375,6 +377,7 @@ class Trace(Displayed):
     lasting: frozenset[str] = frozenset()
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     spans: tuple[TopicSpan, ...] = field(default=(), repr=False)
     cache: MeasurementCache = field(default_factory=MeasurementCache, init=False, repr=False, compare=False)
@@ -655,6 +658,7 @@ class Trace(Displayed):
             lasting=frozenset().union(*(trace.lasting for trace in traces)),
             faults=tuple(fault for trace in traces for fault in trace.faults),
             remarks=tuple(remark for trace in traces for remark in trace.remarks),
+            doubts=tuple(dict.fromkeys(doubt for trace in traces for doubt in trace.doubts)),
             units={name: unit for trace in traces for name, unit in trace.units.items()},
             spans=join_spans(trace.spans for trace in traces),
         )

@@ -48,6 +48,7 @@ from spatial_replay.logs.messages import (
     ALL,
     BLOCK_SAMPLES,
     DERIVED,
+    DOUBTS,
     METADATA,
     OBJECTS,
     OBJECTS_TYPE,
@@ -69,6 +70,7 @@ from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import RemoteFile, each_ahead, open_file, plan_reads
 from spatial_replay.text import Instant, Sentence, counted, listed
+from spatial_replay.trace.doubts import doubts_from_metadata
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
@@ -377,8 +379,10 @@ class McapSource(FileSource):
                 raise LogError(f"{self.name} holds no sample: {fault}")
             remarks = directory_remarks(self.name, walk.directory, self.metadata())
             remarks = (*remarks, *remarks_on_copies(self.name, renamed))
-            if rest or remarks:
-                yield Block(replace(Trace.from_samples(()), faults=rest), remarks=remarks)
+            doubts = tuple(doubts_from_metadata(dict(self.metadata()).get(DOUBTS, {})))
+            if rest or remarks or doubts:
+                trace = replace(Trace.from_samples(()), faults=rest)
+                yield Block(trace, remarks=remarks, doubts=doubts)
 
     def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
         """Yield the payloads of one topic in order, in lists of bounded size, each with what was lost."""
