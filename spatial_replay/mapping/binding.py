@@ -102,7 +102,6 @@ class Namer:
         self,
         objects: Sequence[object],
         indices: Sequence[int | str],
-        style: Style,
         messages: Sequence[object] | None = None,
     ) -> list[int]:
         """Return the code of each object's name.
@@ -121,7 +120,7 @@ class Namer:
             # step by step once, because the errors of the fast getter name no fields
             message = messages[0] if messages else None
             self._name(objects[0], indices[0], message)
-            self._prepare(objects[0], indices[0], message, style)
+            self._prepare(objects[0], indices[0], message)
         known, get = self._code_by_value, self._get
         of_objects = repeat(None, len(objects)) if messages is None else messages
         rows = zip(objects, indices, of_objects, strict=True)
@@ -146,7 +145,7 @@ class Namer:
             self._is_wanted[code] = is_named and not is_excluded
         return [self._is_wanted[code] for code in codes]
 
-    def _prepare(self, example: object, index: int | str, message: object, style: Style) -> None:
+    def _prepare(self, example: object, index: int | str, message: object) -> None:
         """Find a fast way: most templates have one field, so that a name is known by its value."""
         self._is_prepared = True
         fields = [part for part in self._template.parts if not isinstance(part, str)]
@@ -160,10 +159,10 @@ class Namer:
                 return
             *before, last = path.steps
             if path.from_message and isinstance(last, Place) and before:
-                listed = getter(FieldPath(path.text, tuple(before)), style_of(message))
+                listed = getter(FieldPath(path.text, tuple(before)), message)
                 self._get = lambda _, index, message: listed(message)[index]
             elif not path.from_message:
-                get = getter(path, style)
+                get = getter(path, example)
                 self._get = lambda thing, *_: get(thing)
 
     def _name(self, thing: object, index: int | str, message: object) -> str:
@@ -418,11 +417,11 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         if not orientation:
             yaw = _first(layout.yaw, lambda path: columns.add(FieldPath.of(path)))
         position = () if layout.polygon and layout.is_generic else _position(layout, columns)
-    uncertainty, covariance = _uncertainty(layout, columns, style)
+    uncertainty, covariance = _uncertainty(layout, columns)
     sizes = _first(layout.sizes, columns.add_all) or ()
     shape_sizes = tuple(map(columns.measure, layout.shape.sizes)) if layout.shape else ()
     height = tuple(map(columns.measure, layout.height)) if layout.height else ()
-    polygon = _polygon(layout, example, style)
+    polygon = _polygon(layout, example)
     class_paths = [FieldPath.of(path) for path in layout.class_field]
     if len(class_paths) == 1:
         # alternatives may all be missing, a single path of the mapping must not
@@ -431,7 +430,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     paths = columns.paths
     return Binding(
         style=style,
-        numbers=tuple_getter(paths, style) if paths else None,
+        numbers=tuple_getter(paths, example) if paths else None,
         width=len(paths),
         position=position,
         orientation=orientation,
@@ -442,7 +441,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         uncertainty=uncertainty,
         polygon=polygon,
         covariance=covariance,
-        class_gets=tuple(getter(path, style) for path in class_paths),
+        class_gets=tuple(getter(path, example) for path in class_paths),
         frame=_frame(layout, example, message, needs_frame),
         lifetime=lifetime,
     )
@@ -509,7 +508,7 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolv
     return None
 
 
-def _polygon(layout: MessageLayout, example: object, style: Style) -> Get | None:
+def _polygon(layout: MessageLayout, example: object) -> Get | None:
     text = layout.polygon[0] if layout.polygon else layout.shape.outline if layout.shape else ""
     if not text:
         return None
@@ -520,12 +519,10 @@ def _polygon(layout: MessageLayout, example: object, style: Style) -> Get | None
         path, value = below(path, "points"), get_field(value, "points")
     if not is_list(value):
         raise FieldError(f"{path.text}: expected a list of corners, got {type_name(value)}")
-    return getter(path, style)
+    return getter(path, example)
 
 
-def _uncertainty(
-    layout: MessageLayout, columns: _Columns, style: Style
-) -> tuple[float | int | None, Get | None]:
+def _uncertainty(layout: MessageLayout, columns: _Columns) -> tuple[float | int | None, Get | None]:
     wanted = layout.uncertainty
     if wanted is None:
         return None, None
@@ -535,7 +532,7 @@ def _uncertainty(
     value = walk(path, columns.example)
     if not is_list(value) or len(value) not in (4, 9, 36):
         raise FieldError(f"{path.text}: expected a covariance of 4, 9 or 36 numbers, got {type_name(value)}")
-    return None, getter(path, style)
+    return None, getter(path, columns.example)
 
 
 def _frame(
@@ -549,7 +546,7 @@ def _frame(
         value = walk(path, root)
         if not isinstance(value, str):
             raise FieldError(f"{path.text}: expected the name of a frame, got {type_name(value)}")
-        return getter(path, style_of(root)), path.from_message
+        return getter(path, root), path.from_message
     return None
 
 
@@ -565,15 +562,14 @@ def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> Time
         if len(stamps) > 1 and not leads_somewhere(path, root):
             continue
         value = walk(path, root)
-        style = style_of(root)
         names = field_names(value)
         fits = any if isinstance(value, Sparse) else all
         for parts in _TIME_FIELDS:
             if fits(part in names for part in parts):
-                pair = tuple_getter([below(path, part) for part in parts], style)
+                pair = tuple_getter([below(path, part) for part in parts], root)
                 return TimeGetter(path, pair, parts, 1)
         if is_number(value):
-            return TimeGetter(path, getter(path, style), None, stamp.unit_ns)
+            return TimeGetter(path, getter(path, root), None, stamp.unit_ns)
         remedy = "give the path of a stamp or a number"
         raise FieldError(f"{path.text}: {type_name(value)} is not a time; {remedy}")
     return None

@@ -663,9 +663,8 @@ def _points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     names = field_names(example)
     if "x" in names and "y" in names:
         axes = "xyz" if "z" in names else "xy"
-        style = style_of(example)
-        get = tuple_getter([FieldPath.of(axis) for axis in axes], style)
-        rows = rows_from_tuples(map(get, flat), len(flat), len(axes), style)
+        get = tuple_getter([FieldPath.of(axis) for axis in axes], example)
+        rows = rows_from_tuples(map(get, flat), len(flat), len(axes), style_of(example))
         return counts, rows if len(axes) == 3 else np.column_stack([rows, np.zeros(len(flat))])
     if example is None or hasattr(example, "__len__"):
         pairs = _array([(point[0], point[1]) for point in flat], 2)
@@ -680,8 +679,12 @@ def rows_from_tuples(tuples: Iterable[Sequence[Any]], count: int, width: int, st
     """Return the numbers (count, width) in tuples, NaN for the null of JSON."""
     if style == "keys":
         return np.array(list(tuples), np.float64).reshape(count, width)
-    # faster, but it does not take None
-    return np.fromiter(chain.from_iterable(tuples), np.float64, count * width).reshape(count, width)
+    rows = list(tuples)
+    try:
+        # faster, but it does not take None, for an element that a list lacks
+        return np.fromiter(chain.from_iterable(rows), np.float64, count * width).reshape(count, width)
+    except TypeError:
+        return np.array(rows, np.float64).reshape(count, width)
 
 
 def _array(rows: list[Any], width: int) -> Floats:

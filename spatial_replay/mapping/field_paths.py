@@ -1,12 +1,15 @@
 """Field paths such as `poses[*].position.x`, and name templates such as `tag{id}` that contain them.
 
     path      =  ["$."] step { step }      "$." starts at the message, not at the object in it
-    step      =  name | "." name | "[" number "]" | "[*]" | "[best]" | "[index]" | name "[" name "=" text "]"
+    step      =  key | "." key | "[" number "]" | "[*]" | "[best]" | "[index]" | key "[" path "=" text "]"
+    key       =  name | "'" any characters but ' { } | "'"
     template  =  { text | "{" path { "|" path } "}" }
 
-`[*]` also takes the values of a JSON object. `[best]` is the element with the highest score. `[index]`, in
-names, is the element at the place, or key, that the object has in its own list. `position[name=elbow]` is
-the element of `position` where the list `name` beside it has `elbow`; only signals have such steps.
+A key in quotes has dots, spaces or letters beyond ASCII: `'pose.x'`. A number below 0 counts from the end.
+`[*]` also takes the values of a JSON object or of a protobuf map. `[best]` is the element with the highest
+score. `[index]`, in names, is the element at the place, or key, that the object has in its own list.
+`tracks[id=7]` is the last element of `tracks` whose field `id` is 7; `position[name=elbow]` is the element of
+`position` where the list `name` beside it has `elbow`. Without such an element the value is unknown.
 Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and explains errors;
 `getter` compiles it to nested calls. A path comes from a file, so nothing in it is evaluated: it reaches
 only fields that the message declares.
@@ -37,6 +40,10 @@ def field_names(value: object) -> tuple[str, ...]:
     """Return the names of the fields of a message or a part of it; none for numbers, texts and lists."""
     if isinstance(value, dict):
         return tuple(name for name in value if isinstance(name, str))
+    if isinstance(value, Mapping):
+        return tuple(map(str, value))
+    if _is_free(value):
+        return tuple(value.fields)  # type: ignore[attr-defined]
     descriptor = getattr(value, "DESCRIPTOR", None)
     if descriptor is not None:
         return tuple(field.name for field in descriptor.fields)
@@ -47,8 +54,34 @@ def field_names(value: object) -> tuple[str, ...]:
 
 def get_field(value: Any, name: str) -> object:
     """Return the value of a field that `field_names` lists."""
-    field: object = value[name] if isinstance(value, dict) else getattr(value, name)
-    return field
+    if isinstance(value, dict):
+        return _plain(value[name])
+    if isinstance(value, Mapping):
+        # keys of protobuf maps may be numbers
+        return _plain(next(element for key, element in value.items() if str(key) == name))
+    return _plain(value.fields[name] if _is_free(value) else getattr(value, name))
+
+
+_FREE = "google.protobuf.Struct"
+
+
+def _is_free(value: object) -> bool:
+    """Return whether a value is a protobuf message whose fields each sender chooses."""
+    return getattr(getattr(value, "DESCRIPTOR", None), "full_name", "") == _FREE
+
+
+def _plain(value: Any) -> Any:
+    """Return the values of a `google.protobuf.Struct` as those of JSON, and all others as they are."""
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    kind = "" if descriptor is None else descriptor.full_name
+    if kind == _FREE:
+        return {key: _plain(element) for key, element in value.fields.items()}
+    if kind == "google.protobuf.ListValue":
+        return list(map(_plain, value.values))
+    if kind != "google.protobuf.Value":
+        return value
+    chosen = value.WhichOneof("kind")
+    return None if chosen in (None, "null_value") else _plain(getattr(value, chosen))
 
 
 class Sparse(dict[str, Any]):
@@ -85,8 +118,8 @@ def sparse(value: object) -> object:
 
 def _sparse(value: object) -> object:
     if isinstance(value, dict):
-        return Sparse({key: _sparse(each) for key, each in value.items()})
-    return [_sparse(each) for each in value] if isinstance(value, list) else value
+        return Sparse({key: _sparse(element) for key, element in value.items()})
+    return [_sparse(element) for element in value] if isinstance(value, list) else value
 
 
 def type_name(value: object) -> str:
@@ -111,14 +144,15 @@ def type_name(value: object) -> str:
 Get: TypeAlias = Callable[[Any], Any]
 
 EACH: Final = "*"
-_KEYED = r"[A-Za-z_][\w-]*\[[A-Za-z_][\w-]*=[^\[\]{}|=\s]{1,100}\]"
-PATTERN: Final = (
-    rf"(\$\.)?(?=[A-Za-z_]|\[\*\])(\.?(?:{_KEYED}|[A-Za-z_][\w-]*)|\[(\d{{1,9}}|\*|best|index)\])+"
-)
+_NAME = r"[A-Za-z_][\w-]*"
+_KEY = rf"(?:{_NAME}|'[^'{{}}|\x00-\x1f]{{1,200}}')"
+_CHOSEN = rf"\[(?:{_NAME})(?:\.(?:{_NAME}))*=[^\[\]{{}}|=\s]{{1,100}}\]"
+_BRACKET = r"\[(?:-?\d{1,9}|\*|best|index)\]"
+PATTERN: Final = rf"(?:\$\.)?(?:{_KEY}(?:{_CHOSEN})?|\[\*\])(?:\.{_KEY}(?:{_CHOSEN})?|{_BRACKET})*"
 """A path, as a regular expression."""
 
 _STEP = re.compile(
-    r"\.?([A-Za-z_][\w-]*)(?:\[([A-Za-z_][\w-]*)=([^\[\]{}|=\s]+)\])?|\[(\d{1,9}|\*|best|index)\]", re.ASCII
+    rf"\.?(?:({_NAME})|'([^']+)')(?:\[([^\[\]=]+)=([^\[\]]+)\])?|\[(-?\d{{1,9}}|\*|best|index)\]", re.ASCII
 )
 _PATH = re.compile(PATTERN, re.ASCII)
 
@@ -138,16 +172,34 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Keyed:
-    """The step `field[names=key]`: the element of one list where another one beside it has a text."""
+    """The step `field[path=key]`: the element of a list by a field of its own, or by a list beside it."""
 
     field: str
-    names: str
+    path: FieldPath
     key: str
 
     def read(self, value: Any) -> object:
-        """Return the element; None, for an unknown number, where the key is not in the list."""
-        keys = list(get_field(value, self.names))  # type: ignore[call-overload]
-        return get_field(value, self.field)[keys.index(self.key)] if self.key in keys else None  # type: ignore[index]
+        """Return the element; None, for an unknown number, where there is none.
+
+        Raises:
+            FieldError: elements lack the field.
+        """
+        elements = get_field(value, self.field)
+        names = self.names(value)
+        if names is not None:
+            return elements[names.index(self.key)] if self.key in names else None  # type: ignore[index]
+        matching = [thing for thing in elements_of(elements) if _word(walk(self.path, thing)) == self.key]
+        return matching[-1] if matching else None
+
+    def names(self, value: object) -> list[str] | None:
+        """Return the names in the list beside the field; None without such a list."""
+        beside = self.path.text
+        names = get_field(value, beside) if beside in field_names(value) else None
+        return list(map(_word, names)) if is_list(names) else None
+
+
+def _word(value: object) -> str:
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,8 +224,8 @@ def _score(value: object) -> float:
     if "hypothesis" in names:
         return _score(get_field(value, "hypothesis"))
     scores: Iterator[Any] = (get_field(value, name) for name in _SCORES if name in names)
-    found = next((float(score) for score in scores if score is not None and is_number(score)), nan)
-    return -inf if isnan(found) else found
+    best = next((float(score) for score in scores if score is not None and is_number(score)), nan)
+    return -inf if isnan(best) else best
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,15 +259,16 @@ class FieldPath:
         """
         if not _PATH.fullmatch(text):
             raise UsageError(
-                f"{text[:80]!r} is not a field path; write names with dots: pose.position.x, tags[0].id"
+                f"{text[:80]!r} is not a field path; write names with dots: pose.position.x, tags[0].id;"
+                " a key with other characters stands in quotes: 'pose.x'"
             )
         steps: list[Step] = []
         for match in _STEP.finditer(text.removeprefix("$.")):
-            name, names, key, index = match.groups()
-            if names:
-                steps.append(Keyed(name, names, key))
+            name, quoted, chosen_by, key, index = match.groups()
+            if chosen_by:
+                steps.append(Keyed(name or quoted, cls.of(chosen_by), key))
             else:
-                steps.append(name or _BRACKETS.get(index) or int(index))
+                steps.append(name or quoted or _BRACKETS.get(index) or int(index))
         return cls(text, tuple(steps), text.startswith("$."))
 
 
@@ -239,23 +292,25 @@ def walk(
     for step in path.steps:
         if isinstance(step, str):
             is_left_out = isinstance(value, Sparse) and not is_strict
-            value = value[step] if is_left_out else _named(path, value, step)  # type: ignore[index]
+            value = value[step] if is_left_out else _field_at(path, value, step)  # type: ignore[index]
         elif isinstance(step, int):
-            value = _numbered(path, value, step)
+            value = _element_at(path, value, step)
         elif isinstance(step, Keyed):
-            value = _keyed(path, value, step)
+            value = _element_of_key(path, value, step)
+            if value is None:
+                return None
         elif isinstance(step, Best):
-            _numbered(path, value, 0)
+            _element_at(path, value, 0)
             value = step.read(value)
         elif isinstance(step, Place):
-            value = _placed(path, value, index)
+            value = _element_at_place(path, value, index)
     return value
 
 
-def _placed(path: FieldPath, value: object, index: int | str | None) -> object:
+def _element_at_place(path: FieldPath, value: object, index: int | str | None) -> object:
     if index is None:
         raise FieldError(f"{path.text}: [index] is for names: it is the place of an object in its list")
-    return _named(path, value, index) if isinstance(index, str) else _numbered(path, value, index)
+    return _field_at(path, value, index) if isinstance(index, str) else _element_at(path, value, index)
 
 
 def leads_somewhere(path: FieldPath, value: object) -> bool:
@@ -267,10 +322,12 @@ def leads_somewhere(path: FieldPath, value: object) -> bool:
     return True
 
 
-def _named(path: FieldPath, value: object, name: str) -> object:
+def _field_at(path: FieldPath, value: object, name: str) -> object:
     names = field_names(value)
     if name not in names:
-        hint = nearest_hint(name, names)
+        dotted = next((key for key in names if "." in key and _in_quotes(key) not in path.text), None)
+        hint = f"a key with a dot stands in quotes: {_in_quotes(dotted)}" if dotted else ""
+        hint = hint or nearest_hint(name, names)
         raise FieldError(
             f"{path.text}: {type_name(value)} has no field {name!r}"
             + (f"; {hint}" if hint else "")
@@ -279,23 +336,33 @@ def _named(path: FieldPath, value: object, name: str) -> object:
     return get_field(value, name)
 
 
-def _numbered(path: FieldPath, value: object, index: int) -> object:
+def _in_quotes(key: str) -> str:
+    return f"'{key}'"
+
+
+def _element_at(path: FieldPath, value: object, index: int) -> object:
+    if isinstance(value, Mapping):
+        return _field_at(path, value, str(index))
     if not is_list(value):
         raise FieldError(f"{path.text}: [{index}] needs a list, got {type_name(value)}")
-    if index >= len(value):
+    if not -len(value) <= index < len(value):
         raise FieldError(f"{path.text}: [{index}] is out of range, there are {len(value)} elements")
     return value[index]
 
 
-def _keyed(path: FieldPath, value: object, step: Keyed) -> object:
-    lists = [_named(path, value, name) for name in (step.names, step.field)]
-    for name, each in zip((step.names, step.field), lists, strict=True):
-        if not is_list(each):
-            raise FieldError(f"{path.text}: {name} has to be a list, got {type_name(each)}")
-    keys = [str(key) for key in lists[0]]  # type: ignore[attr-defined]
-    if step.key not in keys:
-        hint = nearest_hint(step.key, keys) or f"it has {', '.join(keys[:20]) or 'nothing'}"
-        raise FieldError(f"{path.text}: {step.names} has no {step.key!r}; {hint}")
+def _element_of_key(path: FieldPath, value: object, step: Keyed) -> object:
+    elements = _field_at(path, value, step.field)
+    if not is_list(elements) and not isinstance(elements, Mapping):
+        raise FieldError(f"{path.text}: {step.field} has to be a list, got {type_name(elements)}")
+    names = step.names(value)
+    if names is None and any(field_names(element) for element in elements_of(elements)):
+        return step.read(value)
+    if names is None and len(elements):
+        _field_at(path, value, step.path.text)
+        raise FieldError(f"{path.text}: {step.path.text} has to be a list")
+    if names is not None and step.key not in names:
+        hint = nearest_hint(step.key, names) or f"it has {', '.join(names[:20]) or 'nothing'}"
+        raise FieldError(f"{path.text}: {step.path.text} has no {step.key!r}; {hint}")
     return step.read(value)
 
 
@@ -315,14 +382,20 @@ def enum_names(path: FieldPath, message: object) -> dict[object, str]:
     owner = walk(FieldPath(path.text, path.steps[:-1]), message)
     fields = getattr(getattr(owner, "DESCRIPTOR", None), "fields_by_name", {})
     kind = getattr(fields.get(path.steps[-1]), "enum_type", None)
-    return {} if kind is None else {each.number: each.name for each in kind.values}
+    return {} if kind is None else {member.number: member.name for member in kind.values}
 
 
-def getter(path: FieldPath, style: Style) -> Get:
+def getter(path: FieldPath, example: object) -> Get:
     """Compile a path without `[*]` to a function from a message to the value at the path.
 
     The function is fast, but its errors (AttributeError, LookupError, TypeError) say little; `walk` explains.
+
+    Args:
+        example: a message like those that the function is for.
     """
+    if _has_free_keys(path, example):
+        return lambda value: walk(path, value)
+    style = style_of(example)
     if style == "attributes" and path.steps and all(isinstance(step, str) for step in path.steps):
         return attrgetter(".".join(map(str, path.steps)))
     chain: list[Get] = [
@@ -335,22 +408,44 @@ def getter(path: FieldPath, style: Style) -> Get:
     ]
     if len(chain) == 1:
         return chain[0]
+    may_end = any(isinstance(step, Keyed) for step in path.steps)
 
     def follow(value: Any) -> Any:
         for get in chain:
             value = get(value)
+            if may_end and value is None:
+                return None
         return value
 
     return follow
 
 
-def tuple_getter(paths: Sequence[FieldPath], style: Style) -> Callable[[Any], tuple[Any, ...]]:
+def _has_free_keys(path: FieldPath, value: object) -> bool:
+    """Return whether a path crosses a protobuf map or a Struct, whose keys are no attributes."""
+    if style_of(value) == "keys":
+        return False
+    for step in path.steps:
+        if isinstance(value, Mapping) or _is_free(value):
+            return True
+        if not isinstance(step, str | int):
+            return False
+        try:
+            value = getattr(value, step) if isinstance(step, str) else value[step]  # type: ignore[index]
+        except (AttributeError, LookupError, TypeError):
+            return False
+    return _plain(value) is not value
+
+
+def tuple_getter(paths: Sequence[FieldPath], example: object) -> Callable[[Any], tuple[Any, ...]]:
     """Compile one or more paths to a function from a message to the tuple of their values."""
-    plain = all(isinstance(step, str) for path in paths for step in path.steps)
-    if style == "attributes" and plain and len(paths) > 1:
-        return attrgetter(*(".".join(str(step) for step in path.steps) for path in paths))
-    each = [getter(path, style) for path in paths]
-    return lambda value: tuple([get(value) for get in each])
+    is_plain = style_of(example) == "attributes" and not any(
+        _has_free_keys(path, example) or not all(isinstance(step, str) for step in path.steps)
+        for path in paths
+    )
+    if is_plain and len(paths) > 1:
+        return attrgetter(*(".".join(map(str, path.steps)) for path in paths))
+    gets = [getter(path, example) for path in paths]
+    return lambda value: tuple([get(value) for get in gets])
 
 
 def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
@@ -378,14 +473,14 @@ def elements_of(value: Any) -> Sequence[object]:
 
 def keys_of(value: Mapping[Any, object]) -> list[Any]:
     """Return the keys of the objects in a JSON object, which may have numbers and texts, too, or in a map."""
-    return [key for key, each in value.items() if not isinstance(value, dict) or isinstance(each, dict)]
+    return [key for key, part in value.items() if not isinstance(value, dict) or isinstance(part, dict)]
 
 
-def list_getter(path: FieldPath, style: Style) -> Get | None:
+def list_getter(path: FieldPath, example: object) -> Get | None:
     """Compile the common form `a.b[*]` to a function that returns the list; None for other forms."""
     *before, last = path.steps
     if isinstance(last, Each) and not any(isinstance(step, Each) for step in before):
-        return getter(FieldPath(path.text, tuple(before)), style)
+        return getter(FieldPath(path.text, tuple(before)), example)
     return None
 
 

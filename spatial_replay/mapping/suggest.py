@@ -30,7 +30,6 @@ from spatial_replay.mapping.field_paths import (
     iter_elements,
     leads_somewhere,
     name_from_topic,
-    style_of,
     walk,
 )
 from spatial_replay.mapping.mapping_file import NO_TOPIC, TopicMapping
@@ -232,7 +231,7 @@ def _origin_lines(
     for suggestion in active:
         if short_type(suggestion.topic.type) in GEODETIC_TYPES:
             for message in examples.get(suggestion.topic.name, ()):
-                place = [float(getter(FieldPath.of(name), style_of(message))(message)) for name in GEODETIC]
+                place = [float(getter(FieldPath.of(name), message)(message)) for name in GEODETIC]
                 if all(map(isfinite, place)):
                     yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
                     yield f"origin: [{place[0]!r}, {place[1]!r}]"
@@ -304,7 +303,7 @@ def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]
     for message in examples:
         things = [thing for _, thing in _iter_objects(layout, [message])]
         with suppress(FieldError):
-            namer.codes(things, range(len(things)), style_of(message))
+            namer.codes(things, range(len(things)))
     return namer.is_by_place
 
 

@@ -451,12 +451,11 @@ class Extractor:
                 from the others; FieldError says how.
         """
         values, index, order = self._flatten(messages)
-        style = style_of(messages[0]) if messages else "attributes"
         deleted: list[tuple[int, int]] = []
         if self.layout.solids == "scene":
             deleted = self._deleted_entities(messages)
         of_message = [messages[number] for number in index] if self.namer.needs_messages else None
-        objects = _Objects(values, index, self.namer.codes(values, order, style, of_message))
+        objects = _Objects(values, index, self.namer.codes(values, order, of_message))
         if self.layout.solids == "marker":
             objects, deleted = _split_deleted_markers(objects)
         if self.namer.is_filtering:
@@ -520,7 +519,7 @@ class Extractor:
         if self._list is None and messages:
             # step by step once, because the errors of the fast getter name no fields
             list(iter_elements(self._path, messages[0]))
-            self._list = list_getter(self._path, style_of(messages[0])) or self._elements
+            self._list = list_getter(self._path, messages[0]) or self._elements
         lists = list(map(self._list, messages)) if self._list is not None else []
         keys = (map(str, keys_of(e)) if isinstance(e, Mapping) else range(len(e)) for e in lists)
         order: list[int | str] = list(chain.from_iterable(keys))
@@ -540,7 +539,7 @@ class Extractor:
                 if get(deletion, "type") == DELETE_ALL_ENTITIES:
                     deleted.append((number, EVERY_OBJECT))
                 else:
-                    (code,) = self.namer.codes([deletion], [0], style_of(deletion), [message])
+                    (code,) = self.namer.codes([deletion], [0], [message])
                     deleted.append((number, code))
         return deleted
 
@@ -848,7 +847,7 @@ class TopicReader:
     def _bind_signal(self, signal: SignalMapping, message: object) -> Get:
         path = FieldPath.of(signal.field)
         value = walk(path, message)
-        get, numbers = getter(path, style_of(message)), names_from_unit(signal.unit)
+        get, numbers = getter(path, message), names_from_unit(signal.unit)
         names = enum_names(path, message)
         if names and not (numbers and numbers.keys().isdisjoint(names.values())):
             number = get

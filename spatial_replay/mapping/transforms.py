@@ -27,7 +27,6 @@ from spatial_replay.mapping.field_paths import (
     field_names,
     getter,
     leads_somewhere,
-    style_of,
     tuple_getter,
 )
 from spatial_replay.text import Instant, Sentence, counted
@@ -708,8 +707,8 @@ class TransformReader:
     def _each(self, message: object) -> Iterator[Any]:
         if self._list is None:
             has_list = "transforms" in field_names(message)
-            path, style = FieldPath.of("transforms"), style_of(message)
-            self._list = getter(path, style) if has_list else lambda one: (one,)
+            path = FieldPath.of("transforms")
+            self._list = getter(path, message) if has_list else lambda one: (one,)
         return iter(self._list(message))
 
     def _values(self, transform: Any) -> Sequence[Any]:
@@ -733,7 +732,7 @@ def _getter(example: object) -> Get:
         paths.append(existing[0])
     paths += [f"{place}translation.{axis}" for axis in "xyz"]
     paths += [f"{place}rotation.{axis}" for axis in "xyzw"]
-    return tuple_getter([FieldPath.of(path) for path in paths], style_of(example))
+    return tuple_getter([FieldPath.of(path) for path in paths], example)
 
 
 def _nanoseconds(seconds: Any, rest: Any) -> int:
