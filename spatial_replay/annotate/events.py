@@ -447,7 +447,7 @@ class EventReporter:
         if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
             series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
             settled = self._history.settled(reported.node, series, time_ns, verdict)
-            witness, because = self._settled(settled, time_ns, time_ns)
+            witness, because = self._settled(settled, verdict, time_ns, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
                 self.settled = self._violation(settled, time_ns)
             self._remember(change.node, settled, time_ns)
@@ -473,7 +473,7 @@ class EventReporter:
         low, witness, because, decided = verdict is not Verdict.VIOLATED, "", "", None
         if self._history is not None and self._history.is_complete:
             decided = self._history.finished(reported.node, self._values, final)
-            witness, because = self._settled(decided, last_ns, time_ns)
+            witness, because = self._settled(decided, verdict, last_ns, time_ns)
             self._remember(node, decided, time_ns)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
@@ -550,28 +550,35 @@ class EventReporter:
     def _leaf_text(self, leaf: Formula) -> str:
         return format_formula(leaf, relations=self._relations)
 
-    def _settled(self, found: DecidingLeaf | None, since_ns: int, now_ns: int) -> tuple[str, str]:
+    def _settled(
+        self, found: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
+    ) -> tuple[str, str]:
         """Return what decided in words, and the same with how long before a time; nothing for None."""
         if found is None:
             return "", ""
         missed, shown = found.missed, found.shown
         before_ns = since_ns - shown.time_ns
-        words = self._words(shown, now_ns, past=before_ns > 0)
+        is_violated = verdict is Verdict.VIOLATED and (missed is None or not missed.is_condition)
+        words = self._words(shown, now_ns, past=before_ns > 0, is_violated=is_violated)
         if abs(shown.bound) < abs(shown.number):
             leaf, _ = self._leaf(shown, now_ns)
             words += uncertain_text(amount_text(abs(shown.bound), leaf, self._units))
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
-        response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
+        response = ""
+        if missed is not None:
+            response = f"`{missed.response}` did not hold when its condition `{missed.condition}` held: "
         return words, f"{response}{words}{ago}"
 
-    def _words(self, found: DecidingLeaf | None, now_ns: int, *, past: bool = False) -> str:
-        """Return a leaf and its number in words; "" for none."""
+    def _words(
+        self, found: DecidingLeaf | None, now_ns: int, *, past: bool = False, is_violated: bool = False
+    ) -> str:
+        """Return a leaf and its number in words, as of `how_text`; "" for none."""
         if found is None:
             return ""
         leaf, number = self._leaf(found, now_ns)
         how = f"{'was' if past else 'is'} unknown"
         if not math.isnan(number):
-            how = how_text(number, leaf, self._units, past=past)
+            how = how_text(number, leaf, self._units, past=past, is_violated=is_violated)
         return f"`{self._leaf_text(leaf)}` {how}"
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:

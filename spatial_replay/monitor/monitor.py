@@ -24,7 +24,7 @@ from spatial_replay.monitor.sentences import (
     conjuncts_of,
     divisor_of,
     how_text,
-    missed_text,
+    missed_sentences,
     reason_sentence,
     sentences_of,
     what_was_measured,
@@ -526,7 +526,7 @@ class Violation:
             return f"`{self.spec}` is violated since {since}, by {with_unit(-self.robustness, self.unit)}"
         missed = self.witness.missed
         if missed is not None and missed.is_condition:
-            return missed_text(missed, self.first_ns)
+            return " ".join(missed_sentences(self.witness, missed, self.first_ns)).removesuffix(".")
         number = _settling(self.atom)
         amount = abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
         unit = declared_unit(self.atom.atom, self.witness.units, is_scaled=False)
@@ -540,7 +540,8 @@ def _settling(atom: DecidingAtom) -> float:
 
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
-    how = how_text(_settling(atom), atom.atom, witness.units)
+    is_violated = witness.verdict is Verdict.VIOLATED
+    how = how_text(_settling(atom), atom.atom, witness.units, is_violated=is_violated)
     return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 
 

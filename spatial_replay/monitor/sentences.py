@@ -238,17 +238,8 @@ def sentences_of(
     else:
         sentences = [Sentence(f"{title} is {witness.verdict}{_ENDED if has_ended else ''}: {numbers}.")]
     flipping, witness = witness, least or witness
-    is_decided = not (witness.deciding is None or witness.deciding.unknown) and not is_open
-    is_decided = is_decided and witness.verdict is not Verdict.UNKNOWN
     if witness.missed is not None and not is_open:
-        # how well a condition held is not how badly its response failed
-        is_measured = witness.missed.is_condition and is_decided
-        measured = Sentence("")
-        if is_measured and witness.deciding:
-            measured = Sentence(": ", what_was_measured(witness.deciding, witness.units, first_ns))
-        sentences.append(Sentence(missed_text(witness.missed, first_ns), f"{measured}."))
-        if witness.closest is not None:
-            sentences.append(_closest(*witness.closest, first_ns, witness.units))
+        sentences += missed_sentences(witness, witness.missed, first_ns)
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
@@ -352,12 +343,20 @@ def amount_text(number: float, atom: Formula, units: Mapping[str, str] = Mapping
     return f"{amount} ({number_text(number)} on its scale of {format_number(divisor)})"
 
 
-def how_text(number: float, atom: Formula, units: Mapping[str, str], *, past: bool = False) -> str:
-    """Return how well an atom holds, as in "fails by 3.2"; arguments as of `amount_text`."""
+def how_text(
+    number: float, atom: Formula, units: Mapping[str, str], *, past: bool = False, is_violated: bool = False
+) -> str:
+    """Return how well an atom holds, as in "fails by 3.2"; arguments as of `amount_text`.
+
+    Args:
+        is_violated: whether it decides a violation: one that holds must not.
+    """
     how = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
+    unwanted = "must not hold, and " if is_violated and number >= 0.0 else ""
     if not without_residue(number, atom):
-        return f"just {how}"
-    return f"{how} by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else how
+        return f"{unwanted}{how} by rounding" if number else f"{unwanted}just {how}"
+    amount = f" by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else ""
+    return f"{unwanted}{how}{amount}"
 
 
 def uncertain_text(least: str) -> str:
@@ -387,18 +386,20 @@ def _settled(title: str, verdict: Verdict, since: Instant) -> Sentence:
 def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     """Return one sentence on what decided a verdict or, for an unknown one, on what was not known."""
     deciding = witness.deciding
-    missed = Sentence("") if witness.missed is None else missed_text(witness.missed, first_ns)
+    missed = () if witness.missed is None else missed_sentences(witness, witness.missed, first_ns)
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
-        reason = sentences_of(witness, first_ns=first_ns)[2 if missed else 1]
-        return Sentence(missed, ". ", reason) if missed else reason
+        return _joined(*missed, sentences_of(witness, first_ns=first_ns)[1 + len(missed)])
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
-        said = Sentence(missed, ": ", what_was_measured(deciding, witness.units, first_ns), ".")
-        if witness.closest is None:
-            return said
-        return Sentence(said, " ", _closest(*witness.closest, first_ns, witness.units))
-    how = Sentence(f"`{deciding.text}` ", _how_it_decides(witness, deciding, first_ns))
-    return Sentence(missed, ": ", how) if missed else how
+        return _joined(*missed)
+    how = _how_it_decides(witness, deciding, first_ns)
+    if witness.missed is not None and witness.missed.response == deciding.text:
+        return Sentence(_missed_clause(witness.missed, first_ns), ": it ", how)
+    return _joined(*missed, Sentence(f"`{deciding.text}` ", how))
+
+
+def _joined(first: Sentence, *others: Sentence) -> Sentence:
+    return Sentence(first, *(part for sentence in others for part in (" ", sentence)))
 
 
 def cause_reason(cause: Cause, first_ns: int) -> Sentence:
@@ -416,23 +417,41 @@ def _first_failure(settled: Witness, first_ns: int) -> Sentence:
     amount, deciding = with_unit(abs(settled.upper), settled.unit), settled.deciding
     if deciding is not None and math.isfinite(deciding.value):
         amount = amount_text(abs(deciding.value), deciding.atom, settled.units)
-        amount = amount if without_residue(deciding.value, deciding.atom) else "a rounding error"
+        amount = amount if without_residue(deciding.value, deciding.atom) else "rounding"
     return Sentence(
         "It was violated first at ", Instant(settled.settled_ns or 0, first_ns), f", by {amount}."
     )
 
 
-def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:
-    """Return a clause on an implication that failed: its condition held, and its response did not."""
+def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) -> tuple[Sentence, ...]:
+    """Return sentences on a response that did not follow its condition.
+
+    The response and what came closest to it are first, what the condition was measured by is last.
+    """
+    said = _missed_clause(missed, first_ns)
+    deciding, closest = witness.deciding, []
+    if witness.closest is not None:
+        best, best_ns = witness.closest
+        measured = what_was_measured(best, witness.units, first_ns)
+        if (best.text, best_ns) == (missed.response, missed.time_ns):
+            said = Sentence(said, ": ", measured)
+        else:
+            at = Instant(best_ns, first_ns)
+            closest = [Sentence(f"`{best.text}` came closest at ", at, ": ", measured, ".")]
+    sentences = [Sentence(said, "."), *closest]
+    if missed.is_condition and deciding is not None and not deciding.unknown:
+        measured = what_was_measured(deciding, witness.units, first_ns)
+        # an operator such as `Y` measures in another sample
+        at_ns = witness.time_ns
+        at = () if at_ns == missed.time_ns else (" at ", Instant(at_ns, first_ns))
+        sentences.append(Sentence("The condition held: ", measured, *at, "."))
+    return tuple(sentences)
+
+
+def _missed_clause(missed: MissedResponse, first_ns: int) -> Sentence:
     when = Instant(missed.time_ns, first_ns)
-    return Sentence(f"`{missed.condition}` held at ", when, f", but `{missed.response}` did not")
-
-
-def _closest(best: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
-    """Return a sentence on what a missed response came to at best."""
-    what = what_was_measured(best, units, first_ns)
-    when = Instant(time_ns, first_ns)
-    return Sentence(f"The nearest that it came to `{best.text}` was at ", when, ": ", what, ".")
+    what = f"`{missed.response}` did not hold at "
+    return Sentence(what, when, f", when its condition `{missed.condition}` held")
 
 
 def _how_it_decides(
@@ -441,11 +460,10 @@ def _how_it_decides(
     amount, least = deciding.value, _end(deciding)
     if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
         amount = least
-    how = how_text(amount, deciding.atom, witness.units)
+    is_violated = witness.verdict is Verdict.VIOLATED and not is_open
+    how = how_text(amount, deciding.atom, witness.units, is_violated=is_violated)
     if abs(least) < abs(amount) and without_residue(amount, deciding.atom):
         how += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
-    if amount >= 0.0 and witness.verdict is Verdict.VIOLATED and not is_open:
-        how = f"must not hold, and {how}"
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
@@ -665,7 +683,7 @@ def _between(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
 
 def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
     return Sentence(
-        f"`{deciding.text}` lies {_between(deciding, witness.units)} at ",
+        f"The robustness of `{deciding.text}` lies {_between(deciding, witness.units)} at ",
         Instant(witness.time_ns, first_ns),
         f"{_in_time(witness)}: the uncertainty of the objects leaves open whether it holds.",
     )
@@ -677,7 +695,8 @@ def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int, units: Mappin
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)
         return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", when, f", {reasons}.")
-    what = f"By how much is uncertain: `{deciding.text}` lies {_between(deciding, units)} at "
+    between = _between(deciding, units)
+    what = f"By how much is uncertain: the robustness of `{deciding.text}` lies {between} at "
     return Sentence(what, when, ".")
 
 

@@ -185,7 +185,7 @@ def test_a_template_says_for_whom(tmp_path):
 def test_negated_and_implied_atoms_are_witnesses_in_their_own_sign(tmp_path):
     [(_, event, _)] = events_of(tmp_path, "spec spared = G not battery >= 2", 1.0, 3.0)
     assert facts(event)["robustness"] == "-1.0"
-    assert facts(event)["witness"] == "`battery >= 2` holds by 1"
+    assert facts(event)["witness"] == "`battery >= 2` must not hold, and holds by 1"
 
 
 def test_a_quantifier_is_named_by_the_objects_that_decide_it(tmp_path):
@@ -206,7 +206,7 @@ def test_a_quantifier_is_named_by_the_objects_that_decide_it(tmp_path):
     found = {facts(event)["specification"]: event for _, event, _ in events}
     assert {name: facts(event)["witness"] for name, event in found.items()} == {
         "safe": "`a dist b >= 3` fails by 1",
-        "apart": "`a dist b < 3` holds by 1",
+        "apart": "`a dist b < 3` must not hold, and holds by 1",
         "near": "`a dist b <= 3` failed by 3",  # three samples before the last one
         "each": "`c dist b <= -1` failed by 5",
     }

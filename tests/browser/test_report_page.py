@@ -429,7 +429,7 @@ def test_the_scene_names_what_decided_where_no_arrow_can_show_it(open_page: Open
         "what decided the verdict: speed <= 1 of stops fails by 0.8 now; no arrow shows it"
     )
     said = page.locator(".verdict").first
-    expect(said).to_contain_text("The nearest that it came to speed <= 1 was at 0.600 s: speed is 1.8.")
+    expect(said).to_contain_text("speed <= 1 came closest at 0.600 s: speed is 1.8.")
 
 
 def test_the_tree_and_the_curve_of_a_quantifier_name_the_object_that_decided(open_page: Open) -> None:

@@ -200,9 +200,9 @@ def test_a_rounding_error_is_no_amount(folder: Path, capsys: pytest.CaptureFixtu
                 for name, x in (("left", 0.2), ("right", right))
             )
             log.write(f'{{"time_ns": {time_ns}, "objects": [{objects}]}}\n')
-    assert "first at 0.000 s, by a rounding error." in said(capsys, *REPLAY)[1]
+    assert "first at 0.000 s, by rounding." in said(capsys, *REPLAY)[1]
     _, text = said(capsys, *EXPLAIN, "--to", "1ns")
-    assert "`left dist right <= 0.1`, which just fails at 0.000 s" in text
+    assert "`left dist right <= 0.1`, which fails by rounding at 0.000 s" in text
     assert "`left dist right >= 0.3`, which fails by 0.2 at" in text
 
 

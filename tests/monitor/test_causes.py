@@ -185,7 +185,8 @@ def test_a_monitor_and_a_replay_name_the_same_atoms() -> None:
 def test_what_was_never_to_happen_is_said_the_other_way_round() -> None:
     monitor = sr.Monitor(sr.parse_specification("spec apart = G not (red closeto[0.1] vase)"))
     *_, last = map(monitor.update, stopped_robot())
-    assert str(last.violations[0]).startswith("red is 0.03 too close to vase: `red closeto[0.1] vase` holds")
+    said = "red is 0.03 too close to vase: `red closeto[0.1] vase` must not hold, and holds by 0.03"
+    assert str(last.violations[0]).startswith(said)
 
 
 def test_a_window_that_closed_names_the_best_attempt_in_it_after_a_long_run() -> None:
@@ -345,7 +346,7 @@ def test_a_violation_says_amounts_in_the_units_of_the_log_and_the_time_of_its_at
     for tenths in range(30):
         update = late.update(sr.Sample(tenths * SECOND // 10, {}, {"force": 0.01 * tenths}))
     (residue,) = map(str, update.violations)
-    assert residue.startswith("rate(force) is just too high: `rate(force) <= 0.1` just fails at ")
+    assert residue.startswith("rate(force) is just too high: `rate(force) <= 0.1` fails by rounding at ")
     # the best attempt before the window closed
     assert soon.startswith("force is 5.8 too low: `force >= 20` fails") and soon.endswith("at 1.000 s")
 
@@ -371,9 +372,24 @@ def test_within_an_open_group_the_missed_response_is_named_and_not_its_condition
     result = sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(samples)).result()
     assert result.verdict == "violated"
     assert result.reason(0).startswith(
-        "`agv dist ann <= 2` held at 8.000 s, but `speed(agv) <= 0.5` did not: `speed(agv) <= 0.5`"
-        " fails by 0.3 at 8.000 s"
+        "`speed(agv) <= 0.5` did not hold at 8.000 s, when its condition `agv dist ann <= 2` held:"
+        " it fails by 0.3 at 8.000 s"
     )
+
+
+def test_a_missed_response_is_measured_first_and_a_past_condition_at_its_own_time() -> None:
+    text = "spec slow = G ((Y red dist vase <= 2.5) -> F[0s, 1s] (speed <= 0.5))"
+    samples = [
+        sr.Sample(k * SECOND, {"red": box(4 - k), "vase": box(0)}, {"speed": 1.2 - 0.1 * (k == 3)})
+        for k in range(6)
+    ]
+    said = sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(samples)).result().explain()
+    assert said.splitlines()[1:4] == [
+        "`F[0s, 1s] (speed <= 0.5)` did not hold at 2.000 s, when its condition `Y (red dist vase <= 2.5)`"
+        " held.",
+        "`speed <= 0.5` came closest at 3.000 s: speed is 1.1.",
+        "The condition held: red and vase are 2 apart at 1.000 s.",
+    ]
 
 
 def test_memory_to_find_the_closest_of_many_does_not_grow_with_their_pairs() -> None:
