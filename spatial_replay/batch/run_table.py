@@ -306,11 +306,14 @@ Key: TypeAlias = tuple[str, str, str, str, str | None]
 """Case, log, specification file, spec and object of a result."""
 Change: TypeAlias = Literal["worse", "verdict", "gone", "better"]
 
+WORSE_THAN: Final = "worse than the baseline"
+EDITED_SINCE: Final = "edited since the baseline"
+"""Beginnings of failures of results that a baseline has better."""
 BASELINE_VERDICT: Final = "baseline_verdict"
 BASELINE_ROBUSTNESS: Final = "baseline_robustness"
-_NUMBER: Final = re.compile(
-    r"(?P<number>(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?) ?(?P<unit>%|[^\W\d]\S{0,20})?"
-)
+_NUMBER: Final = r"((?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?)"
+_UNIT: Final = r"([^\W\d]\S{0,20})?"
+_TOLERANCE: Final = re.compile(rf"{_NUMBER} ?%(?:, *at least {_NUMBER} ?{_UNIT})?|{_NUMBER} ?{_UNIT}")
 _KEY: Final = ("case", "log", "file", "spec", "object")
 _ORDER: Final = {"satisfied": 0, "unknown": 1, "violated": 2, None: 3}
 """Verdicts from good to bad; None is an error."""
@@ -318,30 +321,33 @@ _ORDER: Final = {"satisfied": 0, "unknown": 1, "violated": 2, None: 3}
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """How much less robustness passes.
+    """How much less robustness passes: the greater one of a share and an amount.
 
     Attributes:
-        amount: a part of the baseline's number if it `is_relative`, else in units of robustness.
+        share: of the baseline's number.
+        amount: in units of robustness.
         unit: of the amount; "" for results without one.
     """
 
+    share: float = 0.0
     amount: float = 0.0
-    is_relative: bool = False
     unit: str = ""
 
     @classmethod
     def parse(cls, text: str) -> Tolerance:
-        """Read `5%`, or an absolute number with the unit of the robustness, such as `0.02m`, if it has one.
+        """Read an amount such as `0.02m`, a share such as `5%`, or both: `5%, at least 0.002m`.
 
         Raises:
             UsageError: anything else.
         """
-        match = _NUMBER.fullmatch(text.strip())
+        match = _TOLERANCE.fullmatch(text.strip())
         if match is None:
-            raise UsageError(f"{text!r} is not a tolerance; write 5% or, in units of robustness, 0.02m")
-        number = float(match["number"])
-        unit = match["unit"] or ""
-        return cls(number / 100.0, True) if unit == "%" else cls(number, unit=unit)
+            raise UsageError(
+                f"{text!r} is not a tolerance; write an amount in units of robustness, such as 0.02m, "
+                "or '5%, at least 0.002m'"
+            )
+        percent, floor, floor_unit, amount, unit = match.groups()
+        return cls(float(percent or 0.0) / 100.0, float(amount or floor or 0.0), unit or floor_unit or "")
 
     def check(self, units: Iterable[str | None]) -> None:
         """Check that an absolute amount says which unit of the results it is in.
@@ -349,15 +355,17 @@ class Tolerance:
         Raises:
             UsageError: it has none, and results have one; or no result has its unit.
         """
-        known = sorted({each for each in units if each and each != "1"})
-        if self.is_relative or not self.amount or self.unit in known or not (known or self.unit):
+        units_of_results = sorted({unit for unit in units if unit and unit != "1"})
+        if not self.amount or self.unit in units_of_results or not (units_of_results or self.unit):
             return
-        found = f"is in {', '.join(known)}" if known else "has no unit"
-        absolute = f"{self.amount:g}{known[0] if known else ''}"
-        raise UsageError(
-            f"--tolerance {self.amount:g}{self.unit}: robustness {found}; write {absolute}, or "
-            f"{self.amount:g}% for a part of it"
+        place = f"is in {', '.join(units_of_results)}" if units_of_results else "has no unit"
+        amount = f"{self.amount:g}{units_of_results[0] if units_of_results else ''}"
+        remedy = (
+            f"write at least {amount}"
+            if self.share
+            else f"write {amount}, or {self.amount:g}% for a part of it"
         )
+        raise UsageError(f"--tolerance {self.amount:g}{self.unit}: robustness {place}; {remedy}")
 
     def allows(self, before: float | None, now: float | None, unit: str = "") -> bool:
         """Return whether a number is not worse than before by more than this.
@@ -369,9 +377,8 @@ class Tolerance:
             return before is None
         if math.isinf(before) or math.isinf(now):
             return now >= before
-        if self.is_relative:
-            return now >= before - self.amount * abs(before)
-        return now >= before - (self.amount if self.unit in ("", unit) else 0.0)
+        amount = self.amount if self.unit in ("", unit) else 0.0
+        return now >= before - max(self.share * abs(before), amount)
 
 
 @dataclass(frozen=True, slots=True)

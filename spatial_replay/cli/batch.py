@@ -211,7 +211,7 @@ _OUTPUTS = (
     click.option(
         "--tolerance",
         metavar="T",
-        help="With --baseline: how much worse may pass, as 5% or 0.02m.",
+        help="With --baseline: how much worse may pass: 0.02m, or '5%, at least 0.002m'.",
     ),
     click.option("--update-baseline", is_flag=True, help="Write this run's results to --baseline."),
 )
@@ -251,7 +251,7 @@ def batch(
     Examples:
       spatial-replay batch 'nightly/**/*.mcap' --spec safety.spatial -o results
       spatial-replay batch suite.yaml --junit report.xml --html pages
-      spatial-replay batch suite.yaml --baseline main.results --tolerance 5%
+      spatial-replay batch suite.yaml --baseline main.results --tolerance 0.02m
       spatial-replay batch logs --spec safety.spatial --dask tcp://scheduler:8786
     """
     # imported here so that --help stays fast

@@ -85,15 +85,16 @@ def test_any_name_and_text_makes_a_valid_report(texts: list[str]) -> None:
 numbers = st.floats(-1e6, 1e6)
 
 
-@given(numbers, st.floats(0.0, 1e3), st.booleans())
+@given(numbers, st.floats(0.0, 1e3), st.floats(0.0, 1e3))
 def test_a_tolerance_allows_what_is_better_and_never_what_is_undetermined(
-    before: float, amount: float, is_relative: bool
+    before: float, share: float, amount: float
 ) -> None:
-    tolerance = Tolerance(amount, is_relative)
+    tolerance = Tolerance(share, amount)
     assert tolerance.allows(before, before)
     assert tolerance.allows(before, before + 1.0)
     assert tolerance.allows(before, math.inf)
-    assert not tolerance.allows(before, math.nan)
+    assert not tolerance.allows(before, None)
     assert not tolerance.allows(math.inf, before)
-    allowed = amount * (abs(before) if is_relative else 1.0)
+    allowed = max(share * abs(before), amount)
+    assert tolerance.allows(before, before - 0.999 * allowed)
     assert not tolerance.allows(before, before - allowed - 1.0)
