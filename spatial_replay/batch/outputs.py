@@ -20,6 +20,8 @@ from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
 from spatial_replay.batch.run import BatchResult, Wanted
 from spatial_replay.batch.run_table import (
     BASELINE_ROBUSTNESS,
+    EDITED_SINCE,
+    WORSE_THAN,
     Total,
     Values,
     counts_of,
@@ -31,6 +33,7 @@ from spatial_replay.batch.run_table import (
     verdict_word,
     worst_rows,
 )
+from spatial_replay.batch.suite import DAMAGED, DROPPED, UNTESTED, VACUOUS
 from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import output_error, replacing
@@ -164,21 +167,35 @@ def _cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
     """Return a table of totals: the headings of its numbers, and rows of three names and then these."""
     columns = counts_of(rows)
     cells = []
-    for place, each in enumerate(rows):
-        names = [each.group["case"], each.group["spec"] or each.group["file"], each.about]
-        counts = [f"{own[place]:,}" for own in columns.values()]
-        cells.append([*names, *counts, "" if each.least is None else f"{each.least:.6g}"])
+    for place, total in enumerate(rows):
+        spec = total.group["spec"] or total.group["file"]
+        names = [total.group["case"], f"{spec} ({EDITED_SINCE})" if total.is_edited else spec, total.about]
+        counts = [f"{numbers[place]:,}" for numbers in columns.values()]
+        cells.append([*names, *counts, "" if total.least is None else f"{total.least:.6g}"])
     return [*columns, "least robustness"], cells
 
 
 def _line(cells: list[str]) -> str:
-    shown = (printable(cell, 500) for cell in cells)
-    # no cell ends another one, or becomes markup
-    safe = (
-        cell.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
-        for cell in shown
-    )
-    return f"| {' | '.join(safe)} |"
+    return f"| {' | '.join(_markdown_cell(printable(cell, 500)) for cell in cells)} |"
+
+
+def _markdown_cell(sentence: str) -> str:
+    """Return a sentence, its formulas as code, that neither ends its cell nor becomes markup."""
+    pieces = []
+    for number, piece in enumerate(sentence_parts(sentence)):
+        if number % 2:
+            # within code, a backslash escapes nothing but the end of a cell
+            fence = "`" * (max(map(len, _BACKQUOTES.findall(piece)), default=0) + 1)
+            pad = " " if "`" in piece else ""
+            pieces.append(f"{fence}{pad}{piece.replace('|', _PIPE)}{pad}{fence}")
+        else:
+            pieces.append(_MARKUP.sub(r"\\\g<0>", piece).replace("<", "&lt;"))
+    return "".join(pieces)
+
+
+_BACKQUOTES: Final = re.compile("`+")
+_MARKUP: Final = re.compile(r"[\\|\[`*_~]")
+_PIPE: Final = "\\|"
 
 
 def _data(text: str) -> str:
@@ -234,7 +251,12 @@ def _lines(
     suites: dict[tuple[str, ...], list[Values]] = {}
     keys = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
     found = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
-    faults = ("failure", "error", "error_kind")
+    faults = ("failure", "expected", "error", "error_kind")
+    edited = {
+        (total.group["case"], total.group["file"], total.group["spec"])
+        for total in totals(table)
+        if total.is_edited
+    }
     for row in table.select([*keys, *found, *faults]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
@@ -256,6 +278,8 @@ def _lines(
         tested = Counter(row["tested"] for row in rows if row["tested"])
         if tested:
             properties["tested"] = ", ".join(f"{count} {kind}" for kind, count in sorted(tested.items()))
+        if (case, file, spec) in edited:
+            properties["baseline"] = EDITED_SINCE
         for key, value in properties.items():
             yield f"<property name={_quoted(key)} value={_quoted(value)}/>\n"
         yield "</properties>\n"
@@ -279,7 +303,7 @@ def _case(
     if row["failure"] is not None:
         # errors are about the test, failures about what it tests
         tag = "failure" if row["error"] is None else "error"
-        kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
+        kind = row["error_kind"] or _unmet(row)
         texts = [*dict.fromkeys([*row["explanation"], *row["vacuous"]])] or [row["failure"]]
         text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
         text = cut(text, limit or len(text))
@@ -291,6 +315,17 @@ def _case(
         own = _text("\n".join([*tested, *row["untested"]]))
         yield f"<system-out>{own}</system-out>\n"
     yield "</testcase>\n"
+
+
+def _unmet(row: Values) -> str:
+    """Return the expectation that a result did not meet, in words that results of one kind share."""
+    failure = row["failure"]
+    kinds = {UNTESTED: "untested", WORSE_THAN: WORSE_THAN, EDITED_SINCE: EDITED_SINCE, VACUOUS: VACUOUS}
+    kinds |= {"cut": "cut", "left": "left", DROPPED: "dropped", DAMAGED: "damaged log"}
+    for beginning, kind in kinds.items():
+        if failure.startswith(beginning):
+            return kind
+    return "gone" if row["verdict"] is None else f"expected {row['expected']}"
 
 
 def _counts(rows: Any) -> tuple[int, int]:

@@ -8,7 +8,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from glob import glob, has_magic
 from math import nan
 from os import PathLike
@@ -51,9 +51,10 @@ from spatial_replay.mapping.yaml_document import MOST_FAULTS
 from spatial_replay.monitor.stream import Choice
 from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.spec.diagnostics import Diagnostic
-from spatial_replay.spec.format import format_specification
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.format import format_formula, format_specification
+from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import SpecificationText
+from spatial_replay.spec.walks import other_names
 from spatial_replay.text import counted, encodable, first_lines
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class SpecFile:
     Attributes:
         name: as it is written: relative to the suite's folder.
         hash: of its meaning, with ids and titles: layout and comments do not count.
+        meanings: a hash of the meaning of each spec, without ids and titles.
         lines: the line of each spec.
         warnings: what `check` warns of.
         has_plugins: whether its results depend on code, which may import and read any other file.
@@ -79,6 +81,7 @@ class SpecFile:
     name: str
     text: SpecificationText
     hash: str
+    meanings: tuple[tuple[str, str], ...]
     lines: tuple[tuple[str, int], ...]
     warnings: tuple[Diagnostic, ...] = ()
     has_plugins: bool = False
@@ -100,14 +103,27 @@ def read_specification_text(path: Path | str) -> SpecificationText:
 def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, folder: Path) -> SpecFile:
     """Return a specification file that was read and parsed; paths are shown relative to a folder."""
     lines = tuple(spec_lines(parsed).items())
-    shown = _shown(path, folder)
-    return SpecFile(shown, text, meaning_hash(parsed), lines, parsed.warnings, bool(parsed.plugins))
+    meanings = tuple((spec.name, _hash_of_text(_meaning(parsed, spec))) for spec in parsed.results)
+    name, digest = _shown(path, folder), meaning_hash(parsed)
+    return SpecFile(name, text, digest, meanings, lines, parsed.warnings, bool(parsed.plugins))
 
 
 def meaning_hash(file: Specification) -> str:
     """Return a hash of what a specification means: layout and comments do not count."""
-    meaning = f"{file.profile}\n{format_specification(file)}"
-    return hashlib.sha256(meaning.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
+    return _hash_of_text(f"{file.profile}\n{format_specification(file)}")
+
+
+def _meaning(file: Specification, spec: NamedSpec) -> str:
+    """Return the text of a spec without names of other specs, and of all that it uses."""
+    names = other_names(spec.formula)
+    regions = {name: region for name, region in file.regions.items() if name in names}
+    groups = {name: group for name, group in file.groups.items() if name in names}
+    declarations = format_specification(replace(file, specs=(), regions=regions, groups=groups))
+    return f"{declarations}{spec.parameter}: {format_formula(spec.formula)}"
+
+
+def _hash_of_text(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
 
 
 def _shown(file: Path | str, folder: Path) -> str:
@@ -700,19 +716,22 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
     names = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
     judged = rows.select(_JUDGED).to_pylist()
-    lines = {id(each.file): dict(each.file.lines) for each in asked}
+    lines = {id(wanted.file): dict(wanted.file.lines) for wanted in asked}
+    meanings = {id(wanted.file): dict(wanted.file.meanings) for wanted in asked}
     requirements = zip(columns["requirement"].to_pylist(), asked, strict=True)
     columns |= {
-        "case": [each.case.name for each in asked],
-        "log": [each.log.name for each in asked],
-        "file": [each.file.name for each in asked],
-        "meaning": [each.file.hash for each in asked],
-        "expected": [each.case.expectation.text for each in asked],
+        "case": [wanted.case.name for wanted in asked],
+        "log": [wanted.log.name for wanted in asked],
+        "file": [wanted.file.name for wanted in asked],
+        "meaning": [meanings[id(wanted.file)].get(name) for wanted, name in zip(asked, names, strict=True)],
+        "expected": [wanted.case.expectation.text for wanted in asked],
         "failure": [
-            _failure(row, each.case.expectation, fail_on) for row, each in zip(judged, asked, strict=True)
+            _failure(row, wanted.case.expectation, fail_on) for row, wanted in zip(judged, asked, strict=True)
         ],
-        "line": [lines[id(each.file)].get(name, 1) for each, name in zip(asked, names, strict=True)],
-        "requirement": [own or ", ".join(each.case.requirements) or None for own, each in requirements],
+        "line": [lines[id(wanted.file)].get(name, 1) for wanted, name in zip(asked, names, strict=True)],
+        "requirement": [
+            requirement or ", ".join(wanted.case.requirements) or None for requirement, wanted in requirements
+        ],
     }
     schema = run_columns()
     return pa.table({field.name: columns[field.name] for field in schema}, schema=schema)

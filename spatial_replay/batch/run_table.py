@@ -8,7 +8,7 @@ import operator
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
@@ -29,6 +29,8 @@ VERDICTS: Final = ("satisfied", "violated", "unknown", "untested")
 """Verdicts, and the one in their place of what was tested by nothing and fails for that."""
 WORSE: Final = "worse_than_baseline"
 """A column of a table that was compared with a baseline: whether a result is worse than there, or gone."""
+EDITED: Final = "edited_since_baseline"
+"""Another such column: whether the spec means something else than in the baseline."""
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
     {"spec": ("case", "file", "spec"), "log": ("case", "log")}
 )
@@ -49,7 +51,9 @@ class Total:
         errors: how many have an error in place of a verdict.
         failures: how many do not pass.
         least: the least robustness among them; None if none is determined.
-        worse: how many are worse than a baseline, or gone; None without one.
+        worse: how many of unchanged specs are worse than a baseline, or gone; None without one.
+        worse_edited: how many of specs that were edited since; None without a baseline.
+        is_edited: whether the spec was edited since the baseline.
         requirement, title: of the spec; None for a log, and where it has none.
     """
 
@@ -62,6 +66,8 @@ class Total:
     failures: int
     least: float | None
     worse: int | None = None
+    worse_edited: int | None = None
+    is_edited: bool = False
     requirement: str | None = None
     title: str | None = None
 
@@ -139,7 +145,10 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
         "failures": pc.is_valid(table.column("failure")),
     }
     if WORSE in table.column_names:
-        counted["worse"] = table.column(WORSE)
+        worse, edited = table.column(WORSE), table.column(EDITED)
+        counted["worse"] = pc.and_not(worse, edited)
+        counted["worse_edited"] = pc.and_(worse, edited)
+        columns["edited"] = edited
     columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
     columns["least"] = number
     sums = [(f"n_{name}", "sum") for name in counted]
@@ -147,6 +156,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     columns |= {name: table.column(name) for name in about}
     # the first one: what is gone comes last, with that of its time
     sums += [(name, "first") for name in about]
+    sums += [("edited", "max")] if "edited" in columns else []
     # one thread: groups come in the order of their first rows
     grouped = pa.table(columns).group_by(list(_GROUPS[by]), use_threads=False)
     return [
@@ -154,6 +164,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
             {name: row[name] for name in _GROUPS[by]},
             **{name: row[f"n_{name}_sum"] for name in counted},
             least=row["least_min"],
+            is_edited=bool(row.get("edited_max")),
             **{name: row[f"{name}_first"] for name in about},
         )
         for row in grouped.aggregate([*sums, ("least", "min")]).to_pylist()
@@ -161,10 +172,16 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
 
 
 def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
-    """Return the columns of counts of a table of totals; "untested" only where some are."""
+    """Return the columns of counts of a table of totals; "untested" and "edited" only where some are."""
     names = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
-    counts = {head: [getattr(row, name) for row in rows] for head, name in names.items()}
-    return {head: own for head, own in counts.items() if head != "untested" or any(own)}
+    if any(row.worse is not None for row in rows):
+        names |= {"worse": "worse", "edited": "worse_edited"}
+    counts = {head: [getattr(row, name) or 0 for row in rows] for head, name in names.items()}
+    return {
+        head: numbers
+        for head, numbers in counts.items()
+        if head not in ("untested", "edited") or any(numbers)
+    }
 
 
 def worst_rows(table: pa.Table, count: int) -> list[Values]:
@@ -390,6 +407,7 @@ class Difference:
         case, log, file, spec, object: which result.
         before, now: its verdicts; None for an error, and for what is gone now.
         before_robustness, robustness: None where not determined.
+        is_edited: whether the spec was edited since the baseline.
     """
 
     change: Change
@@ -402,6 +420,7 @@ class Difference:
     now: str | None
     before_robustness: float | None
     robustness: float | None
+    is_edited: bool = False
 
     @property
     def fails(self) -> bool:
@@ -434,23 +453,34 @@ def compare(table: pa.Table, baseline: pa.Table, tolerance: Tolerance) -> list[D
     """
     units = dict(zip(_keys(table), table.column("unit").to_pylist(), strict=True))
     tolerance.check(units.values())
-    found = _differences(_by_key(table), _by_key(baseline), tolerance, units)
-    return sorted(found, key=lambda each: (RANKS[each.now], _least_first(each.robustness)))
+    edited = set(edited_specs(table, baseline))
+    differences = [
+        replace(difference, is_edited=(difference.case, difference.file, difference.spec) in edited)
+        for difference in _differences(_by_key(table), _by_key(baseline), tolerance, units)
+    ]
+    return sorted(
+        differences, key=lambda difference: (RANKS[difference.now], _least_first(difference.robustness))
+    )
 
 
-def edited_files(table: pa.Table, baseline: pa.Table) -> list[str]:
-    """Return the specification files that mean something else than when the baseline was made."""
-    before = set(zip(*(baseline.column(name).to_pylist() for name in ("file", "meaning")), strict=True))
-    names = {file for file, _ in before}
-    now = zip(*(table.column(name).to_pylist() for name in ("file", "meaning")), strict=True)
-    return [file for file, meaning in dict.fromkeys(now) if file in names and (file, meaning) not in before]
+def edited_specs(table: pa.Table, baseline: pa.Table) -> list[tuple[str, str, str]]:
+    """Return case, file and name of the specs that mean something else than in the baseline."""
+
+    def meanings(rows: pa.Table) -> dict[tuple[str, str, str], str | None]:
+        names, hashes = ("case", "file", "spec"), rows.column("meaning").to_pylist()
+        keys = zip(*(rows.column(name).to_pylist() for name in names), strict=True)
+        return dict(zip(keys, hashes, strict=True))
+
+    before = meanings(baseline)
+    return [spec for spec, meaning in meanings(table).items() if before.get(spec, meaning) != meaning]
 
 
 def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
     """Return the table of a run in which what is worse than the baseline fails, and what is gone has a row.
 
-    The columns `baseline_verdict` and `baseline_robustness` say what each result was, and
-    `worse_than_baseline` whether it is worse now, or gone.
+    The columns `baseline_verdict` and `baseline_robustness` say what each result was,
+    `worse_than_baseline` whether it is worse now, or gone, and `edited_since_baseline` whether its spec
+    means something else.
 
     Args:
         differences: see `compare`.
@@ -459,14 +489,16 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
 
     before, keys = _by_key(baseline), _keys(table)
     worse: dict[Key, list[str]] = defaultdict(list)
-    own, gone = set(keys), []
-    for each in differences:
-        if each.change == "gone":
-            gone.append(each)
-        elif each.fails:
+    edited = set(edited_specs(table, baseline))
+    present, gone = set(keys), []
+    for difference in differences:
+        if difference.change == "gone":
+            gone.append(difference)
+        elif difference.fails:
             # an error in place of all objects of a template
-            key = each.key if each.key in own else (*each.key[:-1], None)
-            worse[key].append(f"worse than the baseline: {each.failure}")
+            key = difference.key if difference.key in present else (*difference.key[:-1], None)
+            beginning = EDITED_SINCE if difference.is_edited else WORSE_THAN
+            worse[key].append(f"{beginning}: {difference.failure}")
     failures = [
         "; ".join(filter(None, [failure, *worse.get(key, ())])) or None
         for key, failure in zip(keys, table.column("failure").to_pylist(), strict=True)
@@ -478,11 +510,12 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
         (BASELINE_VERDICT, pa.string(), [verdict for verdict, _ in was]),
         (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in was]),
         (WORSE, pa.bool_(), [key in worse for key in keys]),
+        (EDITED, pa.bool_(), [(case, file, spec) in edited for case, _, file, spec, _ in keys]),
     ):
         table = table.append_column(name, pa.array(values, kind))
     places = {key: place for place, key in enumerate(_keys(baseline))} if gone else {}
-    rows = baseline.take(pa.array([places[each.key] for each in gone], pa.int64())).to_pylist()
-    missing = [_gone_row(row, each) for row, each in zip(rows, gone, strict=True)]
+    rows = baseline.take(pa.array([places[result.key] for result in gone], pa.int64())).to_pylist()
+    missing = [_gone_row(row, result) for row, result in zip(rows, gone, strict=True)]
     return pa.concat_tables([table, pa.Table.from_pylist(missing, table.schema)])
 
 
@@ -501,6 +534,7 @@ def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
         BASELINE_VERDICT: difference.before,
         BASELINE_ROBUSTNESS: difference.before_robustness,
         WORSE: True,
+        EDITED: difference.is_edited,
     }
 
 

@@ -49,6 +49,7 @@ _COLOURS: Final = MappingProxyType(
     {
         **VERDICT_COLOURS,
         "untested": "yellow",
+        "edited": "yellow",
         **dict.fromkeys(("error", "errors", "failed", "worse", "gone"), "red"),
     }
 )
@@ -68,14 +69,12 @@ def print_totals(table: pa.Table, by: By) -> None:
     After a comparison with a baseline, also the numbers of worse and missing results.
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.run_table import WORSE, counts_of, totals
+    from spatial_replay.batch.run_table import EDITED_SINCE, counts_of, totals
 
     rows = totals(table, by)
     has_cases = len({total.group["case"] for total in rows}) > 1
     titles = [_title(total, by, has_cases) for total in rows]
     columns = counts_of(rows)
-    if WORSE in table.column_names:
-        columns["worse"] = [total.worse or 0 for total in rows]
     width = max([len(by), *map(len, titles)])
     show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in columns)}  least robustness")
     for place, (title, total) in enumerate(zip(titles, rows, strict=True)):
@@ -88,8 +87,8 @@ def print_totals(table: pa.Table, by: By) -> None:
             line += ["  ", Coloured(cell, colour) if count and colour else cell]
         least = "not determined" if total.least is None else f"{total.least:.6g}"
         show((*line, f"  {least:>16}"))
-        if total.title:
-            show(f"    {total.title}")
+        for text in filter(None, (total.title, EDITED_SINCE if total.is_edited else None)):
+            show(f"    {text}")
 
 
 def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
@@ -263,7 +262,7 @@ def batch(
         write_summary,
     )
     from spatial_replay.batch.run import prepare, workers_of
-    from spatial_replay.batch.run_table import compare, edited_files, with_baseline
+    from spatial_replay.batch.run_table import compare, with_baseline
 
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
@@ -309,8 +308,6 @@ def batch(
             show(line, err=True)
         write_summary(result.table)
     code = exit_code_from_table(evaluated.table, fail_on)
-    if before is not None and (edited := edited_files(evaluated.table, before)):
-        warn(f"edited since the baseline, which may be why results differ: {_join_names(edited)}")
     if differences is not None and _print_differences(differences, outputs.json_file == "-"):
         code = most_severe([code, ExitCode.VIOLATED])
     return code
@@ -397,7 +394,7 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     """
     import pyarrow.compute as pc
 
-    from spatial_replay.batch.run_table import WORSE, summary_text
+    from spatial_replay.batch.run_table import WORSE, summary_text, totals
 
     reused = result.logs - result.evaluated
     news = f"{result.evaluated:,} evaluated now, {reused:,} known" if reused else "all evaluated now"
@@ -413,7 +410,12 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     if failures:
         summary = f"{failures:,} failed"
         if WORSE in result.table.column_names:
-            summary += f", {pc.sum(result.table[WORSE]).as_py():,} of them worse than the baseline, or gone"
+            specs = totals(result.table)
+            summary += (
+                f", {sum(spec.worse or 0 for spec in specs):,} of them worse than the baseline, or gone"
+            )
+            if edited := sum(spec.worse_edited or 0 for spec in specs):
+                summary += f", {edited:,} of specs edited since"
         show(f"{summary}, the worst {_WORST}:" if failures > _WORST else f"{summary}:")
         print_worst(result.table, _WORST, failing=True)
     show(f"wrote {folder}")
@@ -454,14 +456,21 @@ def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
 
 def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bool:
     """Print what differs from the baseline, and return whether any of it fails."""
-    worse = [difference for difference in differences if difference.fails]
-    better = len(differences) - len(worse)
+    failing = [difference for difference in differences if difference.fails]
+    worse = [difference for difference in failing if not difference.is_edited]
+    edited = [difference for difference in failing if difference.is_edited]
+    better = len(differences) - len(failing)
     heads = ["worse than the baseline, or gone" if worse else "nothing is worse than the baseline"]
     heads += [f"{better:,} better: --update-baseline keeps that"] if better else []
     show("; ".join(heads) + (":" if worse else ""), err=to_errors)
     for line in first_lines([difference.text for difference in worse], _MOST_DIFFERENCES):
         show(f"  {line}", err=to_errors)
-    return bool(worse)
+    if edited:
+        specs = _join_names(list(dict.fromkeys(f"{result.spec} ({result.file})" for result in edited)))
+        show(f"worse, and the spec was edited since the baseline: {specs}:", err=to_errors)
+        for line in first_lines([difference.text for difference in edited], _MOST_DIFFERENCES):
+            show(f"  {line}", err=to_errors)
+    return bool(failing)
 
 
 @click.command()

@@ -264,11 +264,82 @@ def test_an_absolute_tolerance_has_the_unit_of_the_results(fleet: Path) -> None:
     Path("log").symlink_to("after")
     bare = batch(*run, "--tolerance", "5")
     assert (bare.code, "robustness is in m; write 5m, or 5% for a part of it" in bare.err) == (2, True)
-    for tolerance, code in (("0.2m", 0), ("0.05 m", 1), ("30%", 0), ("5%", 1)):
+    floor = batch(*run, "--tolerance", "5%, at least 0.2")
+    assert (floor.code, "robustness is in m; write at least 0.2m" in floor.err) == (2, True)
+    both = (("5%, at least 0.2m", 0), ("5%, at least 0.05 m", 1), ("30%, at least 0.05m", 0))
+    for tolerance, code in (("0.2m", 0), ("0.05 m", 1), ("30%", 0), ("5%", 1), *both):
         assert batch(*run, "--tolerance", tolerance).code == code
-    assert "edited" not in batch(*run).err
-    Path("m.spatial").write_text("spec s = G (cart dist person >= 0.05)")
-    assert "edited since the baseline, which may be why results differ: m.spatial" in batch(*run).err
+    wrong = batch(*run, "--tolerance", "at least 0.2m")
+    assert (wrong.code, "write an amount in units of robustness" in wrong.err) == (2, True)
+
+
+def test_results_of_an_edited_spec_are_marked_once_for_each_spec_and_counted_apart(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = ("logs", "--spec", "gate.spatial", "--baseline", "main")
+    batch(*run, "--update-baseline")
+    same = batch(*run)
+    assert "edited" not in same.out + same.err
+    # a stricter spec, and one log that is worse for the spec that nobody edited
+    Path("gate.spatial").write_text(GATE.replace(">= 0.3", ">= 0.45").replace("REQ-4: ", "REQ-9: "))
+    write_log(Path("logs/run-0.jsonl"), 1.2)
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    done = batch(*run, "--junit", "junit.xml", "--json", "rows.jsonl", "--html", "pages")
+    assert done.code == 1
+    totals, _, rest = done.out.partition("4 failed, ")
+    assert rest.startswith("1 of them worse than the baseline, or gone, 3 of specs edited since:\n")
+    heads, *lines = totals.splitlines()[1:]
+    assert heads.split()[5:8] == ["failed", "worse", "edited"]
+    assert [line.split()[-4:-1] for line in lines if "REQ" in line] == [["3", "-", "3"], ["1", "1", "-"]]
+    assert done.out.count("\n    edited since the baseline\n") == 1
+    worse, _, edited = rest.partition(
+        "worse, and the spec was edited since the baseline: apart (gate.spatial):"
+    )
+    assert "  logs/run-0.jsonl: arrives is violated with robustness -0.2; it was satisfied" in worse
+    assert [line.split(":")[0].strip() for line in edited.splitlines()[1:4]] == [
+        "logs/run-3.jsonl", "logs/run-2.jsonl", "logs/run-1.jsonl"
+    ]  # fmt: skip
+    rows = [json.loads(line) for line in Path("rows.jsonl").read_text().splitlines()]
+    assert {(row["spec"], row["edited_since_baseline"]) for row in rows} == {
+        ("apart", True),
+        ("arrives", False),
+    }
+    root = ElementTree.parse("junit.xml").getroot()
+    suites = {
+        suite.get("name"): [
+            each.get("value") for each in suite.iterfind("properties/property[@name='baseline']")
+        ]
+        for suite in root
+    }
+    assert suites == {"logs.apart": ["edited since the baseline"], "logs.arrives": []}
+    assert "| apart (edited since the baseline) | REQ-3: keep 30 cm" in Path("summary.md").read_text()
+    assert "<td>apart (edited since the baseline)</td>" in Path("pages/index.html").read_text()
+
+
+def test_types_of_failures_in_junit_are_what_was_expected(fleet: Path) -> None:
+    Path("suite.yaml").write_text(
+        "specs: gate.spatial\ncases:\n"
+        "  - {name: floor, logs: logs/run-1.jsonl, at_least: 0.5}\n"
+        "  - {name: close, logs: logs/run-0.jsonl, expect: violated}\n"
+        "  - {name: apart, logs: logs/run-3.jsonl}\n"
+    )
+    batch("suite.yaml", "--junit", "junit.xml")
+    types = [failure.get("type") for failure in ElementTree.parse("junit.xml").getroot().iter("failure")]
+    floor = "expected robustness of at least 0.5"
+    assert types == [floor, "expected violated", "expected violated", "expected satisfied"]
+
+
+def test_formulas_in_the_summary_of_github_are_code(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("gate.spatial").write_text(
+        'spec s "<b> | *far*" = G (cart dist person < 0.3 and "a|b" dist cart > 1)'
+    )
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    batch("logs", "--spec", "gate.spatial")
+    summary = Path("summary.md").read_text()
+    assert "`cart dist person < 0.3` fails" in summary
+    assert r"| &lt;b> \| \*far\* |" in summary
 
 
 def test_a_batch_names_the_logs_that_are_damaged_and_those_that_lack_a_name(fleet: Path) -> None:
