@@ -6,8 +6,11 @@ are two fields or a number. Names and classes of objects become codes.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
+from decimal import Decimal
 from fnmatch import fnmatchcase
 from itertools import chain, repeat
 from typing import Any, TypeVar
@@ -325,11 +328,11 @@ class Binding:
 
 @dataclass(frozen=True, slots=True)
 class TimeGetter:
-    """Reads a time: two fields, or one number of `unit_ns`."""
+    """Reads a time: a pair of seconds and nanoseconds, or one number of `unit_ns`, or a text of either."""
 
     path: FieldPath
     get: Get
-    parts: tuple[str, str] | None
+    is_pair: bool
     unit_ns: int
 
     def nanoseconds(self, values: Sequence[object]) -> list[int]:
@@ -339,22 +342,77 @@ class TimeGetter:
             FieldError: one lies outside the times of a log.
                 TypeError, ValueError, OverflowError: one is not a time.
         """
-        read = map(self.get, values)
-        if self.parts is None:
+        times = map(self.get, values)
+        if not self.is_pair:
             unit = self.unit_ns
-            return [self._checked(v * unit if type(v) is int else round(float(v) * unit)) for v in read]
-        pairs = np.fromiter(chain.from_iterable(read), np.int64, 2 * len(values))
+            return [
+                self._checked(
+                    time * unit
+                    if type(time) is int
+                    else ns_from_text(time, unit)
+                    if isinstance(time, str)
+                    else round(float(time) * unit)
+                )
+                for time in times
+            ]
+        pairs = np.fromiter(chain.from_iterable(times), np.int64, 2 * len(values))
         seconds, rest = pairs[::2], pairs[1::2]
+        if len(rest) and rest.max() >= _SECOND_NS:
+            raise FieldError(
+                f"{self.path.text}: its nanoseconds, {rest.max()}, are not below one second, so the stamp is"
+                " invalid; `clock: log` takes the time of recording"
+            )
         # before the product, which would overflow
         if len(seconds) and max(np.abs(seconds).max(), np.abs(rest).max()) >= LATEST_NS // _SECOND_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
-        times: list[int] = (seconds * _SECOND_NS + rest).tolist()
-        return times
+        return [int(time) for time in (seconds * _SECOND_NS + rest).tolist()]
 
     def _checked(self, time_ns: int) -> int:
         if abs(time_ns) > LATEST_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
         return time_ns
+
+
+_DATE = re.compile(
+    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:[.,](\d{1,18}))?(?:[Zz]|([+-]\d\d:?\d\d))", re.ASCII
+)
+_SECONDS = re.compile(r"([+-]?\d{1,19}(?:\.\d{1,18})?)(s?)", re.ASCII)
+
+
+def ns_from_text(text: str, unit_ns: int) -> int:
+    """Return the time of an RFC 3339 text, or of a number in units or, as `1.5s`, in seconds.
+
+    Raises:
+        ContentError: the text is neither.
+    """
+    if number := _SECONDS.fullmatch(text):
+        return int(Decimal(number[1]) * (_SECOND_NS if number[2] else unit_ns))
+    date = _DATE.fullmatch(text)
+    try:
+        if date is not None:
+            moment = datetime.fromisoformat(f"{date[1]}T{date[2]}{date[4] or '+00:00'}")
+            return int(moment.timestamp()) * _SECOND_NS + int((date[3] or "0").ljust(9, "0")[:9])
+    except ValueError:
+        pass
+    raise ContentError(
+        f"{text[:40]!r} is not a time; a text has to be a number or as 2026-03-02T10:00:00.5Z, with its"
+        " offset from UTC; `clock: log` takes the time of recording"
+    )
+
+
+def ns_from_json(value: Any) -> int:
+    """Return a duration as JSON has it: seconds and nanoseconds, or a text such as `1.5s`; 0 without one.
+
+    Raises:
+        ContentError, TypeError, ValueError: it is none.
+    """
+    if isinstance(value, dict):
+        seconds, rest = (
+            next((value[name] for name in names if name in value), 0)
+            for names in zip(*_TIME_FIELDS, strict=True)
+        )
+        return int(seconds) * _SECOND_NS + int(rest)
+    return ns_from_text(value, 1) if isinstance(value, str) else int(value or 0)
 
 
 class _Columns:
@@ -426,7 +484,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     if len(class_paths) == 1:
         # alternatives may all be missing, a single path of the mapping must not
         walk(class_paths[0], example)
-    lifetime = bind_time((Stamp("lifetime"),), example, message) if layout.stays else None
+    lifetime = bind_time((Stamp("lifetime"),), example, message) if layout.stays and style != "keys" else None
     paths = columns.paths
     return Binding(
         style=style,
@@ -551,25 +609,47 @@ def _frame(
 
 
 def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> TimeGetter | None:
-    """Bind the first stamp that exists; None if none does.
+    """Bind the first stamp that exists and is a time; None if none does.
 
     Raises:
-        FieldError: the only stamp does not exist, or a stamp is not a time.
+        FieldError: the only stamp does not exist, or is not a time.
     """
     for stamp in stamps:
         path = FieldPath.of(stamp.field)
         root = message if path.from_message else example
         if len(stamps) > 1 and not leads_somewhere(path, root):
             continue
-        value = walk(path, root)
-        names = field_names(value)
-        fits = any if isinstance(value, Sparse) else all
-        for parts in _TIME_FIELDS:
-            if fits(part in names for part in parts):
-                pair = tuple_getter([below(path, part) for part in parts], root)
-                return TimeGetter(path, pair, parts, 1)
-        if is_number(value):
-            return TimeGetter(path, getter(path, root), None, stamp.unit_ns)
-        remedy = "give the path of a stamp or a number"
-        raise FieldError(f"{path.text}: {type_name(value)} is not a time; {remedy}")
+        try:
+            return _time_getter(stamp, path, root)
+        except FieldError:
+            if len(stamps) == 1:
+                raise
     return None
+
+
+def _time_getter(stamp: Stamp, path: FieldPath, root: object) -> TimeGetter:
+    """Return the getter of a stamp.
+
+    Raises:
+        FieldError: the path leads to no time.
+    """
+    value = walk(path, root)
+    if stamp.nanoseconds:
+        parts = [path, FieldPath.of(stamp.nanoseconds)]
+        if not all(is_number(walk(part, root)) for part in parts):
+            raise FieldError(f"{path.text}: seconds and nanoseconds have to be numbers")
+        return TimeGetter(path, tuple_getter(parts, root), True, 1)
+    names = field_names(value)
+    fits = any if isinstance(value, Sparse) else all
+    for names_of_parts in _TIME_FIELDS:
+        if fits(name in names for name in names_of_parts):
+            pair = tuple_getter([below(path, name) for name in names_of_parts], root)
+            return TimeGetter(path, pair, True, 1)
+    if is_list(value) and len(value) == 2 and all(type(part) is int for part in value):
+        return TimeGetter(path, getter(path, root), True, 1)
+    if isinstance(value, str):
+        ns_from_text(value, stamp.unit_ns)
+    elif not is_number(value):
+        remedy = "give the path of a stamp, a number or a text; `clock: log` takes the time of recording"
+        raise FieldError(f"{path.text}: {type_name(value)} is not a time; {remedy}")
+    return TimeGetter(path, getter(path, root), False, stamp.unit_ns)

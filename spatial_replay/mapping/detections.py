@@ -215,7 +215,7 @@ Numbers: TypeAlias = tuple[float, ...]
 GetField: TypeAlias = Callable[[Any, str], Any]
 
 MARKER_ADD, MARKER_DELETE, MARKER_DELETE_ALL = 0, 2, 3
-DELETE_ALL_ENTITIES = 1
+DELETE_ALL_ENTITIES = (1, "ALL")
 
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
@@ -260,7 +260,10 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
         for primitive in get(entity, name) or ():
             size = _vector(get(primitive, "size"), get)
             if kind == CYLINDER:
-                scale = max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale")))
+                # both are 0 where a protobuf sender sets neither
+                scale = (
+                    max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale"))) or 1.0
+                )
                 size = (size[0] * scale, size[1] * scale, size[2])
             solids.append(Solid(kind, *_pose(get(primitive, "pose"), get), size))
     for primitive in get(entity, "triangles") or ():
@@ -463,7 +466,7 @@ def detections_from_chunks(
         height=_heights(binding, numbers),
         uncertainty=_uncertainty(binding, numbers, len(name)),
         covariance=np.concatenate(spreads) if spreads else None,
-        lifetime_ns=_joined(chunk.lifetimes for chunk in chunks) if binding.lifetime is not None else None,
+        lifetime_ns=_joined(chunk.lifetimes for chunk in chunks) if layout.stays else None,
         is_locked=np.array(locked, np.bool_) if any(locked) else None,
         deleted=deleted,
         skipped=skipped,

@@ -20,6 +20,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import lru_cache
 from math import inf, isnan, nan
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
@@ -120,6 +121,49 @@ def _sparse(value: object) -> object:
     if isinstance(value, dict):
         return Sparse({key: _sparse(element) for key, element in value.items()})
     return [_sparse(element) for element in value] if isinstance(value, list) else value
+
+
+def from_protobuf_json(value: object, objects: str) -> object:
+    """Return a JSON message that protobuf may have written, with its fields as in the definition.
+
+    `frameId` is `frame_id`, too, coordinates that are left out are 0, and an empty list of objects is there.
+
+    Args:
+        objects: the path of the list of objects, such as `entities[*]`; "" for none.
+
+    Raises:
+        ContentError: it is nested too deeply.
+    """
+    try:
+        message = _as_defined(value)
+    except RecursionError:
+        raise ContentError("its JSON is nested too deeply") from None
+    if objects and isinstance(message, dict):
+        message.setdefault(objects.partition("[")[0], [])
+    return message
+
+
+_POINT = MappingProxyType({"x": 0.0, "y": 0.0, "z": 0.0})
+
+
+def _as_defined(value: object) -> object:
+    if isinstance(value, list):
+        # long lists of numbers are as they are
+        return list(map(_as_defined, value)) if value and isinstance(value[0], dict | list) else value
+    if not isinstance(value, dict):
+        return value
+    if value.keys() <= {"x", "y", "z", "w"}:
+        return {**_POINT, **value}
+    fields = {key: _as_defined(part) for key, part in value.items()}
+    if "position" in fields:
+        # an orientation that is not set is a quaternion of zeros in protobuf's own encoding
+        fields.setdefault("orientation", {**_POINT, "w": 0.0})
+    return {_snake_case(key): part for key, part in fields.items()} | fields
+
+
+@lru_cache(4096)
+def _snake_case(key: str) -> str:
+    return re.sub(r"(?<=[a-z0-9])[A-Z]", lambda match: f"_{match[0].lower()}", key)
 
 
 def type_name(value: object) -> str:

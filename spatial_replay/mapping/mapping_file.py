@@ -97,10 +97,15 @@ class SignalMapping:
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """The field of a time: a ROS or protobuf time, or a number of `unit_ns`."""
+    """The field of a time: a ROS or protobuf time, or a number of `unit_ns`.
+
+    Attributes:
+        nanoseconds: the field of the nanoseconds, if `field` has the seconds alone.
+    """
 
     field: str
     unit_ns: int = 1
+    nanoseconds: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,6 +401,8 @@ def _measure(value: Any) -> Measure:
 def _stamp(value: Any) -> Stamp | None:
     if isinstance(value, dict):
         return Stamp(value["field"], UNITS_NS[value.get("unit", "ns")])
+    if isinstance(value, list):
+        return Stamp(value[0], nanoseconds=value[1])
     return None if value is None else Stamp(value)
 
 

@@ -20,7 +20,16 @@ from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.bags.reader import DISORDER_NS
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.mapping.binding import Binding, Codes, Namer, TimeGetter, bind, bind_time, class_codes
+from spatial_replay.mapping.binding import (
+    Binding,
+    Codes,
+    Namer,
+    TimeGetter,
+    bind,
+    bind_time,
+    class_codes,
+    ns_from_json,
+)
 from spatial_replay.mapping.detections import (
     DELETE_ALL_ENTITIES,
     EVERY_OBJECT,
@@ -46,6 +55,7 @@ from spatial_replay.mapping.field_paths import (
     NameTemplate,
     elements_of,
     enum_names,
+    from_protobuf_json,
     getter,
     iter_elements,
     keys_of,
@@ -95,6 +105,7 @@ class PlannedTopic:
         is_transforms: whether its transforms place frames; `is_static`: at all times.
         is_lasting: whether a message counts however old it is.
         is_latched: whether it may have been sent long before it was recorded.
+        is_protobuf_json: whether its messages are of Foxglove and JSON, as protobuf writes it or not.
     """
 
     name: str
@@ -108,6 +119,7 @@ class PlannedTopic:
     is_static: bool
     is_lasting: bool
     is_latched: bool = False
+    is_protobuf_json: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,6 +339,7 @@ def doubts_of(
 def _planned(
     mapping: LogMapping, entry: TopicMapping | None, topic: Topic, needs_frames: bool
 ) -> PlannedTopic:
+    kind = short_type((entry.type if entry is not None else None) or topic.type)
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
@@ -347,6 +360,7 @@ def _planned(
         is_transforms=is_transforms,
         is_static=is_static,
         is_latched=topic.latched,
+        is_protobuf_json=topic.encoding == "json" and kind.startswith("foxglove/"),
         is_lasting=is_static or (layout is not None and max_age_ns >= FOREVER_NS),
     )
 
@@ -387,6 +401,8 @@ class Extractor:
         """Outlines with too few corners, whose objects are unknown."""
         self.widest_turn = 0.0
         """The greatest angle that is read as radians."""
+        self._scene_stamps_ns: dict[int, int] = {}
+        """Timestamps of the entities of a scene by the codes of their names, until they are deleted."""
         self.turned, self.unturned = 0, 0
         """Poses with an orientation, and those whose quaternion is zeros."""
         self.layout = layout
@@ -451,13 +467,13 @@ class Extractor:
                 from the others; FieldError says how.
         """
         values, index, order = self._flatten(messages)
-        deleted: list[tuple[int, int]] = []
-        if self.layout.solids == "scene":
-            deleted = self._deleted_entities(messages)
         of_message = [messages[number] for number in index] if self.namer.needs_messages else None
         objects = _Objects(values, index, self.namer.codes(values, order, of_message))
+        deleted: list[tuple[int, int]] = []
         if self.layout.solids == "marker":
             objects, deleted = _split_deleted_markers(objects)
+        elif self.layout.solids == "scene":
+            deleted = self._deleted_entities(messages, objects)
         if self.namer.is_filtering:
             objects = objects.where(self.namer.wanted(objects.name))
         chunk = DetectionChunk(places, deleted)
@@ -509,6 +525,8 @@ class Extractor:
         chunk.stamps = self._stamps(messages, objects)
         if binding.lifetime is not None:
             chunk.lifetimes = binding.lifetime.nanoseconds(values)
+        elif self.layout.stays:
+            chunk.lifetimes = [ns_from_json(thing.get("lifetime")) for thing in values]
         chunk.message, chunk.name = objects.message, objects.name
         self.cornerless += cornerless
 
@@ -530,17 +548,25 @@ class Extractor:
     def _elements(self, message: object) -> list[object]:
         return [message] if self._path is None else list(iter_elements(self._path, message))
 
-    def _deleted_entities(self, messages: Sequence[object]) -> list[tuple[int, int]]:
-        """Return (message, name) of each deletion in a foxglove.SceneUpdate."""
+    def _deleted_entities(self, messages: Sequence[object], entities: _Objects) -> list[tuple[int, int]]:
+        """Return (message, name) of each deletion in a foxglove.SceneUpdate; entities are after deletions."""
         deleted: list[tuple[int, int]] = []
+        starts = np.searchsorted(entities.message, np.arange(len(messages) + 1)).tolist()
+        stamps = [_stamp_of_scene(entity) for entity in entities.values]
         for number, message in enumerate(messages):
             get = lenient_getter(style_of(message))
             for deletion in get(message, "deletions") or ():
-                if get(deletion, "type") == DELETE_ALL_ENTITIES:
-                    deleted.append((number, EVERY_OBJECT))
+                stamp_ns = _stamp_of_scene(deletion) or LATEST_NS
+                if get(deletion, "type") in DELETE_ALL_ENTITIES:
+                    names = list(self._scene_stamps_ns)
                 else:
-                    (code,) = self.namer.codes([deletion], [0], [message])
-                    deleted.append((number, code))
+                    names = self.namer.codes([deletion], [0], [message])
+                gone = [name for name in names if self._scene_stamps_ns.get(name, 0) <= stamp_ns]
+                for name in gone:
+                    self._scene_stamps_ns.pop(name, None)
+                deleted += [(number, name) for name in gone]
+            own = slice(starts[number], starts[number + 1])
+            self._scene_stamps_ns.update(zip(entities.name[own], stamps[own], strict=True))
         return deleted
 
     def _bind_time(self, example: object, message: object) -> None:
@@ -572,6 +598,19 @@ class Extractor:
             of_message = self._time.nanoseconds(messages)
             return [of_message[index] for index in objects.message]
         return self._time.nanoseconds(objects.values)
+
+
+def _stamp_of_scene(thing: Any) -> int:
+    """Return the timestamp of an entity or a deletion; 0 for none."""
+    if isinstance(thing, dict):
+        return ns_from_json(thing.get("timestamp"))
+    stamp = thing.timestamp
+    # protobuf or ROS
+    return int(
+        stamp.seconds * 10**9 + stamp.nanos
+        if hasattr(stamp, "seconds")
+        else stamp.sec * 10**9 + stamp.nanosec
+    )
 
 
 def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int, int]]]:
@@ -667,9 +706,12 @@ class TopicReader:
         self._report = report
         reads = self.is_mapped or self.decodes_on_arrival
         self._decode: Decoder = decoder(planned.name) if reads else _skip
+        decode = self._decode
         if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
-            decode = self._decode
             self._decode = lambda payload: sparse(decode(payload))
+        elif reads and planned.is_protobuf_json:
+            objects = planned.layout.objects if planned.layout is not None else ""
+            self._decode = lambda payload: from_protobuf_json(decode(payload), objects)
         self._time: TimeGetter | None = None
         self._is_time_bound = False
         self._signal_fields = () if planned.mapping is None else planned.mapping.signals

@@ -136,10 +136,17 @@ class Feed:
         return self
 
     def topics(self) -> list[Topic]:
-        found = {topic: type_of(content) for topic, _, content in reversed(self.messages)} | self.types
+        kinds = {topic: type_of(content) for topic, _, content in reversed(self.messages)} | self.types
+        in_json = {topic for topic, _, content in self.messages if isinstance(content, dict)}
         return [
-            Topic(name, kind, "cdr", latched=name in self.latched, count=self.counts.get(name))
-            for name, kind in sorted(found.items())
+            Topic(
+                name,
+                kind,
+                "json" if name in in_json else "cdr",
+                latched=name in self.latched,
+                count=self.counts.get(name),
+            )
+            for name, kind in sorted(kinds.items())
         ]
 
     def decoder(self, topic: str) -> Decoder:
