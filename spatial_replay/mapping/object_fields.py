@@ -33,7 +33,7 @@ _YAWS = ("yaw", "theta", "heading", "angle")
 _SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
 _OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
 _BOUNDS = ("xyxy", "bounds", "bbox_xyxy", "box_xyxy")
-_NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
+_NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "mmsi", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
 """Lists with a name for each element of another list."""
 _NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
@@ -130,8 +130,7 @@ def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
     counts = set()
     for message in messages:
         try:
-            things = iter_elements(FieldPath.of(guess.objects), message) if guess.objects else [message]
-            places = [walk(FieldPath.of(str(guess.position)), thing) for thing in things]
+            places = [walk(FieldPath.of(str(guess.position)), thing) for thing in _objects_in(guess, message)]
         except FieldError:
             return False
         if not all(isinstance(place, dict) for place in places):
@@ -216,20 +215,32 @@ def _guess(message: object) -> Guess | None:
 
 
 def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
-    """Return whether no two objects of a message share the value of a field."""
+    """Return whether a field has another value in each object of a message, or in each sender's messages."""
+    try:
+        texts = [
+            [str(walk(FieldPath.of(name), thing)) for thing in _objects_in(guess, message)]
+            for message in messages
+        ]
+    except FieldError:
+        return False
     if guess.objects is None:
-        return True
-    for message in messages:
-        try:
-            values = [
-                walk(FieldPath.of(name), thing)
-                for thing in iter_elements(FieldPath.of(guess.objects), message)
-            ]
-        except FieldError:
-            return False
-        if len(set(map(str, values))) < len(values):
-            return False
-    return True
+        return takes_turns([text for (text,) in texts])
+    return all(len(set(row)) == len(row) for row in texts)
+
+
+def _objects_in(guess: Guess, message: object) -> Iterator[object]:
+    """Iterate over the objects in a message.
+
+    Raises:
+        FieldError: the message has no such list.
+    """
+    return iter([message]) if guess.objects is None else iter_elements(FieldPath.of(guess.objects), message)
+
+
+def takes_turns(texts: Sequence[str]) -> bool:
+    """Return whether successive texts name several things: one returns after another, unlike a counter."""
+    starts = [text for text, before in zip(texts, (None, *texts), strict=False) if text != before]
+    return len(set(starts)) < len(starts)
 
 
 def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:

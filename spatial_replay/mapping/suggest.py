@@ -42,7 +42,7 @@ from spatial_replay.mapping.message_types import (
     layout_of_topic,
     short_type,
 )
-from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in
+from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in, takes_turns
 from spatial_replay.mapping.topic_reader import doubts_of
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
@@ -260,7 +260,11 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
         reading = BUILT_IN[kind]
         has_outline = bool(reading.polygon or reading.sizes or reading.solids)
         name = reading.name.replace("{topic}", name_from_topic(topic.name))
-        fields = {} if has_outline else _POINT
+        fields: Mapping[str, str] = {} if has_outline else _POINT
+        if reading.name == "{topic}" and takes_turns(_children(examples)):
+            # such as the odometry of several robots on one topic
+            name = "{child_frame_id}"
+            fields = {"name": _text(name), **fields}
         remarks = () if has_outline else _SIZELESS
         if _is_by_place(topic, reading, examples):
             remarks = (*remarks, BY_PLACE)
@@ -293,6 +297,15 @@ def _with_frames(
     elif any(map(_MAVROS.search, (topic.name, topic.type))):
         remarks = (*remarks, _OF_MAVROS)
     return TopicSuggestion(topic, fields, name, remarks, frames=frames, axes=axes)
+
+
+def _children(messages: Sequence[object]) -> list[str]:
+    """Return the `child_frame_id` of each message that has one."""
+    return [
+        str(get_field(message, "child_frame_id"))
+        for message in messages
+        if "child_frame_id" in field_names(message)
+    ]
 
 
 def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]) -> bool:
@@ -403,21 +416,24 @@ def _shape(guess: Guess) -> str:
 
 
 def _name(topic: Topic, guess: Guess) -> str:
-    if guess.objects is None:
+    if guess.objects is None and not guess.names:
         return name_from_topic(topic.name)
     path = guess.names[0] if guess.names else INDEX
     if guess.names and (path == INDEX or path.startswith("$.") or path.split(".")[-1] in _TEXTS):
         # names by themselves, and not numbers that need a word
         return f"{{{path}}}"
-    word = re.sub("(?<=x)es$|s$", "", guess.objects.removesuffix("[*]").split(".")[-1]) or "object"
-    return f"{word}{{{path}}}"
+    word = name_from_topic(topic.name) if guess.objects is None else guess.objects.removesuffix("[*]")
+    return f"{re.sub('(?<=x)es$|s$', '', word.split('.')[-1]) or 'object'}{{{path}}}"
 
 
 def _remarks(guess: Guess) -> tuple[str, ...]:
+    by_id = ()
+    if guess.objects is None and guess.names:
+        by_id = (f"one object a message: {guess.names[0]} takes turns",)
     sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
     others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
     indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
-    return sizeless + indexed + others
+    return by_id + sizeless + indexed + others
 
 
 def _frame_lines(

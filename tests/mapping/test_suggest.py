@@ -12,7 +12,13 @@ from mcap.writer import Writer
 from spatial_replay import UsageError, read_trace
 from spatial_replay.bags.decoders import Topic
 from spatial_replay.cli import run
-from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping, ShapeMapping, parse_mapping
+from spatial_replay.mapping.mapping_file import (
+    FOREVER_NS,
+    LogMapping,
+    ShapeMapping,
+    TopicMapping,
+    parse_mapping,
+)
 from spatial_replay.mapping.suggest import suggest_mapping
 from spatial_replay.sources import open_source
 
@@ -26,6 +32,13 @@ def suggested(**examples: Any) -> tuple[str, LogMapping]:
     topics = [Topic(f"/{name}", f"a/msg/{name.title()}", "json") for name in examples]
     text = suggest_mapping("run.bag", topics, {f"/{name}": [each] for name, each in examples.items()})
     return text, parse_mapping(text)
+
+
+def suggested_for(messages: list[Any], kind: str = "a/msg/Own") -> tuple[str, TopicMapping]:
+    """Suggest a mapping for one topic; return its text and the topic's entry."""
+    text = suggest_mapping("run.bag", [Topic("/tracks", kind, "json")], {"/tracks": messages})
+    (topic,) = parse_mapping(text).topics
+    return text, topic
 
 
 def test_a_pose_is_an_object_of_its_topic() -> None:
@@ -315,6 +328,23 @@ def test_empty_ids_leave_only_places_in_the_list(ids: tuple[str, str], swap: boo
     detections = {"detections": [{"id": each, "bbox": {"center": {"x": 1, "y": 1}}} for each in ids]}
     topic = Topic("/det", "vision_msgs/msg/Detection2DArray", "json")
     assert ("objects swap" in suggest_mapping("run", [topic], {"/det": [detections]})) == swap
+
+
+def test_ids_that_take_turns_name_one_object_a_message() -> None:
+    def names(field: str, *values: Any) -> str | None:
+        return suggested_for([{field: value, **POINT} for value in values])[1].name
+
+    assert names("track_id", 4, 7, 4, 9) == "track{track_id}"
+    assert names("name", "cup", "cup", "plate", "cup") == "{name}"
+    # counters, and what is the same or changes for a while, name no object
+    for values in ((1, 2, 3, 4), (5, 5, 5), (1, 1, 2, 2, 3), (7,)):
+        assert names("id", *values) == "tracks"
+    odometry = [
+        {"child_frame_id": name, "pose": {"pose": {"position": POINT, "orientation": TURN}}}
+        for name in ("r1", "r2", "r1")
+    ]
+    assert suggested_for(odometry, "nav_msgs/msg/Odometry")[1].name == "{child_frame_id}"
+    assert suggested_for(odometry[:2], "nav_msgs/msg/Odometry")[1].name is None
 
 
 def test_names_that_several_topics_share_get_the_topic_as_prefix() -> None:
