@@ -264,6 +264,8 @@ def _pose_changes(mapping: TopicMapping) -> dict[str, object]:
     if mapping.position is not None:
         paths = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         changes |= {"position": (paths,), "polygon": (), "solids": ""}
+        if paths == GEODETIC:
+            changes["frame"] = ()
     if mapping.orientation is not None:
         changes |= {"orientation": (mapping.orientation,), "yaw": ()}
     if mapping.yaw is not None:

@@ -6,7 +6,7 @@ They are found by their names and the types of their values, for messages of unk
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -24,6 +24,7 @@ from spatial_replay.mapping.field_paths import (
     sparse,
     walk,
 )
+from spatial_replay.mapping.message_types import GEODETIC
 
 _DEEPEST = 4
 """Levels of nested fields to search."""
@@ -47,6 +48,13 @@ _PARTS = frozenset(
 )
 """Keys of parts of one object; other keys of a JSON object may be names of objects."""
 _LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
+_PLANS = frozenset(
+    {
+        *("path", "paths", "plan", "plans", "trajectory", "trajectories", "route", "routes"),
+        *("waypoint", "waypoints", "node", "nodes", "edge", "edges", "viapoints"),
+    }
+)
+"""Words in the names of lists of places to go to, which are no objects."""
 _NOT_PLACES = frozenset(
     {
         *("velocity", "velocities", "vel", "speed", "acceleration", "accel", "twist", "linear", "angular"),
@@ -55,6 +63,10 @@ _NOT_PLACES = frozenset(
     }
 )
 """Words in the names of fields whose points are no places of objects, such as sensors' mounts."""
+_ELSEWHERE = frozenset(
+    {"goal", "target", "desired", "reference", "home", "last", "next", "previous", "initial"}
+)
+"""Words in the names of positions where an object is to be, or was."""
 _VECTORS = re.compile(r"twist|vector3|accel|wrench|imu|cmd_vel|velocity", re.IGNORECASE)
 """Topics and types whose x and y are no place."""
 _TIMES = frozenset({"time", "stamp", "timestamp", "sec", "secs", "nsec", "nsecs", "nanosec", "nanos", "seq"})
@@ -78,6 +90,7 @@ class Guess:
         is_in_pixels: whether coordinates look like pixels.
         has_zeros_left_out: whether some objects lack coordinates that others have.
         others: of further lists whose elements look like objects.
+        is_plan: whether the places are those to go to.
     """
 
     objects: str | None = None
@@ -93,6 +106,7 @@ class Guess:
     is_in_pixels: bool = False
     has_zeros_left_out: bool = False
     others: tuple[str, ...] = ()
+    is_plan: bool = False
 
     @property
     def score(self) -> int:
@@ -117,6 +131,10 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
     if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
         return None
     best = _best(messages)
+    if best is not None and best.objects is not None and not best.names:
+        # places in a list without ids, on a topic or of a type such as nav_msgs/Path
+        words = (_words(re.split(r"[/.]", name)[-1]) for name in (topic, kind))
+        best = replace(best, is_plan=best.is_plan or any(map(_PLANS.intersection, words)))
     if any(isinstance(message, dict) for message in messages):
         with suppress(FieldError):
             zeros = _best([sparse(message) for message in messages])
@@ -147,6 +165,9 @@ def _best(messages: Sequence[object]) -> Guess | None:
     best = max(guesses, key=lambda guess: (guess.score, guess.is_own))
     if best.names == (INDEX,):
         return best
+    if best.position == GEODETIC:
+        # the frame of a fix is that of its receiver
+        best = replace(best, names=(*best.names, "frame_id"))
     names = tuple(name for name in best.names if _distinguishes(name, best, messages))
     return replace(best, names=names or tuple(_names_beside(best, messages)))
 
@@ -206,9 +227,9 @@ def _guess(message: object) -> Guess | None:
     itself = _object_in(message)
     lists = sorted(
         ((guess, path) for path, guess in _iter_lists(message)),
-        key=lambda pair: (-_list_rank(pair[1]), -pair[0].score),
+        key=lambda pair: (pair[0].is_plan, -_list_rank(pair[1]), -pair[0].score),
     )
-    if lists and (itself is None or itself.polygon is None):
+    if lists and (itself is None or (itself.polygon is None and not lists[0][0].is_plan)):
         best, path = lists[0]
         return replace(best, objects=path, others=tuple(path for _, path in lists[1:]))
     return itself
@@ -250,15 +271,23 @@ def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
             yield f"{path}[*]", replace(guess, names=(INDEX,))
         elif is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
+            last = path.split(".")[-1]
             # the corners of an outline are points, not objects
-            if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
-                yield f"{path}[*]", guess
+            if guess is not None and not (last in _OUTLINES and guess.score <= 10):
+                yield f"{path}[*]", replace(guess, is_plan=not _PLANS.isdisjoint(_words(last)))
 
 
 def _table_of_objects(value: object) -> list[object]:
-    """Return the objects that a JSON object has by their names: at least two, and all alike."""
-    keys = keys_of(value) if isinstance(value, dict) else []
-    objects = list(map(value.get, keys)) if isinstance(value, dict) else []
+    """Return the objects that a protobuf map or a JSON object has by their names.
+
+    A JSON object that is a map has at least two, and all alike.
+    """
+    if not isinstance(value, Mapping):
+        return []
+    keys = keys_of(value)
+    objects = [value[key] for key in keys]
+    if not isinstance(value, dict):
+        return objects
     fields = {frozenset(field_names(thing)) for thing in objects}
     is_table = len(objects) > 1 and len(fields) == 1 and _PARTS.isdisjoint(keys)
     return objects if is_table and not any(map(_is_no_place, keys)) else []
@@ -316,7 +345,8 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
     turns = [path for path in _paths_by_name(fields, _TURNS) if _has(fields[path], "xyzw")]
     places = [
         path
-        for path in _paths_by_name(fields, _POSITIONS)
+        # such as `position`, else `agvPosition`
+        for path in (*_paths_by_name(fields, _POSITIONS), *_paths_by_last_word(fields, _POSITIONS))
         # the positions of joints stand beside a list of their names
         if _point(fields[path]) is not None
         and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
@@ -328,6 +358,8 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
     position: str | tuple[str, ...] | None = places[0] if places else None
     if position is None and all(_is_number(fields.get(name)) for name in "xy"):
         position = None if _is_number(fields.get("w")) else ("x", "y")
+    if position is None and all(_is_number(fields.get(name)) for name in GEODETIC):
+        position = GEODETIC
     return position, turns[0] if turns else None
 
 
@@ -410,6 +442,17 @@ def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[st
     ends = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
     paths = [path for path in fields if ends[path] in names]
     return sorted(paths, key=lambda path: (path.count("."), names.index(ends[path])))
+
+
+def _paths_by_last_word(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
+    """Return the paths whose last name has further words before one of some names, by depth."""
+    words_of = {path: _words(path.split(".")[-1]) for path in fields}
+    paths = [
+        path
+        for path, words in words_of.items()
+        if len(words) > 1 and words[-1] in names and _ELSEWHERE.isdisjoint(words)
+    ]
+    return sorted(paths, key=lambda path: path.count("."))
 
 
 def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:

@@ -26,7 +26,6 @@ from spatial_replay.mapping.field_paths import (
     NameTemplate,
     field_names,
     get_field,
-    getter,
     iter_elements,
     leads_somewhere,
     name_from_topic,
@@ -36,7 +35,6 @@ from spatial_replay.mapping.mapping_file import NO_TOPIC, TopicMapping
 from spatial_replay.mapping.message_types import (
     BUILT_IN,
     GEODETIC,
-    GEODETIC_TYPES,
     TRANSFORM_TYPES,
     MessageLayout,
     layout_of_topic,
@@ -90,6 +88,8 @@ class TopicSuggestion:
         frames: those of its coordinates, as the suggested entry reads them.
         axes: those of its coordinates.
         numbers: paths of possible signals.
+        aside: why the entry is not used as it is; empty where it is.
+        layout: where the fields of objects are, by the entry.
     """
 
     topic: Topic
@@ -100,6 +100,8 @@ class TopicSuggestion:
     frames: frozenset[str] = frozenset()
     axes: _Axes = "plane"
     numbers: tuple[str, ...] = ()
+    aside: str = ""
+    layout: MessageLayout | None = None
 
     @property
     def entry(self) -> str:
@@ -144,7 +146,11 @@ def suggest_mapping(
     """
     suggestions = suggest_topics(topics, examples)
     usable = [suggestion for suggestion in suggestions if len(_text(suggestion.topic.name)) <= _LONGEST_KEY]
-    mapped = [suggestion for suggestion in usable if suggestion.entry and not suggestion.is_transforms]
+    mapped = [
+        suggestion
+        for suggestion in usable
+        if suggestion.entry and not suggestion.is_transforms and not suggestion.aside
+    ]
     transforms = [suggestion for suggestion in suggestions if suggestion.is_transforms]
     axes: _Axes = next(
         (axes for axes in _AXES if any(suggestion.axes == axes for suggestion in mapped)), "plane"
@@ -229,13 +235,23 @@ def _origin_lines(
 ) -> Iterator[str]:
     """Yield the line about where local metres are counted from: the first fix."""
     for suggestion in active:
-        if short_type(suggestion.topic.type) in GEODETIC_TYPES:
-            for message in examples.get(suggestion.topic.name, ()):
-                place = [float(getter(FieldPath.of(name), message)(message)) for name in GEODETIC]
-                if all(map(isfinite, place)):
-                    yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
-                    yield f"origin: [{place[0]!r}, {place[1]!r}]"
-                    return
+        if (layout := suggestion.layout) is None or GEODETIC not in layout.position:
+            continue
+        for _, fix in _iter_objects(layout, examples.get(suggestion.topic.name, ())):
+            place = _place_of_fix(fix)
+            if place is not None:
+                yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
+                yield f"origin: [{place[0]!r}, {place[1]!r}]"
+                return
+
+
+def _place_of_fix(fix: object) -> tuple[float, float] | None:
+    """Return latitude and longitude; None without a fix, also where zeros stand for its lack."""
+    latitude, longitude = (float(walk(FieldPath.of(name), fix)) for name in GEODETIC)  # type: ignore[arg-type]
+    status = FieldPath.of("status.status")
+    is_fix = not leads_somewhere(status, fix) or float(walk(status, fix)) >= 0  # type: ignore[arg-type]
+    is_place = isfinite(latitude) and isfinite(longitude) and (latitude, longitude) != (0.0, 0.0)
+    return (latitude, longitude) if is_fix and is_place else None
 
 
 def _axes_lines(axes: _Axes) -> Iterator[str]:
@@ -273,9 +289,11 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     if guess is None:
         return TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())
     name = _name(topic, guess)
-    layout = layout_of_topic(topic.type, TopicMapping(topic.name, objects=guess.objects))
+    entry = TopicMapping(topic.name, objects=guess.objects, position=guess.position)
+    layout = layout_of_topic(topic.type, entry)
     suggestion = _with_frames(topic, layout, examples, _fields(name, guess), name, _remarks(guess))
-    return replace(suggestion, axes="image") if guess.is_in_pixels else suggestion
+    aside = _OF_PLANS if guess.is_plan else ""
+    return replace(suggestion, axes="image" if guess.is_in_pixels else suggestion.axes, aside=aside)
 
 
 def _with_frames(
@@ -296,7 +314,7 @@ def _with_frames(
         axes = "north"
     elif any(map(_MAVROS.search, (topic.name, topic.type))):
         remarks = (*remarks, _OF_MAVROS)
-    return TopicSuggestion(topic, fields, name, remarks, frames=frames, axes=axes)
+    return TopicSuggestion(topic, fields, name, remarks, frames=frames, axes=axes, layout=layout)
 
 
 def _children(messages: Sequence[object]) -> list[str]:
@@ -367,6 +385,7 @@ _OF_MAVROS = (
     "MAVROS turns local positions to x east, y north, z up; raw MAVLink messages are north, east, down: for"
     " these, axes: {y: down}"
 )
+_OF_PLANS = "places to go to, as of a plan, are no objects"
 _POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
 
 
@@ -427,7 +446,7 @@ def _name(topic: Topic, guess: Guess) -> str:
 
 
 def _remarks(guess: Guess) -> tuple[str, ...]:
-    by_id = ()
+    by_id: tuple[str, ...] = ()
     if guess.objects is None and guess.names:
         by_id = (f"one object a message: {guess.names[0]} takes turns",)
     sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
@@ -503,11 +522,12 @@ def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, i
 
 def _unused_line(suggestion: TopicSuggestion, axes: _Axes) -> str:
     topic, what = _text(suggestion.topic.name), _description(suggestion.topic)
+    aside = suggestion.aside
     if suggestion.entry and suggestion.axes != axes and not suggestion.is_transforms:
-        apart = f"{_AXES[suggestion.axes]}: for a mapping of its own with y down"
-        return f"  # {topic}: {suggestion.entry}    # {what}; {apart}"
+        aside = aside or f"{_AXES[suggestion.axes]}: for a mapping of its own with y down"
     if suggestion.entry or suggestion.signals:
-        return f"  # {topic}: {suggestion.entry or suggestion.signals}    # {what}"
+        reason = f"; {aside}" if aside else ""
+        return f"  # {topic}: {suggestion.entry or suggestion.signals}    # {what}{reason}"
     return "; ".join([f"  # {topic}: {what}", *suggestion.remarks])
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from google.protobuf import descriptor_pb2, message_factory
 from mcap.writer import Writer
 
 from spatial_replay import UsageError, read_trace
@@ -345,6 +346,63 @@ def test_ids_that_take_turns_name_one_object_a_message() -> None:
     ]
     assert suggested_for(odometry, "nav_msgs/msg/Odometry")[1].name == "{child_frame_id}"
     assert suggested_for(odometry[:2], "nav_msgs/msg/Odometry")[1].name is None
+
+
+def test_objects_in_a_protobuf_map_are_named_by_its_keys() -> None:
+    field_type = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name="scene.proto", package="own", syntax="proto3")
+    thing, scene = file.message_type.add(name="Thing"), file.message_type.add(name="Scene")
+    entry = scene.nested_type.add(name="ObjectsEntry")
+    entry.options.map_entry = True
+    for number, name in enumerate(("x", "y", "radius"), 1):
+        thing.field.add(name=name, number=number, type=field_type.TYPE_DOUBLE)
+    entry.field.add(name="key", number=1, type=field_type.TYPE_STRING)
+    value = {"type": field_type.TYPE_MESSAGE, "number": 2}
+    entry.field.add(name="value", type_name=".own.Thing", **value)
+    listed = {"label": field_type.LABEL_REPEATED, "type_name": ".own.Scene.ObjectsEntry"}
+    scene.field.add(name="objects", **listed, **value)
+    message = message_factory.GetMessages([file])["own.Scene"]()
+    message.objects["cup"].x = 1.0
+    _, topic = suggested_for([message], "own.Scene")
+    assert (topic.objects, topic.name, topic.position) == ("objects[*]", "{index}", ("x", "y"))
+    assert topic.shape == ShapeMapping("disc", ("radius",))
+
+
+def test_plans_are_no_objects() -> None:
+    pose = {"position": POINT, "orientation": TURN}
+    poses = [{"pose": pose}, {"pose": pose}]
+    cases = [
+        ("/plan", "nav_msgs/msg/Path", {"poses": poses}),
+        ("/global_path", "own/msg/Poses", {"poses": poses}),
+        ("/mission", "own/msg/Mission", {"waypoints": [{"id": 1, "pose": pose}, {"id": 2, "pose": pose}]}),
+    ]
+    for name, kind, message in cases:
+        text = suggest_mapping("run", [Topic(name, kind, "json")], {name: [message]})
+        assert f"  # {name}: {{objects: " in text
+        assert "no objects" in text
+        with pytest.raises(UsageError, match="no topic was chosen"):
+            parse_mapping(text)
+    # the robot beside its plan
+    state = {"nodeStates": [{"nodePosition": POINT}], "agvPosition": {"x": 1.0, "y": 2.0, "theta": 0.5}}
+    _, topic = suggested_for([{**state, "lastNodePosition": POINT}])
+    assert (topic.objects, topic.position, topic.yaw) == (None, "agvPosition", "agvPosition.theta")
+
+
+def test_the_origin_is_the_first_fix_that_is_one() -> None:
+    def fix(latitude: float, longitude: float, status: int) -> dict[str, Any]:
+        return {"status": {"status": status}, "latitude": latitude, "longitude": longitude}
+
+    topic = Topic("/fix", "sensor_msgs/msg/NavSatFix", "json")
+    fixes = [fix(0.0, 0.0, -1), fix(1.0, 2.0, -1), fix(0.0, 0.0, 0), fix(52.0, 5.0, 0), fix(52.1, 5.0, 0)]
+    assert parse_mapping(suggest_mapping("run", [topic], {"/fix": fixes})).origin == (52.0, 5.0)
+    receivers = [{"frame_id": f"gps_{number}", **fix(48.0, number, 0)} for number in (2, 3)]
+    text = suggest_mapping("run", [Topic("/fixes", "a.Fixes", "json")], {"/fixes": [{"fixes": receivers}]})
+    mapping = parse_mapping(text)
+    assert (mapping.origin, mapping.fixed_frame) == ((48.0, 2.0), None)
+    assert (mapping.topics[0].position, mapping.topics[0].name) == (
+        ("latitude", "longitude"),
+        "fix{frame_id}",
+    )
 
 
 def test_names_that_several_topics_share_get_the_topic_as_prefix() -> None:
