@@ -360,9 +360,10 @@ def evaluate_logs(
         jobs: how many processes evaluate; a program that gives more than 1 needs the guard
             `if __name__ == "__main__":`, as for every process pool.
         dask: the address of a Dask scheduler, whose workers evaluate instead.
-        fail_on: "vacuous", "cut", "unknown", "left": results that fail as well.
-        allow: "vacuous", "dropped": results that pass although nothing tested them, and logs that lack
-            samples which their recorder dropped.
+        fail_on: "vacuous", "cut", "unknown", "left", "doubtful": results that fail as well.
+        allow: "vacuous", "dropped", "doubtful": results that pass although nothing tested them, logs that
+            lack samples which their recorder dropped, and results that rest on an assumption which the log
+            contradicts.
         constants, each, semantics, strict_names, reading: as for `replay_log`.
 
     Returns:

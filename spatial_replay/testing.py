@@ -28,16 +28,17 @@ def assert_satisfied(
         specifications: one or several, parsed or as files; None takes those that the log was written with.
         at_least: the least robustness that passes, whatever the verdict, in the units of the formula.
         tolerance: how much less passes, as an allowance for rounding.
-        allow: "vacuous" and "dropped": results that were tested by nothing, and logs that lack samples which
-            their recorder dropped.
+        allow: "vacuous", "dropped" and "doubtful": results that were tested by nothing, logs that lack
+            samples which their recorder dropped, and results that rest on an assumption which the log
+            contradicts.
         options: how to evaluate and read the log, as for `replay_log`.
 
     Returns:
         What `replay_log` returns, for further assertions.
 
     Raises:
-        AssertionError: a result is violated, unknown, less robust, or tested by nothing; its text is what
-            `explain` says.
+        AssertionError: a result is violated, unknown, less robust, doubtful, or tested by nothing; its text
+            is what `explain` says.
         UsageError, SpecificationError, LogError: it cannot be evaluated.
     """
     __tracebackhide__ = True
@@ -52,6 +53,7 @@ def assert_satisfied(
             tested=result.tested,
             untested=[each.message for each in result.untested],
             vacuous=result.vacuous,
+            doubtful=[doubt.text for doubt in result.doubts],
             dropped=replayed.dropped.text,
             faults=(),
         )

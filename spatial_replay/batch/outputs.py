@@ -33,7 +33,7 @@ from spatial_replay.batch.run_table import (
     verdict_word,
     worst_rows,
 )
-from spatial_replay.batch.suite import DAMAGED, DROPPED, UNTESTED, VACUOUS
+from spatial_replay.batch.suite import DAMAGED, DOUBTFUL, DROPPED, UNTESTED, VACUOUS
 from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import output_error, replacing
@@ -320,7 +320,8 @@ def _case(
 def _unmet(row: Values) -> str:
     """Return the expectation that a result did not meet, in words that results of one kind share."""
     failure = row["failure"]
-    kinds = {UNTESTED: "untested", WORSE_THAN: WORSE_THAN, EDITED_SINCE: EDITED_SINCE, VACUOUS: VACUOUS}
+    kinds = {UNTESTED: "untested"}
+    kinds |= {kind: kind for kind in (DOUBTFUL, WORSE_THAN, EDITED_SINCE, VACUOUS)}
     kinds |= {"cut": "cut", "left": "left", DROPPED: "dropped", DAMAGED: "damaged log"}
     for beginning, kind in kinds.items():
         if failure.startswith(beginning):
@@ -539,7 +540,7 @@ def _cell(row: Values | None) -> Html:
         return element(
             "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
         )
-    shown = verdict if number is None or verdict == "untested" else f"{number:.4g}"
+    shown = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
     value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
     why = f": {row['failure'].rstrip('.')}" if fails else ""
     tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"

@@ -92,6 +92,8 @@ class ResultRow:
         untested: sentences on the parts for which that is not "full".
         vacuous: sentences on the parts that decided nothing.
         left: sentences on the members of groups that left the log within reach of a threshold and came back.
+        doubts: assumptions that the verdict rests on, and that the log contradicts, by name.
+        doubtful: a sentence on each of them.
         dropped: what the recorder of the log dropped, in words; None for nothing.
         samples: how many were evaluated.
         start_ns: time of the first of them.
@@ -125,6 +127,8 @@ class ResultRow:
     untested: tuple[str, ...] = ()
     vacuous: tuple[str, ...] = ()
     left: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    doubtful: tuple[str, ...] = ()
     dropped: str | None = None
     samples: int = 0
     start_ns: int | None = None
@@ -285,6 +289,8 @@ def _row(about: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
         explanation=_some(result.sentences(first_ns)),
         untested=_some(counted_from((part.message for part in result.untested), first_ns)),
         vacuous=_some(counted_from((part.message for part in result.vacuous), first_ns)),
+        doubts=tuple(doubt.assumption for doubt in result.doubts),
+        doubtful=_some([doubt.text for doubt in result.doubts]),
     )
 
 

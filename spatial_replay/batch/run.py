@@ -562,7 +562,7 @@ def run_batch(
 
     Args:
         results: the folder of results or its address, made if need be.
-        fail_on: "vacuous", "cut", "unknown" and "left": what fails although the case allows it.
+        fail_on: what fails although the case allows it, see `FAILING_KINDS`.
         progress: shows how many logs have been hashed, and evaluated.
 
     Raises:
@@ -737,7 +737,8 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
     return pa.table({field.name: columns[field.name] for field in schema}, schema=schema)
 
 
-_JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "left", "dropped", "faults", "error"]
+_JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "left", "doubtful", "dropped"]
+_JUDGED += ["faults", "error"]
 
 
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:

@@ -13,7 +13,7 @@ from operator import itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
-from spatial_replay.batch.suite import UNTESTED
+from spatial_replay.batch.suite import DOUBTFUL, UNTESTED
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted, nearest_hint, requirement_text
 
@@ -25,8 +25,10 @@ By: TypeAlias = Literal["spec", "log"]
 Values: TypeAlias = dict[str, Any]
 """A row of a table: values by column."""
 
-VERDICTS: Final = ("satisfied", "violated", "unknown", "untested")
-"""Verdicts, and the one in their place of what was tested by nothing and fails for that."""
+VERDICTS: Final = ("satisfied", "violated", "unknown", "doubtful", "untested")
+"""Verdicts, and the words in their place for what fails as doubtful, or as tested by nothing."""
+_WORDS: Final = MappingProxyType({"doubtful": DOUBTFUL, "untested": UNTESTED})
+"""Beginnings of the failures that stand for a verdict, by the words in its place."""
 WORSE: Final = "worse_than_baseline"
 """A column of a table that was compared with a baseline: whether a result is worse than there, or gone."""
 EDITED: Final = "edited_since_baseline"
@@ -47,7 +49,7 @@ class Total:
 
     Attributes:
         group: what they have in common, by column.
-        satisfied, violated, unknown, untested: how many results; see `VERDICTS`.
+        satisfied, violated, unknown, doubtful, untested: how many results; see `VERDICTS`.
         errors: how many have an error in place of a verdict.
         failures: how many do not pass.
         least: the least robustness among them; None if none is determined.
@@ -61,6 +63,7 @@ class Total:
     satisfied: int
     violated: int
     unknown: int
+    doubtful: int
     untested: int
     errors: int
     failures: int
@@ -89,8 +92,9 @@ def requirement_of(row: Values) -> str:
 
 def verdict_word(row: Values) -> str:
     """Return the verdict of a row, see `VERDICTS`; "error" or "gone" in place of one."""
-    if (row["failure"] or "").startswith(UNTESTED):
-        return "untested"
+    for word, beginning in _WORDS.items():
+        if (row["failure"] or "").startswith(beginning):
+            return word
     return row["verdict"] or ("gone" if row["error"] is None else "error")
 
 
@@ -111,8 +115,8 @@ def summary_text(table: pa.Table) -> str:
         damaged += bool(damage_word(row))
     parts = [
         _expected(f"{total[name]:,} {name}", total[name], passed[name])
-        if name not in ("satisfied", "untested")
-        else f"{total[name]:,} {'satisfied' if name == 'satisfied' else UNTESTED}"
+        if name not in ("satisfied", *_WORDS)
+        else f"{total[name]:,} {_WORDS.get(name, name)}"
         + (f" ({bad:,} failed)" if name == "satisfied" and (bad := total[name] - passed[name]) else "")
         for name in VERDICTS
         if total[name]
@@ -137,8 +141,9 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
 
     verdict, number = table.column("verdict"), table.column("robustness")
     columns = {name: table.column(name) for name in _GROUPS[by]}
-    untested = pc.fill_null(pc.starts_with(table.column("failure"), UNTESTED), False)
-    verdict = pc.if_else(untested, "untested", verdict)
+    for word, beginning in _WORDS.items():
+        is_meant = pc.fill_null(pc.starts_with(table.column("failure"), beginning), False)
+        verdict = pc.if_else(is_meant, word, verdict)
     counted = {name: pc.equal(verdict, name) for name in VERDICTS}
     counted |= {
         "errors": pc.is_valid(table.column("error")),
@@ -172,15 +177,13 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
 
 
 def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
-    """Return the columns of counts of a table of totals; "untested" and "edited" only where some are."""
+    """Return the columns of counts of a table of totals; some only where any counts."""
     names = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
     if any(row.worse is not None for row in rows):
         names |= {"worse": "worse", "edited": "worse_edited"}
     counts = {head: [getattr(row, name) or 0 for row in rows] for head, name in names.items()}
     return {
-        head: numbers
-        for head, numbers in counts.items()
-        if head not in ("untested", "edited") or any(numbers)
+        head: numbers for head, numbers in counts.items() if head not in (*_WORDS, "edited") or any(numbers)
     }
 
 
@@ -519,12 +522,24 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
     return pa.concat_tables([table, pa.Table.from_pylist(missing, table.schema)])
 
 
+_LISTS: Final = (
+    "explanation",
+    "untested",
+    "vacuous",
+    "left",
+    "doubts",
+    "doubtful",
+    "faults",
+    "remarks",
+    "missing",
+)
+"""Columns of several texts."""
+
+
 def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     """Return the row of a result that only the baseline has, given its row there."""
     kept = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
-    nothing: dict[str, Any] = {
-        name: [] for name in ("explanation", "untested", "vacuous", "left", "faults", "remarks", "missing")
-    }
+    nothing: dict[str, Any] = {name: [] for name in _LISTS}
     return {
         **nothing,
         **{name: row.get(name) for name in kept},

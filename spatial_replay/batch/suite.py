@@ -96,6 +96,7 @@ DEFAULT_CONDITIONS: Final = Conditions()
 
 UNTESTED: Final = "tested by nothing"
 VACUOUS: Final = "vacuous"
+DOUBTFUL: Final = "doubtful"
 DROPPED: Final = "the recorder dropped"
 DAMAGED: Final = "the log is damaged"
 """Beginnings of failures that are no violations."""
@@ -110,7 +111,7 @@ class Expectation:
         at_least: the least robustness that passes, whatever the verdict, or None.
         tolerance: how much less passes, as an allowance for rounding.
         allow_unknown: whether an unknown verdict passes, too.
-        allow: "vacuous" and "dropped": what passes although it shows nothing.
+        allow: "vacuous", "dropped" and "doubtful": what passes although it shows nothing.
     """
 
     verdict: Verdict = Verdict.SATISFIED
@@ -131,7 +132,7 @@ class Expectation:
         """Return why a result with a verdict does not pass, in a few words; None if it does.
 
         Args:
-            fail_on: "vacuous", "cut", "unknown" and "left": what fails although the case allows it.
+            fail_on: what fails although the case allows it, see `FAILING_KINDS`.
         """
         failure = self._unexpected(outcome)
         is_unknown = outcome.verdict == Verdict.UNKNOWN
@@ -143,6 +144,8 @@ class Expectation:
             failure = f"cut: {outcome.untested[0]}"
         elif failure is None and "left" in fail_on and outcome.left:
             failure = f"left: {outcome.left[0]}"
+        elif failure is None and outcome.doubtful and "doubtful" not in self.allow - fail_on:
+            failure = f"{DOUBTFUL}: {outcome.doubtful[0]}"
         elif failure is None and "vacuous" not in self.allow and outcome.tested == "nothing":
             failure = f"{UNTESTED}: {outcome.untested[0]}"
         elif failure is None and "dropped" not in self.allow and outcome.dropped:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from spatial_replay.batch.suite import DAMAGED, DROPPED, UNTESTED, VACUOUS
+from spatial_replay.batch.suite import DAMAGED, DOUBTFUL, DROPPED, UNTESTED, VACUOUS
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.options import (
     ConditionArguments,
@@ -48,8 +48,7 @@ if TYPE_CHECKING:
 _COLOURS: Final = MappingProxyType(
     {
         **VERDICT_COLOURS,
-        "untested": "yellow",
-        "edited": "yellow",
+        **dict.fromkeys(("untested", "doubtful", "edited"), "yellow"),
         **dict.fromkeys(("error", "errors", "failed", "worse", "gone"), "red"),
     }
 )
@@ -151,6 +150,8 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
             codes.add(_KIND_CODES[kind])
         elif failure.startswith(VACUOUS) or (verdict == "unknown" and "unknown" in fail_on):
             codes.add(ExitCode.VIOLATED)
+        elif failure.startswith(DOUBTFUL):
+            codes.add(ExitCode.VIOLATED if "doubtful" in fail_on else ExitCode.UNKNOWN)
         elif verdict == "unknown" or failure.startswith((UNTESTED, DROPPED)):
             codes.add(ExitCode.UNKNOWN)
         else:
@@ -244,7 +245,7 @@ def batch(
     folder; another run evaluates only what is new. A log that cannot be read has a row with its error.
 
     One exit code covers all logs, with the meanings of replay. It is 0 if everything is as expected, 1 if
-    anything fails, 3 if logs are damaged or unfit, 4 if results are unknown or tested by nothing.
+    anything fails, 3 if logs are damaged or unfit, 4 if results are unknown, doubtful or tested by nothing.
 
     \b
     Examples:

@@ -132,7 +132,8 @@ def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = N
 
 def _numbers(result: SpecResult, first_ns: int) -> str:
     robustness, lower, upper = result.robustness, result.lower, result.upper
-    parts = ["tested by nothing"] if result.tested == "nothing" else []
+    parts = ["doubtful"] if result.doubts else []
+    parts += ["tested by nothing"] if result.tested == "nothing" else []
     parts.append(f"robustness {_number_text(robustness, result.unit)}")
     if not (lower == upper == robustness or math.isnan(lower)):
         parts.append(f"between {_number_text(lower, result.unit)} and {_number_text(upper, result.unit)}")

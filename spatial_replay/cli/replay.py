@@ -6,7 +6,7 @@ import os
 import re
 import select
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -367,8 +367,9 @@ def replay(
     2026-01-31T12:00:00Z.
 
     Exits with 0 if all results are satisfied, 1 if any is violated, 3 if the log is damaged. The code is 4 if
-    a result is unknown or tested by nothing, or if the recorder dropped samples. With --watch, the key w
-    writes the values of --const into the files.
+    a result is unknown, doubtful or tested by nothing, or if the recorder dropped samples. A doubtful result
+    rests on an assumption that the log contradicts. With --watch, the key w writes the values of --const into
+    the files.
 
     \b
     Examples:
@@ -447,10 +448,19 @@ def _failures(replayed: Replayed, kinds: frozenset[str], allow: frozenset[str]) 
         yield "violated"
     if "left" in kinds and replayed.left:
         yield "violated"
+    if "doubtful" in kinds and any(result.doubts for result in results):
+        yield "violated"
+    if "doubtful" not in allow:
+        yield from _doubtful(results)
     if "vacuous" not in allow and (replayed.vacuous or any(result.tested == "nothing" for result in results)):
         yield "unknown"
     if "dropped" not in allow and replayed.dropped.count:
         yield "unknown"
+
+
+def _doubtful(results: Iterable[SpecResult]) -> Iterator[str]:
+    """Yield "unknown" for each result that rests on an assumption which the log contradicts."""
+    return ("unknown" for result in results if result.doubts)
 
 
 def _width_ns(text: str) -> int:
@@ -471,8 +481,8 @@ def report(request: EvaluationArguments, output: Path | None, semantics: Semanti
     It shows verdicts and explanations, the specification's tree, curves, the scene from above, the automaton,
     events and planner decisions, with one time cursor for all. It needs no network and no other file.
 
-    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
-    3 if the log is damaged.
+    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown
+    or doubtful, 3 if the log is damaged.
 
     \b
     Examples:
@@ -497,7 +507,8 @@ def report(request: EvaluationArguments, output: Path | None, semantics: Semanti
         )
     warn_of_input(replayed)
     print_verdicts(replayed, output)
-    return exit_code_from_verdicts((result.verdict for result in replayed.results), bool(replayed.faults))
+    verdicts = [str(result.verdict) for result in replayed.results]
+    return exit_code_from_verdicts([*verdicts, *_doubtful(replayed.results)], bool(replayed.faults))
 
 
 @click.command()
@@ -639,6 +650,7 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
         for number, lines in enumerate(texts):
             show(*([""] if number else []), *map(_colour_verdicts, lines))
     verdicts = [*(explanation.verdict for explanation in results), *verdicts_of_others]
+    verdicts += _doubtful((*replayed.results, *others))
     return exit_code_from_verdicts(verdicts, bool(replayed.faults))
 
 

@@ -14,9 +14,9 @@ from spatial_replay.text import nearest_hint
 Semantics: TypeAlias = Literal["ltlf", "paper"]
 """Robustness over finite traces, or the paper's Def. 16 to the letter."""
 
-FAILING_KINDS: Final = ("vacuous", "cut", "unknown", "left")
+FAILING_KINDS: Final = ("vacuous", "cut", "unknown", "left", "doubtful")
 """Kinds of results that fail where asked (`fail_on`)."""
-ALLOWED_KINDS: Final = ("vacuous", "dropped")
+ALLOWED_KINDS: Final = ("vacuous", "dropped", "doubtful")
 """Kinds of results that pass where asked (`allow`)."""
 
 

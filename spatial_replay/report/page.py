@@ -192,10 +192,11 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
 
 def _mark(result: SpecResult) -> str:
     """Return what a verdict lacks; "" for nothing."""
+    marks = ["doubtful"] if result.doubts else []
     if result.tested == "nothing":
-        return "tested by nothing"
-    marks = ["a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing"]
-    marks = marks if result.vacuous else []
+        return ", ".join([*marks, "tested by nothing"])
+    if result.vacuous:
+        marks.append("a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing")
     marks += ["the end of the log cut a window"] if result.tested == "cut" else []
     return ", ".join(marks)
 

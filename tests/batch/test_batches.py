@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +27,11 @@ from pyarrow import parquet
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
 from logs.servers import s3_server
+from spatial_replay.logs.messages import MemorySource
+from spatial_replay.recording.recorder import record_source
+from spatial_replay.testing import assert_satisfied
+from spatial_replay.text import Sentence
+from spatial_replay.trace.doubts import Doubt
 from users import plain_user
 
 DISTANCES = [0.5, 0.4, 0.2, 0.1]
@@ -1028,3 +1034,70 @@ def _names(server: str, folder: str = "nightly") -> list[str]:
     with urlopen(f"{server}/fleet?list-type=2&prefix={folder}/") as answer:
         keys = ElementTree.fromstring(answer.read()).iterfind(".//{*}Key")
     return sorted(str(key.text).removeprefix(f"{folder}/") for key in keys)
+
+
+def _doubtful_log(path: Path, *, is_accepted: bool = False) -> Path:
+    """Record a run whose person may have been read wrongly."""
+    doubt = Doubt(
+        "jumps", "/tracks", Sentence("/tracks: person jumps 30 m in 10 ms"), frozenset({"person"}),
+        is_accepted=is_accepted,
+    )  # fmt: skip
+    person = sr.TrackedObject(sr.Footprint.box(2, 0, 3, 1), class_name="person")
+    cart = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1), class_name="cart")
+    samples = (sr.Sample(number * 10**8, {"cart": cart, "person": person}) for number in range(5))
+    record_source(MemorySource(replace(sr.Trace.from_samples(samples), doubts=(doubt,))), path)
+    return path
+
+
+def test_a_verdict_that_rests_on_a_doubt_passes_nowhere_unless_it_is_allowed(fleet: Path) -> None:
+    _doubtful_log(Path("walk.mcap"))
+    Path("far.spatial").write_text("spec far = G (cart dist person >= 3)")
+    Path("alone.spatial").write_text(
+        'group others = class "cart"\nspec alone = G (exists c in others: c dist c <= 0)'
+    )
+    said = "/tracks: person jumps 30 m in 10 ms"
+    spec = ("walk.mcap", "--spec", "gate.spatial")
+    for run in ("replay", "batch"):
+        done = command(run, *spec)
+        warning = f"doubtful: {said}; if the log is right, `accept: [jumps]`"
+        assert (done.code, warning in done.err, "doubtful" in done.out) == (4, True, True)
+        assert command(run, *spec, "--allow", "doubtful").code == 0
+        assert command(run, *spec, "--fail-on", "doubtful").code == 1
+        assert command(run, *spec, "--allow", "doubtful", "--fail-on", "doubtful").code == 1
+        # a violation stays one, and other objects are not in doubt
+        assert command(run, "walk.mcap", "--spec", "far.spatial").code == 1
+        assert command(run, "walk.mcap", "--spec", "alone.spatial").code == 0
+        accepted = command(run, str(_doubtful_log(Path("accepted.mcap"), is_accepted=True)), *spec[1:])
+        assert (accepted.code, f"accepted: {said}" in accepted.err) == (0, True)
+    assert (command("report", *spec, "-o", "walk.html").code, command("explain", *spec).code) == (4, 4)
+    assert f"The verdict is doubtful: {said}." in Path("walk.html").read_text()
+    assert said in command("info", "walk.mcap").err
+
+
+def test_every_output_of_a_batch_says_which_results_are_doubtful(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    _doubtful_log(Path("walk.mcap"))
+    outputs = ("--junit", "junit.xml", "--html", "pages", "--json", "rows.jsonl")
+    done = batch("walk.mcap", "--spec", "gate.spatial", *outputs)
+    assert "2 results: 2 doubtful" in done.out
+    failure = "doubtful: /tracks: person jumps 30 m in 10 ms"
+    assert f"walk.mcap: {failure}. " in next(line for line in done.err.splitlines() if "::error" in line)
+    tests = list(ElementTree.parse("junit.xml").getroot().iter("failure"))
+    assert {(own.get("type"), own.get("message")) for own in tests} == {("doubtful", failure)}
+    assert "The verdict is doubtful: /tracks: person jumps" in (tests[0].text or "")
+    assert "number is-doubtful fails" in Path("pages/index.html").read_text()
+    assert f"| doubtful | {failure} |" in Path("summary.md").read_text()
+    rows = [json.loads(line) for line in Path("rows.jsonl").read_text().splitlines()]
+    assert [row["doubts"] for row in rows] == [["jumps"], ["jumps"]]
+    frame = sr.evaluate_logs("walk.mcap", "gate.spatial", output="results").table.to_pandas()
+    assert [list(names) for names in frame["doubts"]] == [["jumps"], ["jumps"]]
+    Path("suite.yaml").write_text(
+        "specs: gate.spatial\nallow: doubtful\ncases: [{name: all, logs: walk.mcap}]"
+    )
+    assert batch("suite.yaml").code == 0
+    with pytest.raises(AssertionError, match=failure):
+        assert_satisfied("walk.mcap", "gate.spatial")
+    assert_satisfied("walk.mcap", "gate.spatial", allow=["doubtful"])
