@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from collections.abc import Mapping as Table
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
@@ -30,6 +32,7 @@ from spatial_replay.mapping.field_paths import (
     Style,
     Zero,
     below,
+    enum_names,
     field_names,
     get_field,
     getter,
@@ -210,7 +213,7 @@ def class_codes(
         value = _first_value(binding.class_gets, each)
         code = known.get(value)
         if code is None:
-            code = known[value] = codes[_class_name(layout, value)]
+            code = known[value] = codes[_class_name(layout, value, binding.class_names)]
         result.append(code)
     return result
 
@@ -228,13 +231,15 @@ def _first_value(gets: Sequence[Get], thing: object) -> Any:
     return None
 
 
-def _class_name(layout: MessageLayout, value: object) -> str | None:
+def _class_name(layout: MessageLayout, value: object, names: Table[object, str]) -> str | None:
     if value is None or value == "":
         return None
     # JSON can spell lone surrogates, which UTF-8 cannot write
-    text = str(value).encode("utf-8", "replace").decode()
-    if text in layout.class_table:
-        return layout.class_table[text]
+    number = str(value).encode("utf-8", "replace").decode()
+    text = names.get(value, number)
+    for key in (number, text):
+        if key in layout.class_table:
+            return layout.class_table[key]
     return layout.class_other if layout.class_has_other else text
 
 
@@ -278,7 +283,7 @@ def _checked(name: str) -> str:
 
 _Option = TypeVar("_Option")
 _Resolved = TypeVar("_Resolved")
-_Alternative = TypeVar("_Alternative", str, tuple[str, ...])
+_Alternative = TypeVar("_Alternative", str, tuple[str, ...], str | tuple[str, ...])
 
 _SECOND_NS = 10**9
 _TIME_FIELDS = (
@@ -305,6 +310,7 @@ class Binding:
         sizes: columns of length, width and maybe height, if the message has them.
         shape_sizes, height: from the mapping, each a number (float) or a column (int).
         uncertainty: a number, a column, or None.
+        class_names: the names of the numbers of a protobuf enum.
         frame: reads the frame's name, and whether from the message instead of the object; None for the fixed
             frame.
     """
@@ -322,6 +328,7 @@ class Binding:
     polygon: Get | None
     covariance: Get | None
     class_gets: tuple[Get, ...]
+    class_names: Table[object, str]
     frame: tuple[Get, bool] | None
     lifetime: TimeGetter | None
 
@@ -500,9 +507,19 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         polygon=polygon,
         covariance=covariance,
         class_gets=tuple(getter(path, example) for path in class_paths),
+        class_names=_enum_of(class_paths, example),
         frame=_frame(layout, example, message, needs_frame),
         lifetime=lifetime,
     )
+
+
+def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
+    """Return the names of the numbers of the first path that leads to a protobuf enum."""
+    for path in paths:
+        with suppress(FieldError):
+            if names := enum_names(path, example):
+                return names
+    return {}
 
 
 def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout:
@@ -541,12 +558,28 @@ def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     return position
 
 
+class OrderError(FieldError):
+    """Four numbers of a quaternion whose order the mapping does not say."""
+
+
 def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
-    def columns_of(path: str) -> tuple[int, ...]:
-        quaternion = columns.point(FieldPath.of(path), "xyzw")
+    def columns_of(paths: str | tuple[str, ...]) -> tuple[int, ...]:
+        if isinstance(paths, tuple):
+            return columns.add_all(paths)
+        value = walk(FieldPath.of(paths), columns.example)
+        quaternion = columns.point(FieldPath.of(paths), "xyzw")
         if len(quaternion) != 4:
-            raise FieldError(f"{path}: it is not a quaternion; give the path of one with x, y, z, w")
-        return quaternion
+            raise FieldError(f"{paths}: it is not a quaternion; give the path of one with x, y, z, w")
+        if not is_list(value):
+            if layout.order:
+                raise OrderError(f"{paths}: its fields are named x, y, z and w; leave `order` out")
+            return quaternion
+        if not layout.order:
+            raise OrderError(
+                f"{paths}: the four numbers have no names; `order: wxyz` says that w comes first,"
+                " `order: xyzw` that it comes last"
+            )
+        return tuple(quaternion[layout.order.index(name)] for name in "xyzw")
 
     return _first(layout.orientation, columns_of) or ()
 
@@ -560,6 +593,8 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolv
     for option in alternatives:
         try:
             return resolve(option)
+        except OrderError:
+            raise
         except FieldError:
             if len(alternatives) == 1:
                 raise

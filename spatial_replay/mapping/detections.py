@@ -376,6 +376,23 @@ class Detections:
     deleted: list[tuple[int, int]] = field(default_factory=list)
     skipped: int = 0
 
+    def scaled(self, factor: float) -> Detections:
+        """Return the same objects with lengths times a factor."""
+        solids, poses = self.solids, self.poses
+        return replace(
+            self,
+            poses=replace(poses, position=poses.position * factor),
+            solids=replace(
+                solids,
+                position=solids.position * factor,
+                size=solids.size * factor,
+                points=solids.points * factor,
+            ),
+            height=None if self.height is None else self.height * factor,
+            uncertainty=self.uncertainty * factor,
+            covariance=None if self.covariance is None else self.covariance * factor**2,
+        )
+
     def repeated(self, index: int, count: int) -> Detections:
         """Return one of the objects `count` times, each in a message of its own, without frame and stamp."""
         same = np.full(count, index, np.int64)
@@ -498,7 +515,7 @@ def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
         rotation, yaw = matrices_from_quaternions(numbers[:, list(binding.orientation)])
         return Poses(position, rotation, yaw)
     if binding.yaw is not None:
-        yaw = numbers[:, binding.yaw] * layout.angle_scale
+        yaw = layout.angle_zero + numbers[:, binding.yaw] * layout.angle_scale
         return Poses(position, matrices_from_yaw(yaw), yaw)
     return Poses(position, no_rotations(count), np.full(count, np.nan))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
 from dataclasses import field as value_of
@@ -109,6 +110,22 @@ class Stamp:
 
 
 @dataclass(frozen=True, slots=True)
+class Angle:
+    """The field of an angle; `zero + scale` times it is the yaw in radians.
+
+    Attributes:
+        scale: below 0 for angles that count clockwise.
+        zero: the yaw at 0, in radians.
+        is_plain: whether the mapping says nothing of zero and direction.
+    """
+
+    field: str
+    scale: float = 1.0
+    zero: float = 0.0
+    is_plain: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class TopicMapping:
     """How one topic is read; None leaves the default of the message type.
 
@@ -116,12 +133,15 @@ class TopicMapping:
         objects: path of the list of objects; "" for a message that is one object.
         complete: whether a message lists all objects that exist, so that those it leaves out have left.
         position: path of a point, or paths of x, y and maybe z.
-        orientation: path of a quaternion.
-        yaw: path of an angle; times `yaw_scale` it is in radians.
+        orientation: path of a quaternion, or the paths of its x, y, z and w.
+        order: of the four numbers of a quaternion in a list.
+        yaw: path of an angle.
         bounds: path of two opposite corners of a box along the axes.
         only, without: patterns of names to keep, and to leave out.
         max_age_ns: how long an observation stays valid.
         clock: the clock of this topic, if not that of the mapping.
+        scale: units of the log per unit of this topic's positions, sizes, heights and uncertainties.
+        invalid: numbers that say that a value is not available.
         has_zeros_left_out: whether fields that JSON messages lack are 0.
         reads_objects: false for topics that are read for their signals only.
         optional: whether a log may lack the topic.
@@ -135,9 +155,9 @@ class TopicMapping:
     name: str | None = None
     class_name: str | ClassMapping | None = None
     position: str | tuple[str, ...] | None = None
-    orientation: str | None = None
-    yaw: str | None = None
-    yaw_scale: float = 1.0
+    orientation: str | tuple[str, ...] | None = None
+    order: Literal["xyzw", "wxyz"] | None = None
+    yaw: Angle | None = None
     polygon: str | None = None
     bounds: str | None = None
     shape: ShapeMapping | None = None
@@ -151,6 +171,8 @@ class TopicMapping:
     without: tuple[str, ...] = ()
     max_age_ns: int | None = None
     clock: Clock | None = None
+    scale: float = 1.0
+    invalid: tuple[float, ...] = ()
     has_zeros_left_out: bool = False
     optional: bool = False
 
@@ -308,6 +330,7 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         for one, other in (*outlines, ("orientation", "yaw")):
             if one in entry and other in entry:
                 faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
+        faults += [(("topics", topic, *place), text) for place, text in _contradictions_of_turns(entry)]
     tables = [((), value, "max_age"), ((), value, "max_gap"), (("sample",), value.get("sample"), "every")]
     tables += [(("topics", topic), entry, "max_age") for topic, entry in topics.items()]
     for place, table, key in tables:
@@ -315,6 +338,17 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         if isinstance(text, str) and _NO_TIME.fullmatch(text):
             faults.append(((*place, key), f"{text!r} is not a time; give a duration above 0"))
     return faults
+
+
+def _contradictions_of_turns(entry: Table[str, Any]) -> Iterator[tuple[Place, str]]:
+    orientation, yaw = entry.get("orientation"), entry.get("yaw")
+    if "order" in entry and isinstance(orientation, list):
+        yield ("order",), "the four paths of `orientation` give the order, x, y, z and w; leave `order` out"
+    if "order" in entry and yaw is not None:
+        yield ("order",), "it is the order of a quaternion, and there is `yaw`; give one of the two"
+    if isinstance(yaw, dict) and "field" in yaw and ("zero" in yaw) != ("clockwise" in yaw):
+        absent, example = ("zero", "north") if "clockwise" in yaw else ("clockwise", "true")
+        yield ("yaw",), f"`zero` and `clockwise` belong together; add `{absent}: {example}` or the opposite"
 
 
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
@@ -328,7 +362,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
     if "name" in entry:
         NameTemplate.of(entry["name"])
     frame = entry.get("frame")
-    yaw, position, height = entry.get("yaw"), entry.get("position"), entry.get("height")
+    position, orientation, height = entry.get("position"), entry.get("orientation"), entry.get("height")
     return TopicMapping(
         topic=topic,
         reads_objects="signals" not in entry or not entry.keys() <= _SIGNAL_KEYS,
@@ -338,9 +372,9 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         name=entry.get("name"),
         class_name=_class(entry.get("class")),
         position=tuple(position) if isinstance(position, list) else position,
-        orientation=entry.get("orientation"),
-        yaw=yaw["field"] if isinstance(yaw, dict) else yaw,
-        yaw_scale=pi / 180 if isinstance(yaw, dict) and yaw.get("unit") == "deg" else 1.0,
+        orientation=tuple(orientation) if isinstance(orientation, list) else orientation,
+        order=entry.get("order"),
+        yaw=_angle(entry.get("yaw")),
         polygon=entry.get("polygon"),
         bounds=entry.get("bounds"),
         shape=_shape(entry.get("shape"), shapes),
@@ -354,8 +388,22 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         without=tuple(entry.get("except", ())),
         max_age_ns=age_ns(entry["max_age"]) if "max_age" in entry else None,
         clock=entry.get("clock"),
+        scale=float(entry.get("scale", 1.0)),
+        invalid=tuple(map(float, entry.get("invalid", ()))),
         has_zeros_left_out="missing" in entry,
         optional=entry.get("optional", False),
+    )
+
+
+def _angle(value: Any) -> Angle | None:
+    if not isinstance(value, dict):
+        return None if value is None else Angle(value)
+    scale = pi / 180 if value.get("unit") == "deg" else 1.0
+    return Angle(
+        value["field"],
+        -scale if value.get("clockwise") else scale,
+        pi / 2 if value.get("zero") == "north" else 0.0,
+        is_plain="zero" not in value and "clockwise" not in value,
     )
 
 

@@ -38,13 +38,18 @@ class MessageLayout:
         stays: whether an object stays valid until it is deleted.
         name: a name template.
         position: alternatives, each the path of a point or the paths of its coordinates.
-        angle_scale: radians in one unit of `yaw`.
+        orientation: alternatives, each the path of a quaternion or the paths of its x, y, z and w.
+        order: of the four numbers of a quaternion in a list; "" if that is not said.
+        angle_scale: radians in one unit of `yaw`, below 0 if it counts clockwise.
+        angle_zero: the yaw in radians where that field is 0.
         is_bounds: whether `polygon` leads to two opposite corners of a box along the axes.
         sizes: alternatives, each the paths of length, width and maybe height of a box.
         frame, stamp: in the object, or with `$.` in the message.
         solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
         origin: where positions that are latitudes and longitudes are counted from; None for metres.
+        scale: units of the log per unit of positions, sizes, heights and uncertainties.
+        invalid: numbers that say that a value is not available.
     """
 
     objects: str = ""
@@ -52,9 +57,11 @@ class MessageLayout:
     stays: bool = False
     name: str = "{topic}"
     position: tuple[Alternatives, ...] = ()
-    orientation: Alternatives = ()
+    orientation: tuple[str | Alternatives, ...] = ()
+    order: Literal["", "xyzw", "wxyz"] = ""
     yaw: Alternatives = ()
     angle_scale: float = 1.0
+    angle_zero: float = 0.0
     polygon: Alternatives = ()
     is_bounds: bool = False
     sizes: tuple[Alternatives, ...] = ()
@@ -73,6 +80,8 @@ class MessageLayout:
     uncertainty: Uncertainty | None = None
     is_generic: bool = False
     origin: tuple[float, float] | None = None
+    scale: float = 1.0
+    invalid: tuple[float, ...] = ()
 
 
 _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
@@ -256,6 +265,7 @@ def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
         changes["stamp"] = (mapping.stamp,)
     if mapping.uncertainty is not None:
         changes["uncertainty"] = mapping.uncertainty
+    changes |= {"scale": mapping.scale, "invalid": mapping.invalid}
     return replace(layout, **changes)  # type: ignore[arg-type]
 
 
@@ -269,7 +279,10 @@ def _pose_changes(mapping: TopicMapping) -> dict[str, object]:
     if mapping.orientation is not None:
         changes |= {"orientation": (mapping.orientation,), "yaw": ()}
     if mapping.yaw is not None:
-        changes |= {"yaw": (mapping.yaw,), "orientation": (), "angle_scale": mapping.yaw_scale}
+        changes |= {"yaw": (mapping.yaw.field,), "orientation": ()}
+        changes |= {"angle_scale": mapping.yaw.scale, "angle_zero": mapping.yaw.zero}
+    if mapping.order is not None:
+        changes["order"] = mapping.order
     return changes
 
 

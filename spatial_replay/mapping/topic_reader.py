@@ -204,6 +204,7 @@ class ReadingPlan:
             remarks=(
                 *_slow_sampling(sampled, [known[topic] for topic in mapped if topic in known], known),
                 *doubts_of(topics, has_frames=needs_frames, has_stamps=mapping.clock == "header"),
+                *_headings_from_east(planned),
             ),
         )
 
@@ -314,6 +315,19 @@ def _slow_sampling(
         f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
         f" `sample: {{topic: {most.name}}}` takes one at each of these",
     )
+
+
+def _headings_from_east(planned: Sequence[PlannedTopic]) -> Iterator[str]:
+    """Yield remarks on headings beside fixes: most of these are those of a compass."""
+    for topic in planned:
+        yaw = None if topic.mapping is None else topic.mapping.yaw
+        if yaw is not None and yaw.is_plain and topic.layout is not None and topic.layout.origin is not None:
+            unit = "deg" if yaw.scale != 1.0 else "rad"
+            compass = f"{{field: {yaw.field}, unit: {unit}, zero: north, clockwise: true}}"
+            yield (
+                f"{topic.name}: {yaw.field} counts from the east, counter-clockwise; a heading from the"
+                f" north, clockwise, is `yaw: {compass}`"
+            )
 
 
 def doubts_of(
@@ -490,7 +504,8 @@ class Extractor:
 
     def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:
         """Join the chunks of a batch; see `detections_from_chunks`."""
-        return detections_from_chunks(self.layout, self._binding, chunks, good)
+        detections = detections_from_chunks(self.layout, self._binding, chunks, good)
+        return detections if self.layout.scale == 1.0 else detections.scaled(self.layout.scale)
 
     def _fill(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
@@ -512,11 +527,13 @@ class Extractor:
         if binding.numbers is not None:
             rows = map(binding.numbers, values)
             chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+            if self.layout.invalid:
+                chunk.numbers[np.isin(chunk.numbers, self.layout.invalid)] = nan
             if binding.orientation:
                 is_turned = chunk.numbers[:, list(binding.orientation)].any(axis=1)
                 self.turned += len(values)
                 self.unturned += len(values) - int(is_turned.sum())
-            elif binding.yaw is not None and self.layout.angle_scale == 1.0:
+            elif binding.yaw is not None and abs(self.layout.angle_scale) == 1.0:
                 turns = np.abs(chunk.numbers[:, binding.yaw])
                 self.widest_turn = float(np.fmax.reduce(turns, initial=self.widest_turn))
         chunk.covariance = covariances(self.layout, binding, values)
@@ -905,8 +922,12 @@ class TopicReader:
         except (TypeError, OverflowError):
             raise FieldError(f"{signal.field}: its value is neither a number nor a text") from None
 
+        invalid = () if self.planned.mapping is None else self.planned.mapping.invalid
+
         def number_of(message: object) -> float:
             value = get(message)
+            if invalid and value in invalid:
+                return nan
             if not (numbers and isinstance(value, str)):
                 return _number(value)
             if value not in numbers:

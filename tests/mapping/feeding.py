@@ -198,4 +198,4 @@ def make(mapping: str, feed: Feed, *, batch: int = 1000, late_ns: int = SECOND, 
     traces = [assembler.add(raw[begin : begin + batch]) for begin in range(0, len(raw), batch)]
     traces.append(assembler.finish())
     trace = Trace.concatenate(traces)
-    return Made(trace, assembler.take_faults(), assembler.take_remarks())
+    return Made(trace, assembler.take_faults(), (*plan.remarks, *assembler.take_remarks()))

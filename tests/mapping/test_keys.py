@@ -127,3 +127,84 @@ def test_a_deletion_leaves_entities_that_are_later(name: str) -> None:
     # a deletion without a timestamp deletes what there is
     unset = [scene("crate", second=4), scene(deletes=(name,), deleted_second=0)]
     assert read("", *unset, name="foxglove.SceneUpdate").states("crate") == "+-"
+
+
+QUARTER = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
+"""The quaternion x, y, z, w of a quarter turn."""
+
+
+@pytest.mark.parametrize(
+    ("keys", "fields"),
+    [
+        ("orientation: q, order: xyzw", {"q": list(QUARTER)}),
+        ("orientation: q, order: wxyz", {"q": [QUARTER[3], *QUARTER[:3]]}),
+        ("order: wxyz", {"orientation": [QUARTER[3], *QUARTER[:3]]}),
+        ("orientation: [qx, qy, qz, qw]", dict(zip(("qx", "qy", "qz", "qw"), QUARTER, strict=True))),
+        ("yaw: {field: a, unit: deg, zero: north, clockwise: true}", {"a": 360.0}),
+        ("yaw: {field: a, unit: deg, zero: east, clockwise: true}", {"a": 270.0}),
+        ("yaw: {field: a, unit: deg, zero: north, clockwise: false}", {"a": 0.0}),
+    ],
+)
+def test_turns_are_read_from_any_zero_in_any_order(keys: str, fields: dict[str, Any]) -> None:
+    made = read(f"{keys}, shape: {{box: [4, 2]}}", {"x": 0.0, "y": 0.0, **fields})
+    assert sorted(made.footprint_row(0, "t").round(9).tolist()) == [[-1, -2], [-1, 2], [1, -2], [1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("keys", "fault"),
+    [
+        ("order: wxyz, orientation: [a, b, c, d]", "test.yaml:3: .*order: the four paths"),
+        ("order: wxyz, yaw: a", "test.yaml:3: .*order: .* there is `yaw`"),
+        ("yaw: {field: a, zero: north}", "test.yaml:3: .*yaw: .*add `clockwise: true`"),
+        ("yaw: {zero: north}", "test.yaml:3: .*yaw: the key 'field' is missing"),
+        ("orientation: q", "q: the four numbers have no names; `order: wxyz`"),
+        ("", "orientation: the four numbers have no names"),
+        ("orientation: named, order: wxyz", "named: its fields are named"),
+    ],
+)
+def test_turns_that_contradict_themselves_are_refused(keys: str, fault: str) -> None:
+    numbers = {"q": list(QUARTER), "orientation": list(QUARTER)}
+    content = {"x": 0.0, "y": 0.0, "named": dict(zip("xyzw", QUARTER, strict=True)), **numbers}
+    with pytest.raises(UsageError, match=fault):
+        read(keys, content)
+
+
+def test_a_heading_beside_fixes_is_remarked_unless_its_zero_is_given() -> None:
+    content = {"latitude": 52.0, "longitude": 5.0, "heading": 90.0}
+    keys = "position: [latitude, longitude], shape: {box: [4, 2]}, yaw: {field: heading, unit: deg"
+    (remark,) = read(f"{keys}}}", content, mapping="origin: [52, 5]").remarks
+    assert "`yaw: {field: heading, unit: deg, zero: north, clockwise: true}`" in remark
+    made = read(f"{keys}, zero: north, clockwise: true}}", content, mapping="origin: [52, 5]")
+    assert made.remarks == ()
+    assert sorted(made.footprint_row(0, "t").round(6).tolist()) == [[-2, -1], [-2, 1], [2, -1], [2, 1]]
+
+
+def test_numbers_that_stand_for_nothing_are_unknown() -> None:
+    contents = [
+        {"x": 0.0, "y": 0.0, "theta": theta, "speed": speed} for theta, speed in ((1.0, 2), (511, 4095))
+    ]
+    made = read("invalid: [511, 4095], shape: {box: [2, 1]}, signals: {speed: speed}", *contents)
+    assert made.states("t") == "+?"
+    assert made.trace.signals["speed"].tolist()[0] == 2.0
+    assert made.trace.signals["speed"][1] != made.trace.signals["speed"][1]
+
+
+def test_a_topic_has_a_scale_of_its_own() -> None:
+    contents = [{"x": 1000.0, "y": 2000.0, "length": 400.0}]
+    keys = "shape: {box: [length, 200]}, height: [0, 500], uncertainty: 10, scale: 0.001"
+    made = read(keys, *contents, mapping="scale: 100")
+    (sample,) = made.trace
+    thing = sample.objects["t"]
+    assert sorted(made.footprint_row(0, "t").tolist()) == [[80, 190], [80, 210], [120, 190], [120, 210]]
+    assert (thing.height, thing.uncertainty) == ((0.0, 50.0), 1.0)
+
+
+def test_an_enum_of_protobuf_is_a_class_by_its_name_or_number() -> None:
+    update = scene(deletes=("crate", "*"))
+    keys = "objects: 'deletions[*]', name: 'd{index}', position: [timestamp.nanos, timestamp.nanos], class: "
+    for names, classes in (
+        ("{field: type}", ["MATCHING_ID", "ALL"]),
+        ("{field: type, names: {ALL: all, '0': one}}", ["one", "all"]),
+    ):
+        (sample,) = read(keys + names, update).trace
+        assert [sample.objects[name].class_name for name in ("d0", "d1")] == classes
