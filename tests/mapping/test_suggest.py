@@ -15,6 +15,7 @@ from spatial_replay.bags.decoders import Topic
 from spatial_replay.cli import run
 from spatial_replay.mapping.mapping_file import (
     FOREVER_NS,
+    Angle,
     LogMapping,
     ShapeMapping,
     TopicMapping,
@@ -59,7 +60,7 @@ def test_topics_of_others_with_our_names_are_suggested() -> None:
 def test_bare_coordinates_are_a_position() -> None:
     _, mapping = suggested(pose={"x": 1.0, "y": 2.0, "theta": 0.0, "velocity": POINT})
     (topic,) = mapping.topics
-    assert (topic.position, topic.yaw, topic.orientation) == (("x", "y"), "theta", None)
+    assert (topic.position, topic.yaw, topic.orientation) == (("x", "y"), Angle("theta"), None)
 
 
 def test_a_nested_list_of_objects_is_suggested() -> None:
@@ -385,7 +386,7 @@ def test_plans_are_no_objects() -> None:
     # the robot beside its plan
     state = {"nodeStates": [{"nodePosition": POINT}], "agvPosition": {"x": 1.0, "y": 2.0, "theta": 0.5}}
     _, topic = suggested_for([{**state, "lastNodePosition": POINT}])
-    assert (topic.objects, topic.position, topic.yaw) == (None, "agvPosition", "agvPosition.theta")
+    assert (topic.objects, topic.position, topic.yaw) == (None, "agvPosition", Angle("agvPosition.theta"))
 
 
 def test_the_origin_is_the_first_fix_that_is_one() -> None:
