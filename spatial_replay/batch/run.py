@@ -744,6 +744,6 @@ _JUDGED += ["faults", "error"]
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:
     """Return why a row does not pass, in a few words; None if it does."""
     if row["verdict"] is None:
-        return row["error"]
+        return cast("str | None", row["error"])
     lower = nan if row["lower"] is None else row["lower"]
     return expectation.failure(cast(ResultRow, SimpleNamespace(**{**row, "lower": lower})), fail_on)

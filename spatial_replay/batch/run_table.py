@@ -37,7 +37,7 @@ _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
     {"spec": ("case", "file", "spec"), "log": ("case", "log")}
 )
 RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
-    {"violated": 0, None: 1, "unknown": 2, "satisfied": 3}
+    {"violated": 0, None: 1, "unknown": 2, "untested": 2, "satisfied": 3}
 )
 """Verdicts, the worst first; None is an error, or gone."""
 _LONGEST_CONDITION: Final = 1_000
@@ -324,7 +324,7 @@ def _no_condition(text: str) -> str:
 
 Key: TypeAlias = tuple[str, str, str, str, str | None]
 """Case, log, specification file, spec and object of a result."""
-Change: TypeAlias = Literal["worse", "verdict", "gone", "better"]
+Change: TypeAlias = Literal["worse", "verdict", "gone", "better", "more", "new"]
 
 WORSE_THAN: Final = "worse than the baseline"
 EDITED_SINCE: Final = "edited since the baseline"
@@ -335,7 +335,7 @@ _NUMBER: Final = r"((?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?)"
 _UNIT: Final = r"([^\W\d]\S{0,20})?"
 _TOLERANCE: Final = re.compile(rf"{_NUMBER} ?%(?:, *at least {_NUMBER} ?{_UNIT})?|{_NUMBER} ?{_UNIT}")
 _KEY: Final = ("case", "log", "file", "spec", "object")
-_ORDER: Final = {"satisfied": 0, "unknown": 1, "violated": 2, None: 3}
+_ORDER: Final = {"satisfied": 0, "untested": 1, "unknown": 1, "violated": 2, None: 3}
 """Verdicts from good to bad; None is an error."""
 
 
@@ -406,7 +406,8 @@ class Difference:
     """One result that differs from the baseline.
 
     Attributes:
-        change: "worse" by more than the tolerance, another "verdict" that is worse, "gone", or "better".
+        change: "worse" by more than the tolerance, another "verdict" that is worse, "gone", "better" (another
+            verdict), "more" robustness by more than the tolerance, or "new".
         case, log, file, spec, object: which result.
         before, now: its verdicts; None for an error, and for what is gone now.
         before_robustness, robustness: None where not determined.
@@ -427,7 +428,7 @@ class Difference:
 
     @property
     def fails(self) -> bool:
-        return self.change != "better"
+        return self.change in ("worse", "verdict", "gone")
 
     @property
     def key(self) -> Key:
@@ -446,20 +447,26 @@ class Difference:
         return f"{now}; it was {_described(self.before, self.before_robustness)}"
 
 
-def compare(table: pa.Table, baseline: pa.Table, tolerance: Tolerance) -> list[Difference]:
-    """Return the differences of a run from a baseline, the worst first; new results are none.
+def compare(
+    table: pa.Table, baseline: pa.Table, tolerance: Tolerance, *, with_all: bool = False
+) -> list[Difference]:
+    """Return the differences of a run from a baseline, the worst first.
 
     Results are the same if case, log, specification file, spec and object are.
+
+    Args:
+        with_all: also results that are new, or have more robustness.
 
     Raises:
         UsageError: a tolerance without the unit that results have.
     """
-    units = dict(zip(_keys(table), table.column("unit").to_pylist(), strict=True))
+    units = dict(zip(keys_of(table), table.column("unit").to_pylist(), strict=True))
     tolerance.check(units.values())
     edited = set(edited_specs(table, baseline))
     differences = [
         replace(difference, is_edited=(difference.case, difference.file, difference.spec) in edited)
         for difference in _differences(_by_key(table), _by_key(baseline), tolerance, units)
+        if with_all or difference.change not in ("more", "new")
     ]
     return sorted(
         differences, key=lambda difference: (RANKS[difference.now], _least_first(difference.robustness))
@@ -490,7 +497,7 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
     """
     import pyarrow as pa
 
-    before, keys = _by_key(baseline), _keys(table)
+    before, keys = _by_key(baseline), keys_of(table)
     worse: dict[Key, list[str]] = defaultdict(list)
     edited = set(edited_specs(table, baseline))
     present, gone = set(keys), []
@@ -516,7 +523,7 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
         (EDITED, pa.bool_(), [(case, file, spec) in edited for case, _, file, spec, _ in keys]),
     ):
         table = table.append_column(name, pa.array(values, kind))
-    places = {key: place for place, key in enumerate(_keys(baseline))} if gone else {}
+    places = {key: place for place, key in enumerate(keys_of(baseline))} if gone else {}
     rows = baseline.take(pa.array([places[result.key] for result in gone], pa.int64())).to_pylist()
     missing = [_gone_row(row, result) for row, result in zip(rows, gone, strict=True)]
     return pa.concat_tables([table, pa.Table.from_pylist(missing, table.schema)])
@@ -553,13 +560,14 @@ def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     }
 
 
-def _keys(table: pa.Table) -> list[Key]:
+def keys_of(table: pa.Table) -> list[Key]:
+    """Return which result each row is."""
     return list(zip(*(table.column(name).to_pylist() for name in _KEY), strict=True))
 
 
 def _by_key(table: pa.Table) -> dict[Key, tuple[str | None, float | None]]:
     values = zip(table.column("verdict").to_pylist(), table.column("robustness").to_pylist(), strict=True)
-    return dict(zip(_keys(table), values, strict=True))
+    return dict(zip(keys_of(table), values, strict=True))
 
 
 def _differences(
@@ -568,9 +576,13 @@ def _differences(
     tolerance: Tolerance,
     units: Mapping[Key, str | None],
 ) -> Iterator[Difference]:
+    present = {key[:-1] for key in now}
     for key, (old, old_number) in before.items():
         # an error in place of all objects of a template stands for each
         found = now.get(key) or now.get((*key[:-1], None))
+        if found is None and old is None and key[:-1] in present:
+            # an error in place of all objects of a template, which has results now
+            continue
         if found is None:
             yield Difference(
                 "gone", *key, before=old, now=None, before_robustness=old_number, robustness=None
@@ -582,10 +594,16 @@ def _differences(
             change = "verdict" if _ORDER[new] > _ORDER[old] else "better"
         elif not tolerance.allows(old_number, number, units.get(key) or ""):
             change = "worse"
+        elif not tolerance.allows(number, old_number, units.get(key) or ""):
+            change = "more"
         if change is not None:
             yield Difference(
                 change, *key, before=old, now=new, before_robustness=old_number, robustness=number
             )
+    for key, (new, number) in now.items():
+        # an error in place of all objects of a template is none of them
+        if key not in before and not (new is None and key[-1] is None):
+            yield Difference("new", *key, before=None, now=new, before_robustness=None, robustness=number)
 
 
 def _least_first(number: float | None) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +25,7 @@ from spatial_replay.cli.options import (
     naming_option,
     objects_by_parameter,
     plugin_option,
+    refuse_options,
     refuse_values,
     semantics_option,
 )
@@ -120,21 +121,27 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
                 show(*(f"      {part}" for part in line.split("\n")))
 
 
-def write_json_lines(table: pa.Table, file: str, inputs: Sequence[Path]) -> None:
+def write_json_lines(
+    table: pa.Table | Sequence[Mapping[str, Any]], file: str, inputs: Sequence[Path]
+) -> None:
     """Write each row as a JSON object on a line, to a file, or to standard output for "-"."""
     from spatial_replay.logs.output_file import replacing
 
-    def lines(rows: pa.Table) -> str:
-        return "".join(f"{json.dumps(json_value(row), ensure_ascii=False)}\n" for row in rows.to_pylist())
-
-    batches = (table.slice(begin, _BATCH) for begin in range(0, len(table), _BATCH))
+    if isinstance(table, Sequence):
+        batches: Iterable[Sequence[Mapping[str, Any]]] = [table]
+    else:
+        begins = range(0, len(table), _BATCH)
+        batches = (table.slice(begin, _BATCH).to_pylist() for begin in begins)
+    texts = (
+        "".join(f"{json.dumps(json_value(row), ensure_ascii=False)}\n" for row in rows) for rows in batches
+    )
     if file == "-":
-        for rows in batches:
-            show_file(lines(rows))
+        for text in texts:
+            show_file(text)
         return
     with replacing(Path(file), inputs) as stream:
-        for rows in batches:
-            stream.write(lines(rows).encode())
+        for text in texts:
+            stream.write(text.encode())
 
 
 def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
@@ -157,6 +164,13 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
         else:
             codes.add(ExitCode.VIOLATED)
     return most_severe(codes)
+
+
+def code_of_errors(table: pa.Table) -> ExitCode:
+    """Return the exit code of damaged logs, and of errors in place of verdicts."""
+    rows = _columns(table, "faults", "error_kind")
+    codes = [_KIND_CODES[kind] for _, kind in rows if kind is not None]
+    return most_severe([*codes, *(ExitCode.DAMAGED for faults, _ in rows if faults)])
 
 
 def _title(total: Total, by: By, with_case: bool) -> str:
@@ -302,8 +316,8 @@ def batch(
     if outputs.json_file != "-":
         _print(result, evaluated, folder)
     warn(*evaluated.remarks)
-    _warn_of_names(evaluated.table)
-    _warn_of_damage(evaluated.table)
+    warn_of_names(evaluated.table)
+    warn_of_damage(evaluated.table)
     if is_github():
         for line in worst_annotations(result.table, suite.folder):
             show(line, err=True)
@@ -422,7 +436,7 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     show(f"wrote {folder}")
 
 
-def _warn_of_names(table: pa.Table) -> None:
+def warn_of_names(table: pa.Table) -> None:
     """Warn of names that logs lack, and of what is remarkable about logs; the same is reported once."""
     logs: dict[str, dict[str, None]] = {}
     for name in ("missing", "remarks"):
@@ -433,7 +447,7 @@ def _warn_of_names(table: pa.Table) -> None:
     warn(*first_lines(messages_with_logs, _MOST_WARNINGS))
 
 
-def _warn_of_damage(table: pa.Table) -> None:
+def warn_of_damage(table: pa.Table) -> None:
     """Name the logs that are damaged or cannot be read, for which the exit code is 3."""
     rows = _columns(table, "log", "faults", "error_kind")
     for what, kind in (("damaged, or not to be read", "log"), ("unfit to be judged", "unfit")):
@@ -476,6 +490,7 @@ def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bo
 
 @click.command()
 @click.argument("folder", metavar="RESULTS")
+@click.argument("other", metavar="[LATER]", required=False)
 @click.option(
     "--worst", metavar="N", type=click.IntRange(min=0), default=10, help="Rows to show.  [default: 10]"
 )
@@ -488,8 +503,26 @@ def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bo
     help="Grouping of the summary.",
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Rows to write, as JSON objects, one a line.")
-def results(folder: str, worst: int, where: str | None, by: By, json_file: str | None) -> None:
+@click.option(
+    "--tolerance",
+    metavar="T",
+    help="With LATER: how much less is no change: 0.02m, or '5%, at least 0.002m'.",
+)
+@click.pass_context
+def results(
+    context: click.Context,
+    folder: str,
+    other: str | None,
+    worst: int,
+    where: str | None,
+    by: By,
+    json_file: str | None,
+    tolerance: str | None,
+) -> ExitCode:
     """Show what the last run of a batch found: totals, and the worst results with their reasons.
+
+    With the results of a LATER run over the same logs, it lists the verdicts that flipped and the numbers
+    that got less. It then exits with 1 if a verdict flipped.
 
     EXPR compares columns with texts and numbers: == != < <= > >=, "text" in COLUMN, and, or, not, none.
 
@@ -498,21 +531,44 @@ def results(folder: str, worst: int, where: str | None, by: By, json_file: str |
       spatial-replay results results --worst 3
       spatial-replay results results --by log --where 'verdict == "violated" and robustness < -0.1'
       spatial-replay results results --where '"door" in log' --json -
+      spatial-replay results main.results branch.results --tolerance 0.02m
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.run_table import rows_where, summary_text
     from spatial_replay.batch.store import ResultsFolder
 
+    if other is not None:
+        refuse_options(context, ("worst", "where", "by"), "applies to the results of one run")
+        return _compare_results(folder, other, json_file, tolerance)
+    refuse_values({"--tolerance": tolerance}, "applies to two runs; give the results of the later one, too")
     table = ResultsFolder.open(folder).read_run()
     if where is not None:
         table = rows_where(table, where)
     if json_file is not None:
         write_json_lines(table, json_file, ())
     if json_file == "-":
-        return
+        return ExitCode.SATISFIED
     show(summary_text(table))
     if len(table):
         print_totals(table, by)
         if worst:
             show("the worst:")
             print_worst(table, worst, failing=False)
+    return ExitCode.SATISFIED
+
+
+def _compare_results(folder: str, other: str, json_file: str | None, tolerance: str | None) -> ExitCode:
+    """Show what differs between two runs."""
+    from spatial_replay.batch.flips import diff_runs
+    from spatial_replay.batch.run_table import Tolerance
+    from spatial_replay.batch.store import ResultsFolder
+
+    with naming_option("--tolerance"):
+        allowed = Tolerance.parse(tolerance or "0")
+    before, now = (ResultsFolder.open(place).read_run() for place in (folder, other))
+    flips = diff_runs(before, now, allowed, (folder, other))
+    if json_file is not None:
+        write_json_lines([change.document for change in flips.changes], json_file, ())
+    if json_file != "-":
+        show(*flips.table(), *flips.lines("flipped", "less", "gone", "new"))
+    return ExitCode.VIOLATED if flips.flipped else ExitCode.SATISFIED

@@ -1,9 +1,11 @@
-"""`spatial-replay diff`: two versions of a specification over a log, or two logs side by side."""
+"""`spatial-replay diff`: two versions of a specification over logs, or two logs side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from glob import has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,27 +13,36 @@ import click
 
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.options import (
+    ConditionArguments,
     EvaluationArguments,
     JsonCommand,
-    LogPath,
-    evaluation_options,
+    condition_options,
+    objects_by_parameter,
     open_inputs,
     output_option,
+    refuse_values,
     semantics_option,
 )
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_json, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.remote import LogFile, local_files
+from spatial_replay.logs.remote import BAG_METADATA, LogFile, is_address, local_files, log_file, sendable
 
 if TYPE_CHECKING:
+    from spatial_replay.batch.flips import RunDiff
+    from spatial_replay.batch.run_table import Difference
     from spatial_replay.compare.runs import LogDiff
-    from spatial_replay.compare.specifications import SpecificationDiff
+    from spatial_replay.compare.specifications import SpecDiff, SpecificationDiff
     from spatial_replay.monitor.verdict import Semantics
+    from spatial_replay.spec.formula import Specification
+
+
+_MOST_CAUSES = 3
+"""Specs whose edits are traced to a flipped verdict."""
 
 
 @click.command(cls=JsonCommand)
-@evaluation_options
-@click.argument("other", required=False, type=LogPath())
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True)
+@condition_options
 @click.option(
     "--align",
     metavar="time|progress[:NAME]|NAME",
@@ -45,34 +56,46 @@ if TYPE_CHECKING:
 @output_option("HTML page to write: both sides under one time cursor.")
 @semantics_option
 def diff(
-    request: EvaluationArguments,
-    other: LogFile | None,
+    logs: tuple[str, ...],
+    conditions: ConditionArguments,
     align: str,
     as_json: bool,
     output: Path | None,
     semantics: Semantics,
 ) -> int:
-    """Compare two versions of a specification over a log, or two logs.
+    """Compare two versions of a specification over one log or many, or two logs.
 
     With two specifications (--spec OLD --spec NEW), it shows which verdicts and numbers changed, which sample
     differs first, and which edit is the cause. With one --spec, OLD is the specification in the log. The
     cause is checked: OLD with this edit alone, and NEW without it, are evaluated.
 
-    With two logs, it shows which objects moved differently and since when, the effect on each spec, and the
-    planner's first different decision.
+    Over several logs, a folder or a pattern, it lists the verdicts that flipped and the numbers that got
+    less.
 
-    Exits with 0 if nothing differs, or only names of specs, and otherwise with 1. If a log is damaged, it
-    exits with 3.
+    With two logs and one specification, it shows which objects moved differently and since when, the effect
+    on each spec, and the planner's first different decision.
+
+    Exits with 0 if nothing differs, or only names of specs, and otherwise with 1; over several logs with 1 if
+    a verdict flipped. If a log is damaged, it exits with 3.
 
     \b
     Examples:
       spatial-replay diff run.mcap --spec old.spatial --spec new.spatial
+      spatial-replay diff 'nightly/**/*.mcap' --spec old.spatial --spec new.spatial
       spatial-replay diff before.mcap after.mcap --spec blocks.spatial -o diff.html
       spatial-replay diff before.mcap after.mcap --spec blocks.spatial --align progress
     """
     # imported here so that --help stays fast
     from spatial_replay.report.write import refuse_output
 
+    if _are_many(logs, conditions.specs):
+        why = "applies to one log; give one that flipped"
+        refuse_values({"-o": output, "--align": "" if align == "time" else align}, why)
+        return _over_logs(logs, conditions, as_json, semantics)
+    if len(logs) > 2:
+        raise UsageError(f"{len(logs)} logs; give two, or two specifications: --spec OLD --spec NEW")
+    request = _for_log(conditions, logs[0])
+    other = _log(logs[1]) if len(logs) > 1 else None
     if output is not None:
         refuse_output(output, _inputs(request, other))
     if other is None and align != "time":
@@ -91,6 +114,99 @@ def diff(
     show_diagnostics(difference.missing)
     code = ExitCode.SATISFIED if difference.is_empty else ExitCode.VIOLATED
     return most_severe([code, ExitCode.DAMAGED]) if difference.faults else code
+
+
+def _log(text: str) -> LogFile:
+    return log_file(text) if is_address(text) else Path(text)
+
+
+def _for_log(conditions: ConditionArguments, log: str) -> EvaluationArguments:
+    values = {field.name: getattr(conditions, field.name) for field in fields(ConditionArguments)}
+    return EvaluationArguments(**values, log=_log(log))
+
+
+def _are_many(logs: Sequence[str], specs: Sequence[LogFile]) -> bool:
+    """Return whether two specifications are compared over several logs, a folder, or a pattern."""
+    if len(specs) != 2:
+        return False
+    (log, *others), path = logs, Path(logs[0])
+    is_folder = (
+        log.endswith("/") if is_address(log) else path.is_dir() and not (path / BAG_METADATA).is_file()
+    )
+    return bool(others) or is_folder or (has_magic(log) and not path.exists())
+
+
+def _over_logs(
+    logs: Sequence[str], given: ConditionArguments, as_json: bool, semantics: Semantics
+) -> ExitCode:
+    """Show the verdicts that an edit flips over many logs."""
+    from tempfile import TemporaryDirectory
+
+    import pyarrow.compute as pc
+
+    from spatial_replay.batch.flips import diff_runs
+    from spatial_replay.batch.rows import parsed_specifications
+    from spatial_replay.batch.run import prepare, run_batch, workers_of
+    from spatial_replay.batch.suite import Conditions, Suite
+    from spatial_replay.cli.batch import code_of_errors, warn_of_damage, warn_of_names
+
+    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
+    objects = objects_by_parameter(given.choices)
+    conditions = Conditions.given(given.reading, objects, given.constants, semantics=semantics, **others)
+    cases = prepare(Suite.of_logs(logs, [sendable(spec) for spec in given.specs], conditions), progress)
+    old, new = cases[0].files
+    show_diagnostics({str(warning): warning for file in (old, new) for warning in file.warnings}.values())
+    workers = workers_of(min(os.cpu_count() or 1, len(cases[0].logs)))
+    with TemporaryDirectory() as folder:
+        table = run_batch(cases, folder, workers, progress=progress).table
+    before, now = (table.filter(pc.equal(table["file"], file.name)) for file in (old, new))
+    flips = diff_runs(before, now, names=(old.name, new.name))
+    paths = {log.name: log.path for log in cases[0].logs}
+    specifications = parsed_specifications((old.text, new.text), conditions)
+    causes = list(_causes(flips, paths, given, specifications, semantics))
+    if as_json:
+        documents = [{"log": log, **spec.document} for log, _, spec in causes]
+        show_json({"old": old.name, "new": new.name, **flips.document, "causes": documents})
+    else:
+        show(f"{old.name} → {new.name}", *flips.table(), *flips.lines("flipped"))
+        for log, first_ns, spec in causes:
+            sentence, *sentences = spec.sentences(first_ns)
+            show(
+                f"the edit, by {log}:", f"  {spec.title}: {sentence}", *(f"    {text}" for text in sentences)
+            )
+        show(*flips.lines("less", "gone", "new"))
+    warn_of_names(table)
+    warn_of_damage(table)
+    code = ExitCode.VIOLATED if flips.flipped else ExitCode.SATISFIED
+    return most_severe([code, code_of_errors(table)])
+
+
+def _causes(
+    flips: RunDiff,
+    paths: Mapping[str, str],
+    given: ConditionArguments,
+    specifications: Sequence[Specification],
+    semantics: Semantics,
+) -> Iterator[tuple[str, int, SpecDiff]]:
+    """Yield the first flipped result of the first few specs, with its log and the log's first time.
+
+    Args:
+        paths: of logs, by name.
+        specifications: the old one and the new one.
+    """
+    from spatial_replay.compare.specifications import diff_over_source
+
+    old, new = specifications
+    firsts: dict[str, Difference] = {}
+    for change in flips.flipped:
+        if None not in (change.difference.before, change.difference.now):
+            firsts.setdefault(change.difference.spec, change.difference)
+    for result in list(firsts.values())[:_MOST_CAUSES]:
+        inputs = open_inputs(_for_log(given, paths[result.log]), known=specifications)
+        difference = diff_over_source(inputs.source, old, new, inputs.options(semantics))
+        for spec in difference.specs:
+            if (spec.name, spec.new.object) == (result.spec, result.object):
+                yield result.log, difference.first_ns, spec
 
 
 def _of_specifications(

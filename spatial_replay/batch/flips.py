@@ -1,0 +1,212 @@
+"""Two runs of a batch over the same logs: which verdicts flipped, and which numbers got less."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+
+from spatial_replay.batch.run_table import Difference, Key, Tolerance, compare, keys_of, result_name
+from spatial_replay.errors import UsageError
+from spatial_replay.text import counted, first_lines, json_fields, with_unit
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Kind: TypeAlias = Literal["flipped", "less", "more", "gone", "new"]
+KINDS: Final[tuple[Kind, ...]] = ("flipped", "less", "more", "gone", "new")
+_LISTED: Final[Mapping[Kind, int]] = MappingProxyType(
+    {"flipped": 20, "less": 10, "more": 5, "gone": 5, "new": 5}
+)
+"""Results of a kind that texts list; JSON has all."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResultChange:
+    """One result that differs between two runs.
+
+    Attributes:
+        difference: with the verdicts of both; "untested" for a verdict that nothing tested.
+        unit: of both numbers, or "".
+        reason: what decided the worse one of the two verdicts, in a sentence.
+    """
+
+    difference: Difference
+    unit: str
+    reason: str
+
+    @property
+    def kind(self) -> Kind:
+        """What happened to the result."""
+        change = self.difference.change
+        if change in ("verdict", "better"):
+            return "flipped"
+        return "less" if change == "worse" else change  # type: ignore[return-value]
+
+    @property
+    def text(self) -> str:
+        """Both verdicts with their numbers, or that of the run which has the result."""
+        result = self.difference
+        before, now = (
+            "error" if verdict is None else f"{verdict} ({self._number(number)})"
+            for verdict, number in (
+                (result.before, result.before_robustness),
+                (result.now, result.robustness),
+            )
+        )
+        return {"gone": before, "new": now}.get(self.kind, f"{before} → {now}")
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The change as values for JSON."""
+        names = ("case", "log", "file", "spec", "object", "before", "now", "before_robustness", "robustness")
+        return {
+            "change": self.kind,
+            **json_fields(self.difference, *names),
+            "edited": self.difference.is_edited,
+            **json_fields(self, "unit", "reason"),
+        }
+
+    def _number(self, number: float | None) -> str:
+        return "not determined" if number is None else with_unit(number, self.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class RunDiff:
+    """Two runs side by side.
+
+    Attributes:
+        logs, results: how many both have together.
+        changes: results that differ: flipped ones first, the worst first within each kind.
+        specs: how many results each spec has, by case, file and name.
+    """
+
+    logs: int
+    results: int
+    changes: tuple[ResultChange, ...]
+    specs: Mapping[tuple[str, str, str], int]
+
+    @property
+    def flipped(self) -> tuple[ResultChange, ...]:
+        """The results with another verdict."""
+        return tuple(change for change in self.changes if change.kind == "flipped")
+
+    def lines(self, *kinds: Kind) -> Iterator[str]:
+        """Yield the results of some kinds, with reasons: of many, the first."""
+        for kind in kinds:
+            changes = [change for change in self.changes if change.kind == kind]
+            if changes:
+                yield f"{kind}:"
+            for change in changes[: _LISTED[kind]]:
+                result = change.difference
+                yield f"  {result.log}: {result_name(result.spec, result.object)}: {change.text}"
+                if change.reason and kind in ("flipped", "less"):
+                    yield f"      {change.reason}"
+            if len(changes) > _LISTED[kind]:
+                yield f"  … and {len(changes) - _LISTED[kind]:,} more"
+
+    def table(self) -> Iterator[str]:
+        """Yield how many results of each spec differ, in lines."""
+        yield f"{counted(self.logs, 'log')}, {counted(self.results, 'result')}"
+        counts: dict[tuple[str, str, str], Counter[str]] = {spec: Counter() for spec in self.specs}
+        edited = set()
+        for change in self.changes:
+            spec = change.difference.case, change.difference.file, change.difference.spec
+            counts[spec][change.kind] += 1
+            edited |= {spec} if change.difference.is_edited else set()
+        cases = {case for case, _, _ in counts}
+        titles = {
+            spec: f"{spec[0]}: {spec[2] or spec[1]}" if len(cases) > 1 else spec[2] or spec[1]
+            for spec in counts
+        }
+        always = ("flipped", "less")
+        columns = [kind for kind in KINDS if kind in always or any(count[kind] for count in counts.values())]
+        width = max([4, *map(len, titles.values())])
+        yield f"  {'spec':<{width}}  {'  '.join(f'{head:>7}' for head in [*columns, 'same'])}"
+        for spec, count in counts.items():
+            numbers = [*(count[kind] for kind in columns), self.specs[spec] - count.total()]
+            cells = "  ".join(f"{number or '-':>7}" for number in numbers)
+            yield f"  {titles[spec]:<{width}}  {cells}{'  edited' if spec in edited else ''}"
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The comparison as values for JSON."""
+        return {
+            "logs": self.logs,
+            "results": self.results,
+            "flipped": len(self.flipped),
+            "changes": [change.document for change in self.changes],
+        }
+
+
+def diff_runs(
+    before: pa.Table,
+    now: pa.Table,
+    tolerance: Tolerance = Tolerance(),  # noqa: B008 - a frozen value
+    names: tuple[str | PathLike[str], str | PathLike[str]] = ("the first", "the second"),
+) -> RunDiff:
+    """Compare the tables of two runs, result by result.
+
+    Results are the same if case, log, specification file, spec and object are. A file that only the first
+    run has stands for one that only the second has.
+
+    Args:
+        tolerance: how much less is no change.
+        names: of the two, for errors.
+
+    Raises:
+        UsageError: the runs have no result in common, or a tolerance without the unit of the results.
+    """
+    before, now = _tested(_renamed(before, now)), _tested(now)
+    rows = {key: row for table in (before, now) for key, row in _rows(table)}
+    if not set(keys_of(before)) & set(keys_of(now)):
+        examples = [f"{name} has {_example(table)}" for name, table in zip(names, (before, now), strict=True)]
+        raise UsageError(f"no result is in both: {', and '.join(examples)}; give runs over the same logs")
+    firsts = dict(_rows(before))
+    changes = []
+    for difference in compare(now, before, tolerance, with_all=True):
+        row = rows.get(difference.key) or rows[*difference.key[:-1], None]
+        is_fixed = difference.change == "better" and difference.key in firsts
+        reason = (firsts[difference.key] if is_fixed else row)["reason"] or row["error"] or ""
+        changes.append(
+            ResultChange(difference, row["unit"] or "", f"before: {reason}" if is_fixed else reason)
+        )
+    # stable: the worst stay first within each kind
+    changes.sort(key=lambda change: KINDS.index(change.kind))
+    specs = Counter((case, file, spec) for case, _, file, spec, _ in rows)
+    return RunDiff(len({log for _, log, *_ in rows}), len(rows), tuple(changes), specs)
+
+
+def _rows(table: pa.Table) -> Iterator[tuple[Key, dict[str, Any]]]:
+    return zip(keys_of(table), table.select(["reason", "error", "unit"]).to_pylist(), strict=True)
+
+
+def _example(table: pa.Table) -> str:
+    lines = [f"{log}: {result_name(spec or file, name)}" for _, log, file, spec, name in keys_of(table)]
+    return first_lines(lines, 1)[0] if lines else "none"
+
+
+def _renamed(table: pa.Table, other: pa.Table) -> pa.Table:
+    """Return a table in which the only file that another one lacks has the name of its counterpart there."""
+    import pyarrow as pa
+
+    files, others = (set(rows.column("file").to_pylist()) for rows in (table, other))
+    if len(files - others) != 1 or len(others - files) != 1:
+        return table
+    (old,), (new,) = files - others, others - files
+    names = [new if file == old else file for file in table.column("file").to_pylist()]
+    place = table.schema.get_field_index("file")
+    return table.set_column(place, table.schema.field(place), pa.array(names, pa.string()))
+
+
+def _tested(table: pa.Table) -> pa.Table:
+    """Return a table with "untested" for verdicts that nothing tested."""
+    import pyarrow.compute as pc
+
+    is_untested = pc.fill_null(pc.equal(table.column("tested"), "nothing"), False)
+    verdicts = pc.if_else(is_untested, "untested", table.column("verdict"))
+    place = table.schema.get_field_index("verdict")
+    return table.set_column(place, table.schema.field(place), verdicts)
