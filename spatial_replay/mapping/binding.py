@@ -486,7 +486,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     sizes = _first(layout.sizes, columns.add_all) or ()
     shape_sizes = tuple(map(columns.measure, layout.shape.sizes)) if layout.shape else ()
     height = tuple(map(columns.measure, layout.height)) if layout.height else ()
-    polygon = _polygon(layout, example)
+    polygon = _polygon(layout, columns)
     class_paths = [FieldPath.of(path) for path in layout.class_field]
     if len(class_paths) == 1:
         # alternatives may all be missing, a single path of the mapping must not
@@ -601,7 +601,11 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolv
     return None
 
 
-def _polygon(layout: MessageLayout, example: object) -> Get | None:
+def _polygon(layout: MessageLayout, columns: _Columns) -> Get | None:
+    example = columns.example
+    if len(layout.polygon) > 1:
+        columns.add_all(layout.polygon)
+        return tuple_getter(list(map(FieldPath.of, layout.polygon)), example)
     text = layout.polygon[0] if layout.polygon else layout.shape.outline if layout.shape else ""
     if not text:
         return None

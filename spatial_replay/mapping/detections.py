@@ -648,19 +648,25 @@ def _polygons(counts: Integers, points: Floats, own: tuple[Floats, Floats] | Non
 _LEAST_CORNERS = 3
 
 
-def outlines_from_lists(lists: list[Any], *, is_bounds: bool) -> tuple[Integers, Floats, int]:
+def outlines_from_lists(
+    lists: list[Any], *, is_bounds: bool, have_size: bool = False
+) -> tuple[Integers, Floats, int]:
     """Return the counts (R,) and the corners (V, 3) of outlines, and how many have too few corners.
 
     These have one corner, NaN, so that their objects are unknown.
 
     Args:
         is_bounds: whether each list has two opposite corners of a box, which become four.
+        have_size: whether bounds have width and height instead of the second corner.
     """
     counts, points = _points_from_lists(lists)
     if is_bounds:
         few = counts != 2
         starts = starts_from_counts(counts)[:-1][~few]
         ends = np.stack([points[starts], points[starts + 1]]) if len(starts) else np.empty((2, 0, 3))
+        if have_size:
+            # a negative size makes the object unknown, as one of a shape does
+            ends[1] = ends[0] + np.where(ends[1] < 0, np.nan, ends[1])
         (left, low, _), (right, high, _) = ends.min(axis=0).T, ends.max(axis=0).T
         xs, ys = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
         boxes = np.stack([xs, ys, np.zeros_like(xs)], axis=2).reshape(-1, 3)

@@ -136,7 +136,8 @@ class TopicMapping:
         orientation: path of a quaternion, or the paths of its x, y, z and w.
         order: of the four numbers of a quaternion in a list.
         yaw: path of an angle.
-        bounds: path of two opposite corners of a box along the axes.
+        bounds: path of two opposite corners of a box along the axes, or paths of their four numbers.
+        bounds_have_size: whether the last two numbers are width and height instead of a corner.
         only, without: patterns of names to keep, and to leave out.
         max_age_ns: how long an observation stays valid.
         clock: the clock of this topic, if not that of the mapping.
@@ -159,7 +160,8 @@ class TopicMapping:
     order: Literal["xyzw", "wxyz"] | None = None
     yaw: Angle | None = None
     polygon: str | None = None
-    bounds: str | None = None
+    bounds: str | tuple[str, ...] | None = None
+    bounds_have_size: bool = False
     shape: ShapeMapping | None = None
     height: tuple[Measure, Measure] | None = None
     uncertainty: Uncertainty | None = None
@@ -363,6 +365,9 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         NameTemplate.of(entry["name"])
     frame = entry.get("frame")
     position, orientation, height = entry.get("position"), entry.get("orientation"), entry.get("height")
+    bounds, form = entry.get("bounds"), "xyxy"
+    if isinstance(bounds, dict):
+        bounds, form = bounds["field"], bounds["form"]
     return TopicMapping(
         topic=topic,
         reads_objects="signals" not in entry or not entry.keys() <= _SIGNAL_KEYS,
@@ -376,7 +381,8 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         order=entry.get("order"),
         yaw=_angle(entry.get("yaw")),
         polygon=entry.get("polygon"),
-        bounds=entry.get("bounds"),
+        bounds=tuple(bounds) if isinstance(bounds, list) else bounds,
+        bounds_have_size=form == "xywh",
         shape=_shape(entry.get("shape"), shapes),
         height=(_measure(height[0]), _measure(height[1])) if height else None,
         uncertainty=_uncertainty(entry.get("uncertainty")),

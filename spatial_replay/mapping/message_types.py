@@ -42,7 +42,9 @@ class MessageLayout:
         order: of the four numbers of a quaternion in a list; "" if that is not said.
         angle_scale: radians in one unit of `yaw`, below 0 if it counts clockwise.
         angle_zero: the yaw in radians where that field is 0.
-        is_bounds: whether `polygon` leads to two opposite corners of a box along the axes.
+        is_bounds: whether `polygon` leads to two opposite corners of a box along the axes; then it may be
+            the paths of their four numbers.
+        bounds_have_size: whether the last two numbers are width and height instead of a corner.
         sizes: alternatives, each the paths of length, width and maybe height of a box.
         frame, stamp: in the object, or with `$.` in the message.
         solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
@@ -64,6 +66,7 @@ class MessageLayout:
     angle_zero: float = 0.0
     polygon: Alternatives = ()
     is_bounds: bool = False
+    bounds_have_size: bool = False
     sizes: tuple[Alternatives, ...] = ()
     class_name: str | None = None
     class_field: Alternatives = ()
@@ -291,7 +294,9 @@ def _shape_changes(mapping: TopicMapping) -> dict[str, object]:
     if mapping.polygon is not None:
         changes |= {"polygon": (mapping.polygon,), "sizes": (), "solids": ""}
     if mapping.bounds is not None:
-        changes |= {"polygon": (mapping.bounds,), "is_bounds": True, "sizes": (), "solids": ""}
+        paths = (mapping.bounds,) if isinstance(mapping.bounds, str) else mapping.bounds
+        changes |= {"polygon": paths, "is_bounds": True, "bounds_have_size": mapping.bounds_have_size}
+        changes |= {"sizes": (), "solids": ""}
     if mapping.shape is not None:
         changes |= {"shape": mapping.shape, "polygon": (), "sizes": (), "solids": ""}
     if mapping.height is not None:

@@ -521,7 +521,9 @@ class Extractor:
                 chunk.locked = [bool(get(each, "frame_locked")) for each in objects.values]
         elif binding.polygon is not None:
             corners = [binding.polygon(each) for each in objects.values]
-            outlines = outlines_from_lists(corners, is_bounds=self.layout.is_bounds)
+            outlines = outlines_from_lists(
+                corners, is_bounds=self.layout.is_bounds, have_size=self.layout.bounds_have_size
+            )
             chunk.corner_counts, chunk.corners, cornerless = outlines
         values = objects.values
         if binding.numbers is not None:

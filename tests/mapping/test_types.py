@@ -547,6 +547,30 @@ def test_two_opposite_corners_are_a_box_by_a_key_of_its_own(box: object) -> None
         assert found == [[10, 20], [30, 20], [30, 60], [10, 60]]
 
 
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        "[left, low, right, top]",
+        "{field: [left, low, right, top], form: xyxy}",
+        "{field: [left, low, width, height], form: xywh}",
+        "{field: box, form: xywh}",
+    ],
+)
+def test_bounds_are_four_fields_or_a_corner_with_a_size(bounds: str) -> None:
+    box = {"left": 10, "low": 20, "right": 30, "top": 60, "width": 20, "height": 40}
+    feed = Feed(types={"/b": "a/Boxes"})
+    feed.add("/b", 0, {"boxes": [{"id": 1, **box, "box": [10, 20, 20, 40]}]})
+    made = make(f"topics: {{/b: {{objects: 'boxes[*]', name: '{{id}}', bounds: {bounds}}}}}", feed)
+    assert made.footprint_row(0, "1").tolist() == [[10, 20], [30, 20], [30, 60], [10, 60]]
+
+
+def test_bounds_of_a_negative_size_make_an_object_unknown() -> None:
+    feed = Feed(types={"/b": "a/Boxes"})
+    feed.add("/b", 0, {"boxes": [{"id": 1, "box": [10, 20, -20, 40]}]})
+    made = make("topics: {/b: {objects: 'boxes[*]', name: '{id}', bounds: {field: box, form: xywh}}}", feed)
+    assert made.states("1") == "?"
+
+
 def test_an_outline_is_given_once() -> None:
     for pair in ("polygon: a, bounds: b", "bounds: a, shape: {disc: 1}", "polygon: a, shape: {polygon: b}"):
         with pytest.raises(UsageError, match="give one of the two"):
