@@ -33,7 +33,16 @@ _TURNS = ("orientation", "rotation", "quaternion")
 _YAWS = ("yaw", "theta", "heading", "angle")
 _SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
 _OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
-_BOUNDS = ("xyxy", "bounds", "bbox_xyxy", "box_xyxy")
+_BOUNDS = ("xyxy", "bounds", "bbox_xyxy", "box_xyxy", "xywh", "bbox_xywh", "bbox", "box", "bounding_box")
+_FOUR_BOUNDS = (
+    ("xmin", "ymin", "xmax", "ymax"),
+    ("x_min", "y_min", "x_max", "y_max"),
+    ("min_x", "min_y", "max_x", "max_y"),
+    ("left", "top", "right", "bottom"),
+    ("x1", "y1", "x2", "y2"),
+    ("x_offset", "y_offset", "width", "height"),
+)
+"""Names of fields of two opposite corners; the last is that of a region in an image, with its size."""
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "mmsi", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
 """Lists with a name for each element of another list."""
@@ -83,7 +92,8 @@ class Guess:
     Attributes:
         objects: of the list of objects, or None for a single one.
         position: of a point, or of x and y.
-        bounds: of two opposite corners of a box.
+        bounds: of two opposite corners of a box, as a list or as four numbers.
+        bounds_have_size: whether the last two of these numbers are width and height.
         is_own: whether the outline is in the object's own frame, at its pose.
         size: of length, width and maybe height; or of a radius.
         names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
@@ -99,7 +109,8 @@ class Guess:
     yaw: str | None = None
     polygon: str | None = None
     is_own: bool = False
-    bounds: str | None = None
+    bounds: str | tuple[str, ...] | None = None
+    bounds_have_size: bool = False
     size: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     class_name: str | None = None
@@ -169,6 +180,8 @@ def _best(messages: Sequence[object]) -> Guess | None:
         # the frame of a fix is that of its receiver
         best = replace(best, names=(*best.names, "frame_id"))
     names = tuple(name for name in best.names if _distinguishes(name, best, messages))
+    with suppress(FieldError):
+        best = replace(best, bounds_have_size=_have_size(best, messages))
     return replace(best, names=names or tuple(_names_beside(best, messages)))
 
 
@@ -298,7 +311,7 @@ def _object_in(value: object) -> Guess | None:
     fields = dict(_iter_fields(value))
     position, turn = _pose_in(fields)
     polygon, corners = _outline_in(fields)
-    bounds = next((path for path in _paths_by_name(fields, _BOUNDS) if _numbers(fields[path], 4)), None)
+    bounds = _bounds_in(fields)
     is_own = False
     if polygon is not None and turn is not None and isinstance(position, str):
         place = _point(fields[position]) or (0.0, 0.0)
@@ -312,7 +325,7 @@ def _object_in(value: object) -> Guess | None:
         return None
     is_posed = polygon is None or is_own
     if bounds is not None:
-        corners = [tuple(_numbers(fields[bounds], 4))]
+        corners = [_box_at(bounds, value)]
     elif polygon is None and isinstance(position, str) and _IMAGES.search(position):
         corners = [_point(fields[position]) or ()]
     return Guess(
@@ -338,6 +351,48 @@ def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float
         if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
             return path, [point for corner in value if (point := _point(corner)) is not None]
     return None, []
+
+
+def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
+    """Return the path, or the four paths, of the bounds of a box along the axes."""
+    for path in _paths_by_name(fields, _BOUNDS):
+        if _numbers(fields[path], 4):
+            return path
+    paths = {
+        "_".join(_words(path.split(".")[-1])): path for path in reversed(fields) if _is_number(fields[path])
+    }
+    for names in _FOUR_BOUNDS:
+        if all(name in paths for name in names):
+            left, low, right, top = (float(fields[paths[name]]) for name in names)  # type: ignore[arg-type]
+            # ends of a line come in any order
+            return tuple(paths[name] for name in names) if left <= right and low <= top else None
+    return None
+
+
+def _box_at(bounds: str | tuple[str, ...], thing: object) -> tuple[float, ...]:
+    """Return the four numbers of the bounds of an object.
+
+    Raises:
+        FieldError: there are none.
+    """
+    numbers = [
+        walk(FieldPath.of(path), thing) for path in (bounds if isinstance(bounds, tuple) else [bounds])
+    ]
+    return tuple(_numbers(numbers if len(numbers) == 4 else numbers[0], 4))
+
+
+def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
+    """Return whether bounds have width and height: as corners, some lie left of or below the first."""
+    bounds = guess.bounds
+    if bounds is None or isinstance(bounds, tuple):
+        return bounds is not None and _words(bounds[-1].split(".")[-1])[-1] == "height"
+    last = bounds.split(".")[-1]
+    if "xywh" in last:
+        return True
+    boxes = [_box_at(bounds, thing) for message in messages for thing in _objects_in(guess, message)]
+    return "xyxy" not in last and any(
+        right < left or top < low for left, low, right, top in filter(None, boxes)
+    )
 
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:

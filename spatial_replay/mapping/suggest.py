@@ -385,6 +385,10 @@ _OF_MAVROS = (
     "MAVROS turns local positions to x east, y north, z up; raw MAVLink messages are north, east, down: for"
     " these, axes: {y: down}"
 )
+_FORM_OF_BOUNDS = (
+    "{0} fits as two corners in each box looked at; {{field: {0}, form: xywh}} reads a corner and a size",
+    "{0} has a corner and a size: as two corners, some boxes would end left of or below their beginning",
+)
 _OF_PLANS = "places to go to, as of a plan, are no objects"
 _POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
 
@@ -401,6 +405,8 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
         ("bounds", guess.bounds),
     ]
     fields = {key: _value(key, value) for key, value in parts if value is not None}
+    if guess.bounds_have_size:
+        fields["bounds"] = f"{{field: {fields['bounds']}, form: xywh}}"
     if guess.has_zeros_left_out:
         fields["missing"] = "0"
     return fields if {"polygon", "bounds"} & fields.keys() else {**fields, "shape": _shape(guess)}
@@ -451,6 +457,8 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
         by_id = (f"one object a message: {guess.names[0]} takes turns",)
     sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
     others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
+    if isinstance(guess.bounds, str) and "xy" not in guess.bounds:
+        sizeless = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
     indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
     return by_id + sizeless + indexed + others
 

@@ -108,6 +108,21 @@ def test_boxes_by_two_corners_are_suggested() -> None:
     assert (topic.objects, topic.name, topic.bounds) == ("boxes[*]", "{label}", "xyxy")
 
 
+def test_boxes_by_four_numbers_are_read_as_their_values_allow() -> None:
+    names = ("xmin", "ymin", "xmax", "ymax")
+    box = dict(zip(names, (1, 2, 3, 6), strict=True))
+    _, topic = suggested_for([{"boxes": [{"id": 1, "roi": box}]}])
+    assert (topic.bounds, topic.bounds_have_size) == (tuple(f"roi.{name}" for name in names), False)
+    for numbers, has_size in (((100, 100, 20, 30), True), ((100, 100, 120, 130), False)):
+        text, topic = suggested_for([{"boxes": [{"bbox": [0, 0, 10, 10]}, {"bbox": list(numbers)}]}])
+        assert (topic.bounds, topic.bounds_have_size) == ("bbox", has_size)
+        assert "# bbox " in text
+    # the ends of a line are no corners of a box
+    line = {"x1": 3.0, "y1": 0.0, "x2": 1.0, "y2": 4.0}
+    with pytest.raises(UsageError, match="no topic was chosen"):
+        parse_mapping(suggest_mapping("run", [Topic("/a", "own/A", "json")], {"/a": [{"lines": [line]}]}))
+
+
 def test_zeros_that_json_leaves_out_are_suggested_as_such() -> None:
     def models(*places: dict[str, float]) -> dict[str, Any]:
         poses = [
