@@ -442,6 +442,8 @@ def _doubts_of(extractor: Extractor) -> Iterator[str]:
         hint = "" if is_bounds else "; `bounds` reads two opposite corners of a box"
         outlines = counted(extractor.cornerless, "outline")
         yield f"{outlines} with {what}: objects are unknown there{hint}"
+    for path, count in extractor.unset.items():
+        yield f"{counted(count, 'object')} did not set {path}, so it is unknown there"
     if extractor.widest_turn > _MOST_TURNED:
         yield (
             f"its angles reach {number_text(extractor.widest_turn)} and are read as radians;"

@@ -39,6 +39,7 @@ from spatial_replay.mapping.field_paths import (
     is_list,
     is_number,
     leads_somewhere,
+    may_be_unset,
     name_from_topic,
     style_of,
     tuple_getter,
@@ -311,6 +312,7 @@ class Binding:
         shape_sizes, height: from the mapping, each a number (float) or a column (int).
         uncertainty: a number, a column, or None.
         class_names: the names of the numbers of a protobuf enum.
+        unset: columns of numbers that a protobuf sender may not set, with their paths and defaults.
         frame: reads the frame's name, and whether from the message instead of the object; None for the fixed
             frame.
     """
@@ -331,6 +333,7 @@ class Binding:
     class_names: Table[object, str]
     frame: tuple[Get, bool] | None
     lifetime: TimeGetter | None
+    unset: tuple[tuple[int, FieldPath, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -510,7 +513,21 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         class_names=_enum_of(class_paths, example),
         frame=_frame(layout, example, message, needs_frame),
         lifetime=lifetime,
+        unset=tuple(
+            (column, path, _default(path, example))
+            for column, path in enumerate(paths)
+            # an orientation that is not set is one of zeros, and heights are needed by few
+            if column not in (*orientation, *position[2:]) and may_be_unset(path, example)
+        ),
     )
+
+
+def _default(path: FieldPath, example: object) -> float:
+    """Return the number at a path of a protobuf message in which nothing is set; 0 below a list."""
+    try:
+        return float(walk(path, type(example)()))  # type: ignore[arg-type]
+    except FieldError:
+        return 0.0
 
 
 def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:

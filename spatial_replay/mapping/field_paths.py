@@ -424,9 +424,35 @@ def enum_names(path: FieldPath, message: object) -> dict[object, str]:
     if not path.steps:
         return {}
     owner = walk(FieldPath(path.text, path.steps[:-1]), message)
-    fields = getattr(getattr(owner, "DESCRIPTOR", None), "fields_by_name", {})
-    kind = getattr(fields.get(path.steps[-1]), "enum_type", None)
+    last = path.steps[-1]
+    kind = getattr(_definition_of(owner, last) if isinstance(last, str) else None, "enum_type", None)
     return {} if kind is None else {member.number: member.name for member in kind.values}
+
+
+def is_set(path: FieldPath, value: object) -> bool:
+    """Return whether a sender set the protobuf fields on a path, as far as their definition tells."""
+    for step in path.steps:
+        if isinstance(step, str) and not isinstance(value, Mapping):
+            field = _definition_of(value, step)
+            if field is not None and field.has_presence and not value.HasField(step):  # type: ignore[attr-defined]
+                return False
+        value = walk(FieldPath(path.text, (step,)), value)
+    return True
+
+
+def may_be_unset(path: FieldPath, example: object) -> bool:
+    """Return whether `is_set` can be false for messages like an example."""
+    for step in path.steps:
+        field = _definition_of(example, step) if isinstance(step, str) else None
+        if field is not None and field.has_presence:
+            return True
+        example = walk(FieldPath(path.text, (step,)), example)
+    return False
+
+
+def _definition_of(value: object, name: str) -> Any:
+    """Return the descriptor of a protobuf field; None for other fields."""
+    return getattr(getattr(value, "DESCRIPTOR", None), "fields_by_name", {}).get(name)
 
 
 def getter(path: FieldPath, example: object) -> Get:

@@ -8,6 +8,7 @@ reports those that fail, and clears their flags.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, compress
@@ -57,10 +58,12 @@ from spatial_replay.mapping.field_paths import (
     enum_names,
     from_protobuf_json,
     getter,
+    is_set,
     iter_elements,
     keys_of,
     leads_somewhere,
     list_getter,
+    may_be_unset,
     sparse,
     style_of,
     walk,
@@ -415,6 +418,8 @@ class Extractor:
         """Outlines with too few corners, whose objects are unknown."""
         self.widest_turn = 0.0
         """The greatest angle that is read as radians."""
+        self.unset: Counter[str] = Counter()
+        """Objects that do not set a field of protobuf, by its path."""
         self._scene_stamps_ns: dict[int, int] = {}
         """Timestamps of the entities of a scene by the codes of their names, until they are deleted."""
         self.turned, self.unturned = 0, 0
@@ -529,6 +534,7 @@ class Extractor:
         if binding.numbers is not None:
             rows = map(binding.numbers, values)
             chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+            self._forget_unset(binding, chunk.numbers, values)
             if self.layout.invalid:
                 chunk.numbers[np.isin(chunk.numbers, self.layout.invalid)] = nan
             if binding.orientation:
@@ -548,6 +554,14 @@ class Extractor:
             chunk.lifetimes = [ns_from_json(thing.get("lifetime")) for thing in values]
         chunk.message, chunk.name = objects.message, objects.name
         self.cornerless += cornerless
+
+    def _forget_unset(self, binding: Binding, numbers: Floats, objects: Sequence[object]) -> None:
+        """Replace defaults that stand for protobuf fields which were not set."""
+        for column, path, default in binding.unset:
+            for row in np.flatnonzero(numbers[:, column] == default).tolist():
+                if not is_set(path, objects[row]):
+                    numbers[row, column] = nan
+                    self.unset[path.text] += 1
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
         """Return all objects, the index of each one's message, and its index, or key, in that message."""
@@ -907,8 +921,8 @@ class TopicReader:
 
     def _bind_signal(self, signal: SignalMapping, message: object) -> Get:
         path = FieldPath.of(signal.field)
-        value = walk(path, message)
-        get, numbers = getter(path, message), names_from_unit(signal.unit)
+        walk(path, message)
+        get, numbers = _getter_of_set_values(path, message), names_from_unit(signal.unit)
         names = enum_names(path, message)
         if names and not (numbers and numbers.keys().isdisjoint(names.values())):
             number = get
@@ -916,11 +930,10 @@ class TopicReader:
             def get(message: object) -> object:
                 # as in JSON, whose enums are texts; a number without a name stays one
                 code = number(message)
-                return names.get(code, str(code) if numbers else code)
+                return names.get(code, str(code) if numbers and code is not None else code)
 
-            value = get(message)
         try:
-            _number(value)
+            _number(get(message))
         except (TypeError, OverflowError):
             raise FieldError(f"{signal.field}: its value is neither a number nor a text") from None
 
@@ -977,6 +990,18 @@ class TopicReader:
 
     def _misfit_error(self, reason: str) -> UsageError:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {reason}")
+
+
+def _getter_of_set_values(path: FieldPath, example: object) -> Get:
+    """Return the getter of a path, which returns None where a protobuf sender did not set the field."""
+    get = getter(path, example)
+    if not may_be_unset(path, example):
+        return get
+
+    def get_if_set(message: object) -> object:
+        return get(message) if is_set(path, message) else None
+
+    return get_if_set
 
 
 def unit_of_stamp(stamp: int, log_time_ns: int) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.struct_pb2 import Struct
 
@@ -208,3 +210,25 @@ def test_an_enum_of_protobuf_is_a_class_by_its_name_or_number() -> None:
     ):
         (sample,) = read(keys + names, update).trace
         assert [sample.objects[name].class_name for name in ("d0", "d1")] == classes
+
+
+def test_a_position_that_protobuf_did_not_set_is_unknown() -> None:
+    unset, origin = PoseInFrame(frame_id="map"), PoseInFrame(frame_id="map")
+    unset.pose.orientation.w = origin.pose.orientation.w = 1.0
+    origin.pose.position.SetInParent()
+    made = read("signals: {x: pose.position.x}, name: t", origin, unset, origin, name="foxglove.PoseInFrame")
+    assert made.states("t") == "+?+"
+    assert made.trace.signals["x"].tolist()[::2] == [0.0, 0.0]
+    assert made.trace.signals["x"][1] != made.trace.signals["x"][1]
+    assert made.remarks == (
+        "test.bag: /t: 1 object did not set pose.position.x, so it is unknown there",
+        "test.bag: /t: 1 object did not set pose.position.y, so it is unknown there",
+    )
+
+
+def test_an_optional_number_that_protobuf_did_not_set_is_unknown() -> None:
+    contents = FieldDescriptorProto(number=0, label=1), FieldDescriptorProto(name="x")  # type: ignore[arg-type]
+    made = read("signals: {number: number, label: label}", *contents)
+    assert made.trace.signals["number"][0] == 0.0
+    # the default of the enum is its first number, 1
+    assert np.isnan([made.trace.signals[name] for name in ("number", "label")])[:, 1].all()
