@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.plausibility import ThresholdRange
     from spatial_replay.monitor.stream import SeriesBlock
     from spatial_replay.sanity.examine import Examination
+    from spatial_replay.trace.doubts import Doubt
     from spatial_replay.trace.trace import Trace
 
 
@@ -254,6 +255,7 @@ def _compare_with_log(
     evaluation = _CutResults(specification)
     ends = RunEnds(Needs.of([specification], {}))
     faults: list[str] = []
+    doubts: list[Doubt] = []
 
     def compare(traces: Iterable[Trace]) -> None:
         for trace in traces:
@@ -265,9 +267,11 @@ def _compare_with_log(
             names.add(block.trace)
             compare(ends.add(block.trace))
             faults += block.trace.faults
+            doubts += block.doubts
             advance(len(block.trace))
     compare(ends.finish())
-    remarks = (Sentence(f"{source.name}: ", remark) for remark in ends.remarks)
+    remarks = [doubt.remark(source.name) for doubt in dict.fromkeys(doubts)]
+    remarks += [Sentence(f"{source.name}: ", remark) for remark in ends.remarks]
     warn(*counted_from((*faults, *remarks), ends.log_begin_ns))
     unknown = names.check(specification, {})
     missing = sum(diagnostic.severity == "error" for diagnostic in unknown)

@@ -2,17 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
 from spatial_replay.monitor.ends import Needs
 from spatial_replay.monitor.stream import Instance
-from spatial_replay.spec.formula import ANY_CLASS, Specification
+from spatial_replay.spec.formula import ANY_CLASS, NamedSpec, Specification
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import ABSENT, Trace
+
+
+class ClassMembers:
+    """The objects that were of some classes in any sample so far.
+
+    Args:
+        classes: in lower case; any object is one of `ANY_CLASS`.
+    """
+
+    def __init__(self, classes: Iterable[str]) -> None:
+        self._names = {name: set[str]() for name in classes if name != ANY_CLASS}
+
+    def __bool__(self) -> bool:
+        """Return whether there is a class whose members are collected."""
+        return bool(self._names)
+
+    def add(self, trace: Trace) -> None:
+        """Add the objects of the next samples."""
+        own = {code: (name or "").casefold() for code, name in enumerate(trace.classes)}
+        codes = [code for code, name in own.items() if name in self._names]
+        if not codes:
+            return
+        rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
+        # the number of an absent object, -1, is the place of a class that is none
+        code_of_row = np.append(trace.class_code, -1)[rows]
+        for code in codes:
+            columns = np.flatnonzero((code_of_row == code).any(axis=0)).tolist()
+            self._names[own[code]].update(trace.names[column] for column in columns)
+
+    def may_include(self, classes: Iterable[str], objects: frozenset[str]) -> bool:
+        """Return whether one of the objects was of one of the classes."""
+        return bool(objects) and any(
+            name == ANY_CLASS or not objects.isdisjoint(self._names[name]) for name in classes
+        )
+
+
+def needs_of_spec(spec: NamedSpec, object: str | None = None) -> Needs:
+    """Return the names that one spec uses; the parameter of a template stands for the object."""
+    needs = Needs.of([Specification((replace(spec, parameter=None),), profile="")], {})
+    return needs if object is None else replace(needs, objects=needs.objects | {object})
+
+
+def doubts_about(needs: Needs, doubts: Iterable[Doubt], members: ClassMembers) -> tuple[Doubt, ...]:
+    """Return the doubts that results with these needs rest on, without those that are accepted."""
+    return tuple(
+        doubt
+        for doubt in doubts
+        if not doubt.is_accepted
+        and (
+            not needs.objects.isdisjoint(doubt.objects)
+            or not needs.signals.isdisjoint(doubt.signals)
+            or members.may_include(needs.classes, doubt.objects)
+        )
+    )
 
 
 def doubts_of_instances(
@@ -21,38 +74,12 @@ def doubts_of_instances(
     """Return for each instance the doubts that its verdict rests on, without those that are accepted.
 
     Args:
-        traces: iterates over the samples; called where an instance has groups of a class.
+        traces: iterates over the samples; called if there are doubts and groups of a class.
     """
-    doubts = [doubt for doubt in doubts if not doubt.is_accepted]
-
-    @cache
-    def members(classes: frozenset[str]) -> frozenset[str]:
-        return frozenset().union(*(_members(trace, classes) for trace in traces()))
-
-    def rests_on(needs: Needs, doubt: Doubt) -> bool:
-        if not (needs.objects.isdisjoint(doubt.objects) and needs.signals.isdisjoint(doubt.signals)):
-            return True
-        if not (needs.classes and doubt.objects):
-            return False
-        return ANY_CLASS in needs.classes or not doubt.objects.isdisjoint(members(needs.classes))
-
-    return [
-        tuple(doubt for doubt in doubts if rests_on(needs, doubt))
-        for needs in (map(_needs, instances) if doubts else [Needs()] * len(instances))
-    ]
-
-
-def _needs(instance: Instance) -> Needs:
-    """Return the names that one instance uses; a template's parameter stands for its object."""
-    needs = Needs.of([Specification((replace(instance.spec, parameter=None),), profile="")], {})
-    return needs if instance.object is None else replace(needs, objects=needs.objects | {instance.object})
-
-
-def _members(trace: Trace, classes: Collection[str]) -> frozenset[str]:
-    """Return the objects that are of some classes, given in lower case, in any sample."""
-    codes = [code for code, name in enumerate(trace.classes) if (name or "").casefold() in classes]
-    if not codes:
-        return frozenset()
-    rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
-    is_member = (rows != ABSENT) & np.isin(trace.class_code, codes)[rows]
-    return frozenset(trace.names[column] for column in np.flatnonzero(is_member.any(axis=0)).tolist())
+    if all(doubt.is_accepted for doubt in doubts):
+        return [()] * len(instances)
+    needs_of_each = [needs_of_spec(instance.spec, instance.object) for instance in instances]
+    members = ClassMembers(name for needs in needs_of_each for name in needs.classes)
+    for trace in traces() if members else ():
+        members.add(trace)
+    return [doubts_about(needs, doubts, members) for needs in needs_of_each]

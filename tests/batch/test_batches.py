@@ -1071,7 +1071,8 @@ def test_a_verdict_that_rests_on_a_doubt_passes_nowhere_unless_it_is_allowed(fle
         assert (accepted.code, f"accepted: {said}" in accepted.err) == (0, True)
     assert (command("report", *spec, "-o", "walk.html").code, command("explain", *spec).code) == (4, 4)
     assert f"The verdict is doubtful: {said}." in Path("walk.html").read_text()
-    assert said in command("info", "walk.mcap").err
+    for reading in (("info", "walk.mcap"), ("check", "gate.spatial", "--log", "walk.mcap")):
+        assert f"walk.mcap: doubtful: {said}" in command(*reading).err
 
 
 def test_every_output_of_a_batch_says_which_results_are_doubtful(
