@@ -303,10 +303,10 @@ MAX_SHAPES = 200_000
 def _signed(atom: Atom) -> tuple[Expression, bool]:
     """Return an expression that says the same as a relation, or the opposite, and whether it is the same.
 
-    Signals are left as they are: they are often equal to their limits, where both hold.
+    Comparisons of signals are left as they are: signals are often equal to their limits, where both hold.
     """
     expression, is_positive = atom.expression, True
-    while atom.relation != "signal":
+    while atom.relation not in ("signal", "sum"):
         match expression:
             case Negative(operand=operand):
                 expression = operand

@@ -24,6 +24,7 @@ from spatial_replay.spec.formula import (
     DerivedTerm,
     Formula,
     Group,
+    Number,
     Outline,
     Quantified,
     RegionName,
@@ -45,6 +46,7 @@ from spatial_replay.spec.walks import (
     iter_terms,
     map_leaves,
     rewritten,
+    signals_in,
     without_variables,
 )
 
@@ -522,6 +524,9 @@ def _without_numbers(atom: Atom) -> Hashable:
     texts = tuple(each for each in atom.parameters if isinstance(each, str))
     # the number of a signal's comparison is a text too: NAME, comparison, number
     texts = texts[:2] if atom.relation == "signal" else texts
+    if atom.relation == "sum":
+        zero = Number(0.0)
+        return texts, map_leaves(atom.expression, lambda leaf: zero if isinstance(leaf, Number) else leaf)
     return texts, len(atom.parameters), tuple((type(term), format_term(base_of(term))) for term in atom.terms)
 
 
@@ -533,11 +538,9 @@ def similarity(old: Formula, new: Formula) -> float:
 
 def _subjects(formula: Formula) -> Counter[str]:
     found = Counter(format_term(base_of(term)) for term in iter_terms([formula]))
-    found.update(
-        str(node.parameters[0])
-        for _, _, node in iter_nodes(formula)
-        if isinstance(node, Atom) and not node.terms
-    )
+    atoms = [node for _, _, node in iter_nodes(formula) if isinstance(node, Atom)]
+    found.update(str(atom.parameters[0]) for atom in atoms if not atom.terms and atom.relation != "sum")
+    found.update(name for atom in atoms if atom.relation == "sum" for name in signals_in(atom.expression))
     return found
 
 

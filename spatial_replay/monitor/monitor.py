@@ -39,9 +39,18 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import check_names, object_names, signal_names, with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import NamedSpec, Number, Signal, Specification, iter_nodes
+from spatial_replay.spec.formula import (
+    Atom,
+    NamedSpec,
+    Number,
+    Product,
+    Scaled,
+    Signal,
+    Specification,
+    iter_nodes,
+)
 from spatial_replay.spec.load import require_specification
-from spatial_replay.spec.walks import declared_unit
+from spatial_replay.spec.walks import declared_unit, iter_expressions
 from spatial_replay.text import Instant, Sentence, counted, named_arguments, time_text, times_apart, with_unit
 from spatial_replay.trace.trace import (
     FOREVER,
@@ -534,6 +543,12 @@ class Violation:
         return f"{short}: {_deciding_words(self.atom, self.witness, self.first_ns)}"
 
 
+def _has_factor(atom: Atom) -> bool:
+    """Return whether what an atom measures is multiplied: its amount is not that of the signal then."""
+    whole = atom.expression.operand if isinstance(atom.expression, Scaled) else atom.expression
+    return any(isinstance(part, Product | Scaled) for part in iter_expressions(whole))
+
+
 def _settling(atom: DecidingAtom) -> float:
     return atom.upper if atom.end is End.HIGH else atom.lower
 
@@ -548,6 +563,8 @@ def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
 def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
     """Return what is wrong in a few words: in which direction a distance or a signal is off."""
     signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
+    if _has_factor(atom.atom):
+        signed = []
     if len(signed) == 1 and len(atom.measured) == 1:
         (sign, part), *_ = signed
         (measured,) = atom.measured

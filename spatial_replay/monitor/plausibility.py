@@ -363,7 +363,9 @@ def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float
 
 
 def _compared(atom: Atom) -> Expression | None:
-    """Return the signal or distance that an atom compares with something; None if that is not one."""
+    """Return the signal or distance that an atom compares with numbers; None if it is computed or not one."""
+    if atom.relation == "sum":
+        return None
     parts = {each for each in iter_expressions(atom.expression) if isinstance(each, (Signal, Measurement))}
     part = parts.pop() if len(parts) == 1 else None
     has_limit = atom.relation == "signal" or any(isinstance(each, float) for each in atom.parameters)

@@ -38,6 +38,7 @@ from spatial_replay.spec.formula import (
     Number,
     Outline,
     Present,
+    Product,
     Projection,
     Protrusion,
     Quantified,
@@ -117,6 +118,8 @@ def _build(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
             if is_text_number(value) or isinstance(signal, Present):
                 raise OverflowError("a text, or whether an object is in the sample")
             return _build(compare(signal, "==", value), regions)
+        case Product():
+            return _times(_build(expression.operand, regions), exact(expression.factor))
         case Scaled():
             return _times(_build(expression.operand, regions), 1 / exact(expression.divisor))
         case Minimum() | Maximum():

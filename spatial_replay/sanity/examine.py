@@ -40,7 +40,7 @@ from spatial_replay.spec.formula import (
     iter_nodes,
 )
 from spatial_replay.spec.load import require_specification
-from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, terms_of
+from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, signals_in, terms_of
 from spatial_replay.text import counted, json_fields, named_arguments, number_text, shortened_formula
 
 MAX_PAIRS: Final = 300
@@ -250,7 +250,8 @@ def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[b
 def _subject(formula: Formula) -> frozenset[str]:
     """Return the objects, regions and signals that a formula is about."""
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
-    signals = {str(atom.parameters[0]) for atom in atoms if atom.relation == "signal"}
+    computed = [atom for atom in atoms if atom.relation in ("signal", "sum")]
+    signals = {name for atom in computed for name in signals_in(atom.expression)}
     named = {part.name for part in iter_formulas(formula) if part.name is not None}
     return (other_names(formula) - named) | signals
 

@@ -40,6 +40,7 @@ from spatial_replay.spec.walks import (
     logged_signals,
     named_members,
     rewritten,
+    summed_units,
     terms_of,
     units_of,
 )
@@ -302,7 +303,8 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
     """Return a specification that compares signals with numbers, not with the names that these have.
 
     Raises:
-        SpecificationError: it compares a signal with a name that none of its numbers has.
+        SpecificationError: it compares a signal with a name that none of its numbers has, or adds or compares
+            numbers of different units.
     """
     tables = {signal: names for signal, unit in units.items() if (names := names_from_unit(unit))}
     faults = Faults(SourceText.of(specification.source, specification.filename))
@@ -325,7 +327,16 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
         exact = replace(part, value=numbers[part.value])
         return replace(atom, expression=exact if part is atom.expression else -exact)
 
+    for atom in _atoms(specification):
+        summed = summed_units(atom.expression, units) if atom.relation == "sum" else []
+        if len(summed) > 1:
+            message = f"`{atom.text}` adds or compares numbers in {' and '.join(summed)}"
+            hint = (
+                "multiply one of them by a constant that converts it, or by 1 if its declared unit is wrong"
+            )
+            faults.add(atom.span, message, hint)
     if not any(map(compared, _atoms(specification))):
+        faults.raise_if_any()
         return specification
     specs = tuple(replace(spec, formula=rewritten(spec.formula, change)) for spec in specification.specs)
     faults.raise_if_any()

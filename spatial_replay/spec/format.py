@@ -19,12 +19,23 @@ from spatial_replay.spec.formula import (
     Centre,
     Earlier,
     Enlarged,
+    Expression,
     Formula,
     Group,
+    Maximum,
+    Minimum,
     NamedSpec,
+    Negative,
+    Number,
     Outline,
+    Product,
     Quantified,
+    Rate,
+    Scaled,
+    Signal,
+    SignedDistance,
     Specification,
+    Sum,
     Temporal,
     Term,
     Truth,
@@ -107,6 +118,8 @@ def format_relation(
             measured = f"rate({written_name(signal, relations)})"
         if len(values) == 2:
             return f"{measured} {values[0]} {values[1]}"
+        if not values:
+            return measured
         return f"{values[0]} {values[1]} {measured} {values[2]} {values[3]}"
     if relation == "present":
         return f"present({names[0]})"
@@ -115,6 +128,71 @@ def format_relation(
     bracket = f"[{', '.join(values)}]" if values else ""
     right = f"({names[1]}, {names[2]})" if relation == "between" else names[1]
     return f"{names[0]} {relation}{bracket} {right}"
+
+
+def format_atom(
+    relation: str,
+    expression: Expression,
+    terms: Sequence[Term],
+    parameters: Sequence[float | str],
+    relations: frozenset[str] = RELATION_NAMES,
+) -> str:
+    """Return an atom as written (see `Atom`); computed numbers are written from what they compute."""
+    if relation != "sum":
+        return format_relation(relation, terms, parameters, relations)
+    whole = expression.operand if isinstance(expression, Scaled) else expression
+    margins = whole.operands if isinstance(whole, Minimum) else (whole,)
+    signs = [sign for sign in parameters if isinstance(sign, str)]
+    sides = [_sides(margin, sign) for margin, sign in zip(margins, signs, strict=True)]
+    texts = [format_sum(side, relations) for side in (sides[0][0], *(right for _, right in sides))]
+    return texts[0] + "".join(f" {sign} {text}" for sign, text in zip(signs, texts[1:], strict=True))
+
+
+def _sides(margin: Expression, sign: str) -> tuple[Expression, Expression]:
+    """Return what stands left and right of a comparison, given its margin (see `relations.compare`)."""
+    match margin:
+        case Sum(first, Negative(second)):
+            return (first, second) if sign.startswith(">") else (second, first)
+    raise TypeError(f"{margin!r} is no margin of a comparison")
+
+
+def format_sum(expression: Expression, relations: frozenset[str] = RELATION_NAMES) -> str:
+    """Return a computed number as written, with brackets wherever another operation stands in one."""
+
+    def operand(inner: Expression) -> str:
+        text = format_sum(inner, relations)
+        is_alone = isinstance(inner, Number | Signal | Maximum)
+        return text if is_alone else f"({text})"
+
+    match expression:
+        case Number(value):
+            return format_number(value)
+        case SignedDistance(first, second):
+            return format_relation("dist", (first, second), (), relations)
+        case Rate(terms=(), signal=Signal(name)):
+            return format_relation("rate", (), (name,), relations)
+        case Rate(terms=terms):
+            return format_relation("speed", terms, (), relations)
+        case Signal(name):
+            return written_name(name, relations)
+        case Maximum((inner, _)):
+            return f"abs({format_sum(inner, relations)})"
+        case Negative(inner):
+            return f"-{operand(inner)}"
+        case Product(factor, inner):
+            return f"{format_number(factor)} * {operand(inner)}"
+        case Scaled(inner, divisor):
+            return f"{operand(inner)} / {format_number(divisor)}"
+        case Sum(first, Negative(second)):
+            return f"{_first_summand(first, relations)} - {operand(second)}"
+        case Sum(first, second):
+            return f"{_first_summand(first, relations)} + {operand(second)}"
+    raise TypeError(f"{expression!r} is no sum")
+
+
+def _first_summand(expression: Expression, relations: frozenset[str]) -> str:
+    text = format_sum(expression, relations)
+    return f"({text})" if isinstance(expression, SignedDistance | Negative) else text
 
 
 # ------------------------------------------------------------------------------------------- formulas

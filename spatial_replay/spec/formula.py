@@ -317,8 +317,16 @@ class Maximum(_OfSeveral):
 
 
 @dataclass(frozen=True, slots=True)
+class Product(_Arithmetic):
+    """`factor` * `operand`; factor > 0."""
+
+    factor: float
+    operand: Expression
+
+
+@dataclass(frozen=True, slots=True)
 class Scaled(_Arithmetic):
-    """`operand` / `divisor`, so that numbers of different units can be compared; divisor > 0."""
+    """`operand` / `divisor`: written so, or of a `scale` line; divisor > 0."""
 
     operand: Expression
     divisor: float
@@ -327,7 +335,9 @@ class Scaled(_Arithmetic):
 Measurement: TypeAlias = SignedDistance | Protrusion | Projection | CentroidProjection | Misalignment
 """An expression that geometry answers."""
 
-Expression: TypeAlias = Number | Measurement | Signal | Equality | Sum | Negative | Minimum | Maximum | Scaled
+Expression: TypeAlias = (
+    Number | Measurement | Signal | Equality | Sum | Negative | Minimum | Maximum | Product | Scaled
+)
 
 
 def as_expression(value: object) -> Expression:
@@ -396,10 +406,12 @@ class Atom:
 
     Attributes:
         text: its canonical text, in the profile of its specification.
-        relation: the relation's name ("closeto", "dist", ...; "signal" for a comparison of a signal).
+        relation: the relation's name ("closeto", "dist", ...; "signal" for a comparison of a signal; "sum"
+            for one of computed numbers).
         expression: its robustness.
         terms: what the relation is about, in the order written; none for a signal.
-        parameters: what is written besides: numbers, an axis, a comparison's operators.
+        parameters: what is written besides: numbers, an axis, a comparison's operators. The text of a "sum"
+            is that of its expression.
     """
 
     text: str
@@ -596,7 +608,7 @@ def _rates_of(expression: Expression) -> Iterator[Rate]:
         case Sum(first, second):
             yield from _rates_of(first)
             yield from _rates_of(second)
-        case Negative(operand) | Scaled(operand):
+        case Negative(operand) | Product(operand=operand) | Scaled(operand):
             yield from _rates_of(operand)
         case Minimum(operands) | Maximum(operands):
             for operand in operands:

@@ -15,7 +15,6 @@ from itertools import islice, permutations
 from os import PathLike
 from pathlib import Path, PurePath
 from reprlib import repr as shortened
-from types import MappingProxyType
 from typing import Any, get_args
 
 from lark import Token
@@ -28,17 +27,16 @@ from spatial_replay.spec.checks import (
     scale_warnings,
     unused_warnings,
 )
+from spatial_replay.spec.comparisons import ComparisonBuilder
 from spatial_replay.spec.constants import replaced
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
-from spatial_replay.spec.format import format_number, format_relation
+from spatial_replay.spec.format import format_atom, format_number
 from spatial_replay.spec.formula import (
     Atom,
     Axis,
     Boolean,
-    ComputedSignal,
     Earlier,
     Enlarged,
-    Equality,
     Expression,
     Formula,
     Group,
@@ -46,8 +44,6 @@ from spatial_replay.spec.formula import (
     NamedSpec,
     Quantified,
     RegionName,
-    Signal,
-    SignedDistance,
     Span,
     Specification,
     Temporal,
@@ -56,9 +52,8 @@ from spatial_replay.spec.formula import (
     Truth,
     Variable,
     as_expression,
-    minimum,
 )
-from spatial_replay.spec.parser import MAX_DEPTH, MIRRORED, parse_statements
+from spatial_replay.spec.parser import MAX_DEPTH, parse_statements
 from spatial_replay.spec.relations import (
     DEFAULT_PROFILE,
     PROFILES,
@@ -66,12 +61,13 @@ from spatial_replay.spec.relations import (
     THREE_TERM_RELATIONS,
     Plugin,
     Relation,
-    compare,
     plugins_of,
     used_modules,
 )
 from spatial_replay.spec.resolve import MAX_SIZE, Anything, Namespace, Resolver, Scope, Value, kind_of
 from spatial_replay.spec.syntax import (
+    DERIVED_TERMS,
+    ArgumentSyntax,
     Arithmetic,
     BooleanSyntax,
     BrokenStatement,
@@ -90,7 +86,6 @@ from spatial_replay.spec.syntax import (
     SpecStatement,
     Statement,
     TemporalSyntax,
-    TermSyntax,
     TruthSyntax,
     UseStatement,
 )
@@ -100,19 +95,15 @@ from spatial_replay.spec.walks import (
     is_centre,
     iter_expressions,
     iter_formulas,
-    looks_back,
     named_members,
     other_names,
     presence_of,
-    rate_of,
     scaled,
-    speed_of,
     substitute,
     terms_of,
 )
-from spatial_replay.text import encodable, named_arguments, text_number
+from spatial_replay.text import encodable, named_arguments
 
-_MIRRORED = MappingProxyType({">=": "<=", ">": "<"})
 _AXES: tuple[str, ...] = get_args(Axis)
 
 
@@ -155,32 +146,13 @@ class AtomBuilder:
         self._check(expression, written, scope)
         return self._atom(written.relation, expression, terms, parameters, written, scope)
 
-    def distance(self, written: DistanceSyntax, scope: Scope) -> Atom:
-        """Return the atom of `a dist b <= c`, c - sd(a, b); of a chain, the lesser of both comparisons."""
-        terms = (self.resolver.term(written.first, scope), self.resolver.term(written.second, scope))
-        return self._limited("dist", SignedDistance(*terms), terms, (), written, scope)
-
-    def rate(self, written: RateSyntax, scope: Scope) -> Formula:
-        """Return the atom of `speed(a) <= c` or `rate(signal) <= c`; `true` of anything else."""
-        given, function = written.arguments, written.function
-        if any(sign == "!=" for sign, _ in written.comparisons):
-            hint = f"write what is too slow or too fast: {function}(a) >= c, {function}(a) <= c"
-            self.resolver.fault(written.span, scope, "a rate is hardly ever exactly a number", hint)
-        if function == "rate" and len(given) == 1 and isinstance(given[0], Name):
-            signal = self._signal(given[0], scope)
-            return self._limited("rate", rate_of(signal), (), (signal.name,), written, scope)
-        if function == "rate" or not 1 <= len(given) <= 2:
-            message, hint = "'rate' takes one signal", "write rate(battery) <= c"
-            if function == "speed":
-                message, hint = "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"
-            self.resolver.fault(written.span, scope, message, hint)
-            return Truth(True)
-        terms = tuple([self._moving(each, scope, alone=len(given) == 1) for each in given])
-        return self._limited("speed", speed_of(*terms), terms, (), written, scope)
+    def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
+        """Return the atom of a comparison of numbers."""
+        return self._atom(*ComparisonBuilder(self.resolver).build(written, scope), written, scope)
 
     def presence(self, written: Call, scope: Scope) -> Formula:
         """Return the atom of `present(a)`; `true` of anything but one object."""
-        if len(written.arguments) == 1 and not isinstance(written.arguments[0], (NumberSyntax, Arithmetic)):
+        if len(written.arguments) == 1 and isinstance(written.arguments[0], (Name, *DERIVED_TERMS)):
             term = self.resolver.term(written.arguments[0], scope)
             if isinstance(term, (TrackedName, Variable)):
                 return self._atom("present", presence_of(term), (term,), (), written, scope)
@@ -188,86 +160,16 @@ class AtomBuilder:
         self.resolver.fault(written.span, scope, "'present' takes one object of the log", hint)
         return Truth(True)
 
-    def _moving(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope, *, alone: bool) -> Term:
-        """Return a term that `speed` takes."""
-        if isinstance(written, (NumberSyntax, Arithmetic)):
-            self.resolver.fault(written.span, scope, "a number has no speed", "write speed(a) or speed(a, b)")
-            return TrackedName("")
-        term = self.resolver.term(written, scope)
-        if looks_back(term):
-            hint = "leave out the [-n]"
-            self.resolver.fault(written.span, scope, "a speed is from the report before to this one", hint)
-        elif alone and isinstance(base_of(term), Group):
-            hint = "write forall p in GROUP: speed(p) <= c"
-            self.resolver.fault(written.span, scope, "a group has no speed of its own", hint)
-        elif alone and isinstance(base_of(term), RegionName):
-            hint = "write speed(a) for an object a, or speed(a, REGION)"
-            self.resolver.fault(written.span, scope, "a region never moves", hint)
-        return term
-
-    def _limited(
-        self,
-        relation: str,
-        quantity: Expression,
-        terms: tuple[Term, ...],
-        names: tuple[str, ...],
-        written: DistanceSyntax | RateSyntax,
-        scope: Scope,
-    ) -> Atom:
-        limits = [(sign, self.resolver.number(limit, scope)) for sign, limit in written.comparisons]
-        comparisons = [compare(quantity, sign, limit) for sign, limit in limits]
-        (sign, limit), *upper = limits
-        if not upper:
-            return self._atom(relation, comparisons[0], terms, (*names, sign, limit), written, scope)
-        parameters: tuple[float | str, ...] = (*names, limit, _MIRRORED[sign], *upper[0])
-        return self._atom(relation, minimum(*comparisons), terms, parameters, written, scope)
-
-    def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
-        """Return the atom of `signal >= c`, signal - c; `==` and `!=` are exact."""
-        limit_name = written.limit if isinstance(written.limit, Name) else None
-        if limit_name is not None and self.resolver.is_number(limit_name, scope):
-            limit_name = None
-        name, shown = written.signal, None
-        if limit_name is not None and (
-            self.resolver.is_number(name, scope) or (name.is_quoted and not limit_name.is_quoted)
-        ):
-            turned = ComparisonSyntax(limit_name, MIRRORED[written.operator], name, written.span)
-            return self.comparison(turned, scope)
-        if limit_name is not None and limit_name.is_quoted:
-            shown, limit = quoted(limit_name.text), text_number(limit_name.text)
-            if written.operator not in ("==", "!="):
-                self.resolver.fault(written.span, scope, "a text has no order", "compare it by == or !=")
-        else:
-            limit = self.resolver.number(written.limit, scope)
-        signal = self._signal(name, scope)
-        is_equal = Equality(signal, limit)
-        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
-        expression = exact.get(written.operator) or compare(signal, written.operator, limit)
-        parameters = (name.text, written.operator, limit if shown is None else shown)
-        return self._atom("signal", expression, (), parameters, written, scope)
-
-    def _signal(self, name: Name, scope: Scope) -> Signal:
-        """Return a signal of the log or of a plug-in; a name of something else is a fault."""
-        plugin = self.resolver.names.signals.get(name.text)
-        defined = self.resolver.names.definitions.get(name.text)
-        if name.text in scope.values:
-            message = f"{name.text!r} is a parameter or variable here; a signal of the log is expected"
-            self.resolver.fault(name.span, scope, message)
-        elif defined is not None and not isinstance(defined, BrokenStatement):
-            message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
-            self.resolver.fault(name.span, scope, message, "if the log has it, rename the definition")
-        return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
-
     def _atom(
         self,
         relation: str,
         expression: Expression,
         terms: tuple[Term, ...],
         parameters: tuple[float | str, ...],
-        written: RelationSyntax | DistanceSyntax | RateSyntax | ComparisonSyntax | Call,
+        written: RelationSyntax | ComparisonSyntax | Call,
         scope: Scope,
     ) -> Atom:
-        text = format_relation(relation, terms, parameters, self.names)
+        text = format_atom(relation, expression, terms, parameters, self.names)
         expression = scaled(expression, self.resolver.names.scales)
         span = scope.call or written.span
         return Atom(text, relation, expression, span=span, terms=terms, parameters=parameters)
@@ -584,12 +486,15 @@ class Elaborator:
                 return self._call(written, scope)
             case RelationSyntax():
                 return self.atoms.relation(written, scope) or Truth(True)
-            case DistanceSyntax():
-                return self.atoms.distance(written, scope)
-            case RateSyntax():
-                return self.atoms.rate(written, scope)
+            case NumberSyntax() | Arithmetic() | DistanceSyntax() | RateSyntax():
+                self._report_number(written, scope)
+                return Truth(True)
             case ComparisonSyntax():
                 return self.atoms.comparison(written, scope)
+            case BooleanSyntax(operator="->", operands=[left, NumberSyntax() as right]):
+                between = Span(left.span.end, right.span.start)
+                self.resolver.fault(between, scope, "'=>' means implies", "at least is written >=")
+                return Truth(True)
             case BooleanSyntax():
                 inner = scope.deeper()
                 operands = tuple([self.formula(operand, inner) for operand in written.operands])
@@ -598,6 +503,11 @@ class Elaborator:
                 return self._temporal(written, scope, span)
             case QuantifierSyntax():
                 return self.quantifiers.formula(written, scope, span)
+
+    def _report_number(self, written: FormulaSyntax, scope: Scope) -> None:
+        text = self.faults.source.text[written.span.start : written.span.end]
+        hint = f"compare it with a number: {text} <= 1"
+        self.resolver.fault(written.span, scope, "a number, where a formula is expected", hint)
 
     def _count(self, span: Span, scope: Scope) -> None:
         self.resolver.size += 1
@@ -716,9 +626,13 @@ class Elaborator:
         hint = self.faults.nearest(name, macros) or function_hint(name, inner) or "define it with def"
         self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
 
-    def _argument(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope) -> Value:
+    def _argument(self, written: ArgumentSyntax, scope: Scope) -> Value:
         if isinstance(written, (NumberSyntax, Arithmetic)):
             return self.resolver.quantity(written, scope)
+        if not isinstance(written, (Name, *DERIVED_TERMS)):
+            hint = "a macro takes objects and numbers"
+            self.resolver.fault(written.span, scope, "a formula in the place of an object", hint)
+            return Anything()
         if isinstance(written, Name):
             local = scope.values.get(written.text)
             if local is not None:

@@ -75,7 +75,6 @@ MAX_EXCLUDED = 1000
 MAX_DURATION_NS = 2**63 - 1
 
 _BOOLEAN = MappingProxyType({"AND": "and", "OR": "or", "XOR": "xor", "IMPLIES": "->", "IFF": "<->"})
-MIRRORED = MappingProxyType({"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "==", "!=": "!="})
 _NS = MappingProxyType({"s": Decimal(10**9), "ms": Decimal(10**6)})
 
 
@@ -102,23 +101,6 @@ def _deeper(operands: tuple[FormulaSyntax, ...], span: Span) -> int:
         hint = "give parts of it names of their own, with spec"
         raise StatementError(span, f"more than {MAX_DEPTH} operators within one another", hint)
     return depth
-
-
-def _chain(lower: Any, below: Any, above: Any, upper: Any) -> tuple[tuple[str, Any], tuple[str, Any]]:
-    """Return both comparisons of `lower <= a dist b <= upper`, each as if the number stood on the right."""
-    for token, side in ((below, "left"), (above, "right")):
-        if token.value not in ("<=", "<"):
-            message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
-            raise StatementError(span_of(token), message, _chain_hint(below.value, above.value))
-    return (MIRRORED[below.value], lower), (above.value, upper)
-
-
-def _chain_hint(below: str, above: str) -> str:
-    if {"==", "!="} & {below, above}:
-        return "write a dist b == c, or c1 <= a dist b <= c2"
-    if below[0] == above[0]:
-        return "write the lesser limit first: c1 <= a dist b <= c2"
-    return "write it as c1 <= a dist b <= c2, or as two comparisons joined by and"
 
 
 def read_number(text: str, span: Span) -> float | Duration:
@@ -172,7 +154,8 @@ def _looking_back(written: Quantity) -> Quantity:
             leftmost = leftmost.operands[0]
         if isinstance(leftmost, Arithmetic):
             if leftmost is written:
-                return written.operands[0]
+                operand: Quantity = written.operands[0]
+                return operand
             return Arithmetic("-", (written,), written.span, written.depth + 1)
     hint = "write [-3] for three samples earlier, [-2.5s] for 2.5 seconds"
     if isinstance(written, Name):
@@ -248,10 +231,6 @@ class TreeBuilder:
         first, token, second = children
         return _arithmetic(token.value, (first, second), children)
 
-    def grouped(self, children: list[Any]) -> Quantity:
-        inner: Quantity = children[1]
-        return inner if isinstance(inner, Name) else inner._replace(span=_cover(children))
-
     # -------------------------------------------------------------------------------------- formulas
 
     def chain(self, children: list[Any]) -> BooleanSyntax:
@@ -297,7 +276,7 @@ class TreeBuilder:
         inner = children[1]
         if isinstance(inner, BooleanSyntax):
             return inner._replace(span=_cover(children), is_bracketed=True)
-        return inner._replace(span=_cover(children))
+        return inner if isinstance(inner, Name) else inner._replace(span=_cover(children))
 
     def relation(self, children: list[Any]) -> RelationSyntax:
         first, token, parameters, second = children
@@ -314,35 +293,14 @@ class TreeBuilder:
         return RelationSyntax("between", span_of(token), terms, parameters or (), _cover(children))
 
     def distance(self, children: list[Any]) -> DistanceSyntax:
-        first, _, second, token, limit = children
-        if token.value == "!=":
-            hint = "write what is too near or too far: a dist b <= c, a dist b >= c"
-            raise StatementError(span_of(token), "a distance is hardly ever exactly a number", hint)
-        return DistanceSyntax(first, second, ((token.value, limit),), _cover(children))
-
-    def turned_distance(self, children: list[Any]) -> DistanceSyntax:
-        lower, below, first, dist, second, above, upper = children
-        if above is None:
-            turned = below.update(value=MIRRORED[below.value])
-            return self.distance([first, dist, second, turned, lower])._replace(span=_cover(children))
-        return DistanceSyntax(first, second, _chain(lower, below, above, upper), _cover(children))
+        return DistanceSyntax(children[0], children[2], _cover(children))
 
     def rate(self, children: list[Any]) -> RateSyntax:
-        function, _, arguments, _, token, limit = children
-        return RateSyntax(function.value, arguments or (), ((token.value, limit),), _cover(children))
-
-    def turned_rate(self, children: list[Any]) -> RateSyntax:
-        lower, below, function, _, arguments, _, above, upper = children
-        chain = ((MIRRORED[below.value], lower),) if above is None else _chain(lower, below, above, upper)
-        return RateSyntax(function.value, arguments or (), chain, _cover(children))
+        return RateSyntax(children[0].value, children[2] or (), _cover(children))
 
     def comparison(self, children: list[Any]) -> ComparisonSyntax:
-        signal, token, limit = children
-        return ComparisonSyntax(signal, token.value, limit, _cover(children))
-
-    def turned_comparison(self, children: list[Any]) -> ComparisonSyntax:
-        limit, token, signal = children
-        return ComparisonSyntax(signal, MIRRORED[token.value], limit, _cover(children))
+        present = [child for child in children if child is not None]
+        return ComparisonSyntax(tuple(present[::2]), tuple(present[1::2]), _cover(children))
 
     # ----------------------------------------------------------------------------------------- terms
 
@@ -710,9 +668,6 @@ def _report(
         faults.add(span, found, hint)
     elif "TITLE" in accepted and token.type == "NAME":
         hint = 'a title is written in quotes: spec NAME "REQ-12: what must hold" = ...'
-        faults.add(span, found, hint)
-    elif before is not None and before.type == "COMPARE" and token.type == "NUMBER":
-        hint = "a signal is compared as it is, battery >= 1.5; a distance as 1 <= a dist b <= 2"
         faults.add(span, found, hint)
     elif "NAME" in accepted and token.type == "NUMBER":
         hint = f"a name that begins with a digit is written in quotes: {quoted(token.value)}"

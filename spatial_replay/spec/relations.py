@@ -49,7 +49,7 @@ ComparisonOperator: TypeAlias = Literal["<=", "<", ">=", ">", "=="]
 THREE_TERM_RELATIONS: frozenset[str] = frozenset({"closer", "between"})
 
 
-def compare(quantity: Expression, operator: str, limit: float) -> Expression:
+def compare(quantity: Expression, operator: str, limit: Expression | float) -> Expression:
     """Return the margin by which a quantity keeps a limit; strict comparisons have the same."""
     match operator:
         case "<=" | "<":

@@ -6,7 +6,9 @@ They are named tuples: there are many kinds, and declaring one takes a tenth of 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+from lark import Token
 
 from spatial_replay.spec.formula import Span
 
@@ -38,10 +40,13 @@ class NumberSyntax(NamedTuple):
 
 
 class Arithmetic(NamedTuple):
-    """`first * second` or another operation; `-` with one operand is its negative."""
+    """`first * second` or another operation; `-` with one operand is its negative.
+
+    In formulas the operands are what was written there: a number, a signal, a distance or a mistake.
+    """
 
     operator: Literal["+", "-", "*", "/"]
-    operands: tuple[Quantity, ...]
+    operands: tuple[Any, ...]
     span: Span
     depth: int
 
@@ -89,6 +94,9 @@ class CentreSyntax(NamedTuple):
     span: Span
 
 
+DERIVED_TERMS = (OpenGroup, Exclusion, Delayed, Enlargement, CentreSyntax)
+"""Kinds of terms without names, which may also be those of numbers or formulas."""
+
 TermSyntax: TypeAlias = Name | OpenGroup | Exclusion | Delayed | Enlargement | CentreSyntax
 
 # ------------------------------------------------------------------------------------------- formulas
@@ -102,10 +110,10 @@ class TruthSyntax(NamedTuple):
 
 
 class Call(NamedTuple):
-    """`name(argument, ...)`: a use of a `def`."""
+    """`name(argument, ...)`: a use of a `def`, or `abs`."""
 
     name: Name
-    arguments: tuple[TermSyntax | NumberSyntax | Arithmetic, ...]
+    arguments: tuple[ArgumentSyntax, ...]
     span: Span
 
 
@@ -120,38 +128,26 @@ class RelationSyntax(NamedTuple):
 
 
 class DistanceSyntax(NamedTuple):
-    """`first dist second <= c`, or `c1 <= first dist second <= c2`.
-
-    Attributes:
-        comparisons: in the order written, each as if the distance stood on the left.
-    """
+    """`first dist second`."""
 
     first: TermSyntax
     second: TermSyntax
-    comparisons: tuple[tuple[str, Quantity], ...]
     span: Span
 
 
 class RateSyntax(NamedTuple):
-    """`speed(a) <= c`, `speed(a, b) <= c` or `rate(signal) <= c`, or a chain of two comparisons.
-
-    Attributes:
-        function: "speed" or "rate".
-        comparisons: in the order written, each as if the rate stood on the left.
-    """
+    """`speed(a)`, `speed(a, b)` or `rate(signal)`; `function` is "speed" or "rate"."""
 
     function: str
-    arguments: tuple[TermSyntax | NumberSyntax | Arithmetic, ...]
-    comparisons: tuple[tuple[str, Quantity], ...]
+    arguments: tuple[ArgumentSyntax, ...]
     span: Span
 
 
 class ComparisonSyntax(NamedTuple):
-    """`signal >= 3.0`."""
+    """`signal >= 3.0` or, with three operands, `1 <= a dist b <= 2`; `operators` are between them."""
 
-    signal: Name
-    operator: str
-    limit: Quantity
+    operands: tuple[FormulaSyntax, ...]
+    operators: tuple[Token, ...]
     span: Span
 
 
@@ -196,7 +192,7 @@ class QuantifierSyntax(NamedTuple):
 
 
 FormulaSyntax: TypeAlias = (
-    Name
+    Quantity
     | TruthSyntax
     | Call
     | RelationSyntax
@@ -207,6 +203,9 @@ FormulaSyntax: TypeAlias = (
     | TemporalSyntax
     | QuantifierSyntax
 )
+
+
+ArgumentSyntax: TypeAlias = TermSyntax | FormulaSyntax
 
 
 def depth_of(formula: FormulaSyntax) -> int:

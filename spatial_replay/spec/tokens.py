@@ -96,8 +96,7 @@ _LENGTHS: Mapping[str, float] = MappingProxyType(
 """Units of length, in metres."""
 _TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
 _PER = re.compile(r"\s*/\s*([a-z]+)")
-_OPPOSITE: Mapping[str, str] = MappingProxyType({"STAR": "/", "SLASH": "*", "PLUS": "-", "MINUS": "+"})
-"""Signs of arithmetic, and what each is on the other side of a comparison."""
+_ARITHMETIC = frozenset({"STAR", "SLASH", "PLUS", "MINUS"})
 _SHAPES: Mapping[str, str] = MappingProxyType(
     {
         **dict.fromkeys(("rect", "rectangle", "square", "aabb", "box"), "box(xmin, ymin, xmax, ymax)"),
@@ -357,44 +356,14 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         )
     if token.type in ("NAME", "IN", "ALL"):
         return _meant_word(token, last, after, accepted)
-    if token.type == "DIST" and before.type == "COMPARE":
-        return "a distance is compared with a number", "of two, write which is less: a closer b than c"
-    if token.type == "DIST" and before.type in ("STAR", "PLUS"):
-        return f"a distance has no {before.value!r}", "it is compared as it is: put the number into its limit"
-    if token.type in _OPPOSITE and before.type == "DIST" and "COMPARE" in accepted:
-        return f"a distance has no {token.value!r}", "it is compared as it is: put the number into its limit"
-    if last.type == "NAME" and before.type == token.type == "COMPARE":
-        return _meant_range(tokens, position)
-    if last.type == "COMPARE" and token.type in ("NUMBER", "MINUS") and _has_arithmetic(tokens, position):
-        return "a signal is compared as it is", _meant_arithmetic(tokens, position)
-    if token.type == "COMPARE" and (call := _meant_call(tokens[:position], token.value, after.value)):
-        return call
+    is_delayed = last.type == "RSQB" and "DIST" in accepted and "AND" not in accepted
+    if is_delayed and token.type in (*_ARITHMETIC, "COMPARE", "RPAR", "$END"):
+        hint = "rate(x) is its change since its last report, Y (x >= 1) looks at the sample before"
+        return "a signal has no [-n]", hint
     if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
         hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
         return found, f"{hint}; a range is two comparisons, joined by and"
     return None
-
-
-def _meant_call(tokens: Sequence[Token], comparison: str, limit: str) -> tuple[str, str] | None:
-    """Return what was meant by a function of one or two names in front of a comparison."""
-    limit = limit or "..."
-    match [each.type for each in tokens[-4:]], [each.type for each in tokens[-6:]]:
-        case ["NAME", "LPAR", "NAME", "RPAR"], _:
-            name, signal = tokens[-4].value, tokens[-2].value
-            hint = f"a signal is compared as it is: {signal} {comparison} {limit}"
-            if name.lower() in ("abs", "fabs", "norm", "magnitude"):
-                turned = comparison.translate(str.maketrans("<>", "><"))
-                both = "and" if comparison[0] == "<" else "or"
-                hint = f"write {signal} {turned} -{limit} {both} {signal} {comparison} {limit}"
-            elif name.lower() in ("velocity", "vel", "derivative", "der", "diff"):
-                word = "speed" if name.lower().startswith("vel") else "rate"
-                hint = f"it is written {word}({signal}) {comparison} {limit}"
-        case _, ["NAME", "LPAR", "NAME", "COMMA", "NAME", "RPAR"]:
-            name, first, second = tokens[-6].value, tokens[-4].value, tokens[-2].value
-            hint = f"a distance is written between its objects: {first} dist {second} {comparison} {limit}"
-        case _:
-            return None
-    return f"{name!r} is not a function", hint
 
 
 def _meant_window(tokens: Sequence[Token], position: int) -> str:
@@ -423,33 +392,6 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
         case ["LSQB", "NUMBER", "COMMA", "NAME", "RPAR"]:
             return f"{operator}[{numbers[0]}, {inner[3].value}]"
     return ""
-
-
-def _has_arithmetic(tokens: Sequence[Token], position: int) -> bool:
-    """Return whether the left side of the comparison in front of a token is computed."""
-    for token in reversed(tokens[: position - 1]):
-        if token.type in _OPPOSITE:
-            return True
-        if token.type not in ("NAME", "NUMBER"):
-            break
-    return False
-
-
-def _meant_arithmetic(tokens: Sequence[Token], position: int) -> str:
-    """Return how a comparison of a computed signal is written, with the arithmetic on its other side."""
-    before = [*tokens[max(0, position - 5) : position]]
-    match [each.type for each in before[-4:]]:
-        case ["NAME", sign, "NUMBER", "COMPARE"] if sign in _OPPOSITE:
-            name, _, number, comparison = (each.value for each in before[-4:])
-        case ["NUMBER", "STAR" | "PLUS" as sign, "NAME", "COMPARE"]:
-            number, _, name, comparison = (each.value for each in before[-4:])
-        case _:
-            return "write it with one signal and a number: battery >= 1.5; only constants are computed"
-    right = tokens[position]
-    is_alone = len(before) < 5 or before[0].type not in _OPPOSITE
-    if right.type != "NUMBER" or not is_alone:
-        return "put the numbers on the other side: battery >= 3 / 2"
-    return f"put the numbers on the other side: {name} {comparison} {right.value} {_OPPOSITE[sign]} {number}"
 
 
 def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
@@ -483,14 +425,6 @@ def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[st
     return None
 
 
-def _meant_range(tokens: Sequence[Token], position: int) -> tuple[str, str]:
-    """Return what was meant by `5 <= battery <= 8`."""
-    limit, sign, name = (each.value for each in tokens[position - 3 : position])
-    turned = sign.translate(str.maketrans("<>", "><"))
-    then = tokens[position + 1].value if position + 1 < len(tokens) else "..."
-    return "a range of a signal", f"write {name} {turned} {limit} and {name} {tokens[position].value} {then}"
-
-
 def meant_statement(tokens: Sequence[Token]) -> str:
     """Return how a line is written that begins with no word of a statement; "" where that is not known."""
     line = [each for each in tokens if each.line == tokens[0].line]
@@ -505,7 +439,7 @@ def meant_statement(tokens: Sequence[Token]) -> str:
     value = line[3:] if line[2].type == "EQUAL" else line[2:]
     if not value:
         return ""
-    is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in value)
+    is_number = all(each.type in ("NUMBER", "NAME", *_ARITHMETIC) for each in value)
     definition = f"{line[0].value} = {_as_written(value)}"
     if is_number:
         return f"a number is defined by const {definition}; equality is written =="
@@ -566,19 +500,29 @@ def _argument(tokens: Sequence[Token], start: int) -> str:
     return f"({_as_written(tokens[start : end - (depth == 0)])})"
 
 
-def function_hint(name: str, argument: str) -> str:
+def function_hint(name: str, argument: str, arguments: Sequence[str] = ()) -> str:
     """Return how a function of other tools is written; "" where it is none that is known.
 
     Args:
         argument: what it was of, in brackets.
+        arguments: each by itself, where a number is expected.
     """
+    match name.lower(), arguments:
+        case "fabs" | "norm" | "magnitude", [inner]:
+            return f"it is written abs({inner})"
+        case "velocity" | "vel", [inner]:
+            return f"it is written speed({inner})"
+        case "derivative" | "der" | "diff", [inner]:
+            return f"it is written rate({inner})"
+        case "min" | "max", [_, _, *_]:
+            return "compare each by itself, joined by and, or by or"
+        case _, [first, second] if first.isidentifier() and second.isidentifier():
+            return f"a distance is written between its objects: {first} dist {second}"
     match name.lower():
         case "rise" | "rising" | "rising_edge" | "rose":
             return f"a rising edge is written (Y not {argument}) and {argument}"
         case "fall" | "falling" | "falling_edge" | "fell":
             return f"a falling edge is written (Y {argument}) and not {argument}"
-        case "abs" | "fabs" | "norm" | "magnitude" if " dist " in argument:
-            return f"a distance is compared as it is: leave {name} out"
         case "until":
             return "it stands between its formulas: (p) U (q)"
         case word if word in _MEANT_RELATIONS:

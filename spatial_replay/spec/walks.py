@@ -9,7 +9,7 @@ from itertools import chain
 from math import inf
 from typing import Any, Literal
 
-from spatial_replay.spec.format import format_number, format_relation, format_term
+from spatial_replay.spec.format import format_atom, format_number, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -33,6 +33,7 @@ from spatial_replay.spec.formula import (
     Number,
     Present,
     PreviousSignal,
+    Product,
     Projection,
     Protrusion,
     Quantified,
@@ -92,7 +93,7 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
         match current:
             case Sum():
                 stack += (current.second, current.first)
-            case Negative() | Scaled():
+            case Negative() | Product() | Scaled():
                 stack.append(current.operand)
             case Equality():
                 stack.append(current.signal)
@@ -198,6 +199,11 @@ def logged_signals(expression: Expression) -> Iterator[str]:
         signal = signal.signal if isinstance(signal, PreviousSignal) else signal
         if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal | HasRate | Present):
             yield signal.name
+
+
+def signals_in(expression: Expression) -> frozenset[str]:
+    """Return the names of the signals, and of the rates, that an expression compares."""
+    return frozenset(part.name for part in iter_expressions(expression) if isinstance(part, Signal))
 
 
 def iter_formulas(formula: Formula) -> Iterator[Formula]:
@@ -371,7 +377,7 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
             terms = tuple(substitute_term(term, names) for term in formula.terms)
             text = formula.text
             if terms:
-                text = format_relation(formula.relation, terms, formula.parameters, relations)
+                text = format_atom(formula.relation, expression, terms, formula.parameters, relations)
             return replace(formula, text=text, terms=terms, expression=expression)
         case Quantified():
             group: Any = substitute_term(formula.group, names)
@@ -471,6 +477,8 @@ def map_leaves(
             return Minimum(tuple([map_leaves(each, change) for each in expression.operands]))
         case Maximum():
             return Maximum(tuple([map_leaves(each, change) for each in expression.operands]))
+        case Product():
+            return Product(expression.factor, map_leaves(expression.operand, change))
         case Scaled():
             return Scaled(map_leaves(expression.operand, change), expression.divisor)
         case Equality(Present() as presence):
@@ -494,6 +502,8 @@ def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], T
 
 LENGTHS = "lengths"
 """Name of the footprint units in `scale`."""
+MULTIPLES = "multiples"
+"""Name of the unit of a number that is computed from multiples alone, as in `2 * x <= 1`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -537,15 +547,18 @@ def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: b
         declared: the units of signals by their names, that of lengths by "".
         is_scaled: whether the number is what `scale` made of it, which has no unit.
     """
-    found = {
-        ""
-        if each.kind == "orientation" or (is_scaled and each.divisor is not None)
-        else per_second(declared.get(each.signal or "", ""))
-        if each.kind == "rate"
-        else plain_unit(declared.get(each.signal or "", ""))
-        for each in units_of(formula)
+    units = {
+        "" if is_scaled and unit.divisor is not None else _declared(unit, declared)
+        for unit in units_of(formula)
     }
-    return found.pop() if len(found) == 1 else ""
+    return units.pop() if len(units) == 1 else ""
+
+
+def _declared(unit: Unit, declared: Mapping[str, str]) -> str:
+    if unit.kind == "orientation":
+        return ""
+    name = declared.get(unit.signal or "", "")
+    return per_second(name) if unit.kind == "rate" else plain_unit(name)
 
 
 def per_second(unit: str) -> str:
@@ -579,17 +592,58 @@ def scaled(expression: Expression, scales: Sequence[Scale]) -> Expression:
 
 def _units(expression: Expression) -> list[Unit]:
     divisor = expression.divisor if isinstance(expression, Scaled) else None
-    found: dict[Unit, None] = {}
-    parts = list(iter_expressions(expression))
+    whole = expression.operand if isinstance(expression, Scaled) else expression
+    parts = list(iter_expressions(whole))
     if any(isinstance(part, Equality) for part in parts):
         return []
-    for part in parts:
-        if isinstance(part, Rate):
-            found[Unit("rate", part.signal.name if part.signal else None, divisor)] = None
-        elif isinstance(part, Signal):
-            found[Unit("signal", part.name, divisor)] = None
-        elif isinstance(part, Misalignment):
-            found[Unit("orientation")] = None
-        elif isinstance(part, Measurement):
-            found[Unit("length", None, divisor)] = None
-    return list(found)
+    if leaves := _unit_leaves(whole):
+        return list(dict.fromkeys(_unit_of(leaf, divisor) for leaf in leaves))
+    is_number = all(isinstance(part, Number | Sum | Negative | Minimum | Maximum) for part in parts)
+    return [] if is_number else [Unit("signal", MULTIPLES, divisor)]
+
+
+def _unit_leaves(expression: Expression) -> list[Signal | Measurement]:
+    """Return the parts whose units an expression has: of a sum, one; a multiple may be in another unit."""
+    match expression:
+        case Sum(first, second):
+            return _unit_leaves(first) or _unit_leaves(second)
+        case Negative(operand):
+            return _unit_leaves(operand)
+        case Minimum(operands) | Maximum(operands):
+            return [leaf for operand in operands for leaf in _unit_leaves(operand)]
+        case Number() | Product() | Scaled() | Equality():
+            return []
+    return [expression]
+
+
+def _unit_of(leaf: Signal | Measurement, divisor: float | None) -> Unit:
+    match leaf:
+        case Rate():
+            return Unit("rate", leaf.signal.name if leaf.signal else None, divisor)
+        case Signal():
+            return Unit("signal", leaf.name, divisor)
+        case Misalignment():
+            return Unit("orientation")
+    return Unit("length", None, divisor)
+
+
+def summed_units(expression: Expression, declared: Mapping[str, str]) -> list[str]:
+    """Return the declared units of what a sum adds and compares, each once; multiples may have any.
+
+    Args:
+        declared: see `declared_unit`.
+    """
+    units: dict[str, None] = {}
+    stack = [expression.operand if isinstance(expression, Scaled) else expression]
+    while stack:
+        current = stack.pop()
+        match current:
+            case Sum(first, second):
+                stack += (second, first)
+            case Negative(operand):
+                stack.append(operand)
+            case Minimum(operands) | Maximum(operands):
+                stack += reversed(operands)
+            case Signal() | SignedDistance():
+                units[_declared(_unit_of(current, None), declared)] = None
+    return [unit for unit in units if unit]

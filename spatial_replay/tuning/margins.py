@@ -36,6 +36,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Outline,
+    Product,
     Projection,
     Protrusion,
     Quantified,
@@ -382,6 +383,8 @@ def _of_expression(before: Expression, after: Expression) -> Direction | None:
             return _common([_of_expression(old.first, new.first), _of_expression(old.second, new.second)])
         case Negative() as old, Negative() as new:
             return _opposite(_of_expression(old.operand, new.operand))
+        case Product() as old, Product() as new if old.factor == new.factor:
+            return _of_expression(old.operand, new.operand)
         case Scaled() as old, Scaled() as new if old.divisor == new.divisor:
             return _of_expression(old.operand, new.operand)
         case Minimum() as old, Minimum() as new if len(old.operands) == len(new.operands):

@@ -37,11 +37,13 @@ from spatial_replay.spec.formula import (
     Number,
     Outline,
     Present,
+    Product,
     Projection,
     Protrusion,
     Quantified,
     Rate,
     RegionName,
+    Scaled,
     Signal,
     SignedDistance,
     Sum,
@@ -110,7 +112,7 @@ def has_value_atoms(formula: Formula) -> list[Atom]:
                 match part:
                     case Sum():
                         parts += [part.first, part.second]
-                    case Negative():
+                    case Negative() | Product() | Scaled():
                         parts.append(part.operand)
                     case Minimum() | Maximum():
                         parts += part.operands
@@ -396,6 +398,15 @@ class Observed:
                     return None
                 low, high = first.low + second.low, first.high + second.high
                 return None if math.isnan(low) or math.isnan(high) else Interval(low, high)
+            case Product() | Scaled():
+                operand = inner(expression.operand)
+                if operand is None:
+                    return None
+                low, high = (
+                    end * expression.factor if isinstance(expression, Product) else end / expression.divisor
+                    for end in operand
+                )
+                return Interval(low, high)
             case Minimum() | Maximum():
                 operands = [inner(each) for each in expression.operands]
                 known = [each for each in operands if each is not None]

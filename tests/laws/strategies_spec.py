@@ -94,11 +94,36 @@ def terms(draw: st.DrawFn, words: Vocabulary) -> str:
     return tracked
 
 
+def signals(words: Vocabulary) -> st.SearchStrategy[str]:
+    return st.sampled_from(words.signals)
+
+
+def sums(words: Vocabulary) -> st.SearchStrategy[str]:
+    """Texts of numbers that are computed from signals, distances and rates of signals."""
+    distances = st.tuples(terms(words), terms(words)).map(lambda pair: f"({pair[0]} dist {pair[1]})")
+    measured = [signals(words), distances]
+    measured += [signals(words).map(lambda name: f"rate({name})")] if words.rates else []
+    factors = st.sampled_from(["2", "0.3", "-1.5", "1e3"])
+    return st.recursive(
+        st.one_of(*measured),
+        lambda inner: st.one_of(
+            st.tuples(inner, st.sampled_from("+-"), st.one_of(inner, numbers)).map(
+                lambda parts: f"({' '.join(parts)})"
+            ),
+            st.tuples(factors, inner).map(" * ".join),
+            st.tuples(inner, factors).map(" / ".join),
+            inner.map(lambda text: f"abs({text})"),
+            inner.map(lambda text: f"-({text})"),
+        ),
+        max_leaves=3,
+    )
+
+
 @st.composite
 def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
     """The text of a relation or comparison; parameters are always written."""
     kinds = ["plain", "parameter", "dist", "within", "closer", "prec", "between"]
-    kinds += ["signal"] if words.signals else []
+    kinds += ["signal", "sum", "range"] if words.signals else []
     kinds += ["present", "speed", "closing", *(["rate"] if words.signals else [])] if words.rates else []
     kinds += ["oriented"] if words.oriented else []
     first, second = draw(terms(words)), draw(terms(words))
@@ -121,6 +146,12 @@ def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
         case "signal":
             comparison = draw(st.sampled_from((*COMPARISONS, "!=")))
             return f"{draw(st.sampled_from(words.signals))} {comparison} {draw(numbers)}"
+        case "sum":
+            sign = draw(st.sampled_from(COMPARISONS[:-1]))
+            measured = f"{draw(signals(words))} - {draw(sums(words))}"
+            return f"{measured} {sign} {draw(st.one_of(numbers, sums(words)))}"
+        case "range":
+            return f"{draw(numbers)} <= {draw(sums(words))} < {draw(sums(words))} + {draw(signals(words))}"
         case "rate":
             signal, comparison = draw(st.sampled_from(words.signals)), draw(st.sampled_from(COMPARISONS))
             return f"rate({signal}) {comparison} {draw(numbers)}"

@@ -39,6 +39,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Present,
+    Product,
     Projection,
     Quantified,
     Rate,
@@ -119,7 +120,7 @@ def _leaves(expression: Expression, sign: int) -> Iterator[tuple[int, Expression
             yield from _leaves(second, sign)
         case Negative(operand):
             yield from _leaves(operand, -sign)
-        case Scaled(operand):
+        case Product(operand=operand) | Scaled(operand):
             yield from _leaves(operand, sign)
         case _:
             yield sign, expression
@@ -155,6 +156,7 @@ CLOSEST = 13  # closest pair a, as an interval
 EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where one of them is a text, or none
 QUOTIENT = 15  # a by b, which is positive and the same in every channel
 HAS_VALUE = 16  # +inf where a is a number, else -inf; not a number where b is not
+MULTIPLY = 17  # a by constant b, which is positive
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -248,6 +250,9 @@ def run_instructions(
                 elif op == DIVIDE:
                     for k in range(count):
                         target[k] = first[k] / constants[b]
+                elif op == MULTIPLY:
+                    for k in range(count):
+                        target[k] = first[k] * constants[b]
                 elif op == QUOTIENT:
                     for k in range(count):
                         target[k] = first[k] / second[k]
@@ -378,6 +383,9 @@ class LeafCode:
                     signal = presence_of(term).signal
                 constant = self.constants.setdefault(value, len(self.constants))
                 return self._row(EQUAL, self.signals.setdefault(signal, len(self.signals)), constant)
+            case Product(factor, operand):
+                constant = self.constants.setdefault(factor, len(self.constants))
+                return self._row(MULTIPLY, self._expression(operand, bindings), constant)
             case Scaled(operand, divisor):
                 constant = self.constants.setdefault(divisor, len(self.constants))
                 return self._row(DIVIDE, self._expression(operand, bindings), constant)

@@ -43,6 +43,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Present,
+    Product,
     Projection,
     Protrusion,
     Quantified,
@@ -425,7 +426,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
                 if is_text_number(compared):
                     kinds = "a number, not a text; `names` of its mapping give numbers names"
                 yield f"signal {name!r} is {kinds}"
-        case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
+        case Number() | Sum() | Negative() | Minimum() | Maximum() | Product() | Scaled():
             return
         case _:
             for term in terms_of(part):
@@ -640,7 +641,7 @@ def _branch(
             yield from _branch(scene, expression.second, end, sign)
         case Negative():
             yield from _branch(scene, expression.operand, end.turned, -sign)
-        case Scaled():
+        case Product() | Scaled():
             yield from _branch(scene, expression.operand, end, sign)
         case Equality():
             yield sign, expression.signal

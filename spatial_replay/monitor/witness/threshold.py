@@ -30,6 +30,7 @@ from spatial_replay.spec.formula import (
     NamedNumber,
     Negative,
     Number,
+    Product,
     Projection,
     Protrusion,
     Quantified,
@@ -138,6 +139,8 @@ class Dial:
                 return {a + b for a in first for b in second}
             case Negative():
                 return {-slope for slope in self.slopes(expression.operand)}
+            case Product(factor, operand):
+                return {slope * factor for slope in self.slopes(operand)}
             case Scaled(operand, divisor):
                 return {slope / divisor for slope in self.slopes(operand)}
             case Minimum() | Maximum():
@@ -176,7 +179,11 @@ def _radii_of(term: Term) -> list[float]:
 
 def _numbers(expression: Expression) -> Iterator[float]:
     for part in iter_expressions(expression):
-        yield from [part.value] if isinstance(part, Number) else _radii(part)
+        match part:
+            case Number(value=number) | Product(factor=number) | Scaled(divisor=number):
+                yield number
+            case _:
+                yield from _radii(part)
 
 
 def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> Iterator[tuple[Atom, int]]:

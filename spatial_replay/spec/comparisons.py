@@ -1,0 +1,390 @@
+"""Comparisons of numbers: of one signal, distance or rate with a constant, and of sums of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from spatial_replay.spec.formula import (
+    ComputedSignal,
+    Equality,
+    Expression,
+    Group,
+    Maximum,
+    NamedNumber,
+    Negative,
+    Number,
+    Product,
+    Rate,
+    RegionName,
+    Scaled,
+    Signal,
+    SignedDistance,
+    Sum,
+    Term,
+    TrackedName,
+    maximum,
+    minimum,
+)
+from spatial_replay.spec.relations import compare
+from spatial_replay.spec.resolve import Anything, Resolver, Scope, kind_of
+from spatial_replay.spec.syntax import (
+    DERIVED_TERMS,
+    ArgumentSyntax,
+    Arithmetic,
+    BrokenStatement,
+    Call,
+    ComparisonSyntax,
+    ConstStatement,
+    DefStatement,
+    DistanceSyntax,
+    FormulaSyntax,
+    Name,
+    NumberSyntax,
+    RateSyntax,
+)
+from spatial_replay.spec.tokens import function_hint, quoted, span_of
+from spatial_replay.spec.walks import (
+    base_of,
+    iter_expressions,
+    looks_back,
+    rate_of,
+    speed_of,
+)
+from spatial_replay.text import text_number
+
+_MIRRORED: Final[Mapping[str, str]] = MappingProxyType(
+    {"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "==", "!=": "!="}
+)
+_SIMPLE: Final = (Name, DistanceSyntax, RateSyntax)
+"""Quantities that relations of their own compare with a constant: "signal", "dist", "speed", "rate"."""
+
+
+class Comparison(NamedTuple):
+    """The parts of an atom that compares numbers; see `Atom`."""
+
+    relation: str
+    expression: Expression
+    terms: tuple[Term, ...]
+    parameters: tuple[float | str, ...]
+
+
+_NOTHING: Final = Comparison("sum", compare(Number(0.0), "<=", Number(0.0)), (), ("<=",))
+"""The comparison after a fault."""
+_NOT_EQUAL: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "dist": "write what is too near or too far: a dist b <= c, a dist b >= c",
+        "speed": "write what is too slow or too fast: speed(a) >= c, speed(a) <= c",
+        "rate": "write what is too slow or too fast: rate(x) >= c, rate(x) <= c",
+    }
+)
+_PLUGIN: Final = (
+    'a plug-in computes it: SIGNALS = {"NAME": function of a sample} in a module, given by --plugin; '
+    "a comparison has sums, multiples by constants and abs"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonBuilder:
+    """Builds the comparisons of one text."""
+
+    resolver: Resolver
+
+    def build(self, written: ComparisonSyntax, scope: Scope) -> Comparison:
+        """Return what a comparison computes."""
+        operands, signs = written.operands, [token.value for token in written.operators]
+        if len(operands) == 3:
+            return self._range(written, scope)
+        left, right = operands
+        if self._is_constant(left, scope) and isinstance(right, _SIMPLE):
+            if not self._is_constant(right, scope):
+                return self._of_one(right, ((_MIRRORED[signs[0]], left),), written, scope)
+        elif isinstance(left, _SIMPLE) and self._is_constant(right, scope):
+            return self._of_one(left, ((signs[0], right),), written, scope)
+        if isinstance(left, Name) and isinstance(right, Name) and signs[0] in ("==", "!="):
+            if right.is_quoted:
+                return self._of_text(left, signs[0], right, scope)
+            if left.is_quoted:
+                return self._of_text(right, signs[0], left, scope)
+        return self._of_sums(written, scope)
+
+    # ------------------------------------------------------------------------------- one with a constant
+
+    def _of_one(
+        self,
+        quantity: Name | DistanceSyntax | RateSyntax,
+        comparisons: Sequence[tuple[str, FormulaSyntax]],
+        written: ComparisonSyntax,
+        scope: Scope,
+    ) -> Comparison:
+        """Return how one signal, distance or rate compares with one constant, or with two."""
+        limits = [(sign, self.resolver.number(limit, scope)) for sign, limit in comparisons]  # type: ignore[arg-type]
+        if isinstance(quantity, Name):
+            ((sign, limit),) = limits
+            return self._of_signal(quantity, sign, limit, limit, scope)
+        measured = self._number(quantity, scope)
+        relation = quantity.function if isinstance(quantity, RateSyntax) else "dist"
+        names: tuple[float | str, ...] = ()
+        if not isinstance(measured, Rate | SignedDistance):
+            return _NOTHING
+        if isinstance(measured, Rate) and measured.signal:
+            names = (measured.signal.name,)
+        for token in written.operators:
+            if token.value == "!=":
+                message = f"a {'distance' if relation == 'dist' else 'rate'} is hardly ever exactly a number"
+                self.resolver.fault(span_of(token), scope, message, _NOT_EQUAL[relation])
+        terms = _written_terms(measured)
+        margins = [compare(measured, sign, limit) for sign, limit in limits]
+        (sign, limit), *upper = limits
+        if not upper:
+            return Comparison(relation, margins[0], terms, (*names, sign, limit))
+        parameters = (*names, limit, _MIRRORED[sign], *upper[0])
+        return Comparison(relation, minimum(*margins), terms, parameters)
+
+    def _of_text(self, signal: Name, sign: str, text: Name, scope: Scope) -> Comparison:
+        return self._of_signal(signal, sign, text_number(text.text), quoted(text.text), scope)
+
+    def _of_signal(
+        self, name: Name, sign: str, limit: float, limit_text: float | str, scope: Scope
+    ) -> Comparison:
+        """Return how a signal compares with a constant or a text; `==` and `!=` are exact."""
+        signal = self._signal(name, scope)
+        is_equal = Equality(signal, limit)
+        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
+        expression = exact.get(sign) or compare(signal, sign, limit)
+        return Comparison("signal", expression, (), (name.text, sign, limit_text))
+
+    # ----------------------------------------------------------------------------------------------- sums
+
+    def _range(self, written: ComparisonSyntax, scope: Scope) -> Comparison:
+        """Return `c1 <= a dist b <= c2`, the lesser of both comparisons."""
+        (lower, middle, upper), (below, above) = written.operands, written.operators
+        for token, side in ((below, "left"), (above, "right")):
+            if token.value not in ("<=", "<"):
+                message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
+                self.resolver.fault(span_of(token), scope, message, _range_hint(below.value, above.value))
+                return _NOTHING
+        is_between_constants = self._is_constant(lower, scope) and self._is_constant(upper, scope)
+        if is_between_constants and isinstance(middle, DistanceSyntax | RateSyntax):
+            limits = ((_MIRRORED[below.value], lower), (above.value, upper))
+            return self._of_one(middle, limits, written, scope)
+        return self._of_sums(written, scope)
+
+    def _of_sums(self, written: ComparisonSyntax, scope: Scope) -> Comparison:
+        signs = [token.value for token in written.operators]
+        if not {"==", "!="}.isdisjoint(signs):
+            self._report_equality(written, scope)
+            return _NOTHING
+        if all(self._is_constant(operand, scope) for operand in written.operands):
+            self._report_constants(written, scope)
+            return _NOTHING
+        numbers = [self._number(operand, scope) for operand in written.operands]
+        for first, second in pairwise(numbers):
+            self._check_units(first, second, written, scope)
+        margins = [
+            compare(first, sign, second)
+            for (first, second), sign in zip(pairwise(numbers), signs, strict=True)
+        ]
+        expression = margins[0] if len(margins) == 1 else minimum(*margins)
+        parts = list(iter_expressions(expression))
+        limits = dict.fromkeys(part.value for part in parts if isinstance(part, Number))
+        terms = dict.fromkeys(term for part in parts for term in _written_terms(part))
+        return Comparison("sum", expression, tuple(terms), (*signs, *limits))
+
+    def _number(self, written: ArgumentSyntax, scope: Scope) -> Expression:
+        """Return what was written in the place of a number; 0 after a fault."""
+        self.resolver.size += 1
+        if self._is_constant(written, scope):
+            return Number(self.resolver.number(written, scope))  # type: ignore[arg-type]
+        match written:
+            case Name():
+                return self._signal(written, scope)
+            case DistanceSyntax():
+                terms = (self.resolver.term(term, scope) for term in (written.first, written.second))
+                return SignedDistance(*terms)
+            case RateSyntax():
+                return self._rate(written, scope)
+            case Call():
+                return self._absolute(written, scope)
+            case Arithmetic(operands=(operand,)):
+                return -self._number(operand, scope)
+            case Arithmetic(operator="+" | "-" as sign, operands=(left, right)):
+                first, second = self._number(left, scope), self._number(right, scope)
+                self._check_units(first, second, written, scope)
+                return first + second if sign == "+" else first - second
+            case Arithmetic():
+                return self._multiple(written, scope)
+        message, hint = "a formula, where a number is expected", "compare signals, distances or rates"
+        if isinstance(written, DERIVED_TERMS):
+            message, hint = "an object, where a number is expected", "a distance is written a dist b"
+        self.resolver.fault(written.span, scope, message, hint)
+        return Number(0.0)
+
+    def _multiple(self, written: Arithmetic, scope: Scope) -> Expression:
+        """Return a number times or divided by a constant."""
+        operand, factor = written.operands
+        is_product = written.operator == "*"
+        if is_product and self._is_constant(operand, scope):
+            operand, factor = factor, operand
+        if not self._is_constant(factor, scope):
+            what = "a product of two signals" if is_product else "a quotient of two signals"
+            self.resolver.fault(written.span, scope, f"{what}, distances or rates", _PLUGIN)
+            return Number(0.0)
+        amount, number = self.resolver.number(factor, scope), self._number(operand, scope)
+        if amount == 0.0:
+            message = "a factor of 0" if is_product else "division by zero"
+            self.resolver.fault(factor.span, scope, message, "leave the number out, or write another factor")
+            return Number(0.0)
+        size = abs(amount)
+        if isinstance(amount, NamedNumber):
+            size = NamedNumber(size, amount.constants)
+        multiple = Product(size, number) if is_product else Scaled(number, size)
+        return multiple if amount > 0.0 else -multiple
+
+    def _absolute(self, written: Call, scope: Scope) -> Expression:
+        """Return `abs(x)`, the greater of x and -x; any other function is a fault."""
+        name, arguments = written.name.text, written.arguments
+        macro = self.resolver.names.definitions.get(name)
+        if name == "abs" and len(arguments) == 1 and not isinstance(macro, DefStatement):
+            operand = self._number(arguments[0], scope)
+            return maximum(operand, -operand)
+        message, hint = f"{name!r} is not a function", self._function_hint(written)
+        if isinstance(macro, DefStatement):
+            message, hint = f"{name!r} is a macro, so a formula, where a number is expected", ""
+        elif name == "abs":
+            message, hint = "'abs' takes one number", "write abs(x - y) <= c"
+        self.resolver.fault(written.span, scope, message, hint)
+        return Number(0.0)
+
+    def _function_hint(self, written: Call) -> str:
+        text = self.resolver.faults.source.text
+        arguments = [text[argument.span.start : argument.span.end] for argument in written.arguments]
+        return function_hint(written.name.text, f"({', '.join(arguments)})", arguments) or _PLUGIN
+
+    def _rate(self, written: RateSyntax, scope: Scope) -> Expression:
+        """Return `speed(a)`, `speed(a, b)` or `rate(signal)`."""
+        arguments, function = written.arguments, written.function
+        if function == "rate" and len(arguments) == 1 and isinstance(arguments[0], Name):
+            return rate_of(self._signal(arguments[0], scope))
+        if function == "rate" or not 1 <= len(arguments) <= 2:
+            message, hint = "'rate' takes one signal", "write rate(battery) <= c"
+            if function == "speed":
+                message, hint = "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"
+            self.resolver.fault(written.span, scope, message, hint)
+            return Number(0.0)
+        return speed_of(*(self._moving(each, scope, alone=len(arguments) == 1) for each in arguments))
+
+    def _moving(self, written: ArgumentSyntax, scope: Scope, *, alone: bool) -> Term:
+        """Return a term that `speed` takes."""
+        if not isinstance(written, (Name, *DERIVED_TERMS)):
+            self.resolver.fault(written.span, scope, "a number has no speed", "write speed(a) or speed(a, b)")
+            return TrackedName("")
+        term = self.resolver.term(written, scope)
+        if looks_back(term):
+            hint = "leave out the [-n]"
+            self.resolver.fault(written.span, scope, "a speed is from the report before to this one", hint)
+        elif alone and isinstance(base_of(term), Group):
+            hint = "write forall p in GROUP: speed(p) <= c"
+            self.resolver.fault(written.span, scope, "a group has no speed of its own", hint)
+        elif alone and isinstance(base_of(term), RegionName):
+            hint = "write speed(a) for an object a, or speed(a, REGION)"
+            self.resolver.fault(written.span, scope, "a region never moves", hint)
+        return term
+
+    def _signal(self, name: Name, scope: Scope) -> Signal:
+        """Return a signal of the log or of a plug-in; a name of something else is a fault."""
+        plugin = self.resolver.names.signals.get(name.text)
+        defined = self.resolver.names.definitions.get(name.text)
+        if name.text in scope.values:
+            message = f"{name.text!r} is a parameter or variable here; a signal of the log is expected"
+            self.resolver.fault(name.span, scope, message)
+        elif defined is not None and not isinstance(defined, BrokenStatement):
+            message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
+            self.resolver.fault(name.span, scope, message, "if the log has it, rename the definition")
+        return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
+
+    def _is_constant(self, written: ArgumentSyntax, scope: Scope) -> bool:
+        """Return whether something is a number by itself: also a parameter of an unused macro."""
+        match written:
+            case NumberSyntax():
+                return True
+            case Name():
+                local = scope.values.get(written.text)
+                defined = self.resolver.names.definitions.get(written.text)
+                is_broken = local is None and isinstance(defined, BrokenStatement)
+                return isinstance(local, Anything) or is_broken or self.resolver.is_number(written, scope)
+            case Arithmetic():
+                return all(self._is_constant(operand, scope) for operand in written.operands)
+        return False
+
+    # --------------------------------------------------------------------------------------------- faults
+
+    def _check_units(
+        self, first: Expression, second: Expression, written: Arithmetic | ComparisonSyntax, scope: Scope
+    ) -> None:
+        """Refuse a distance plus a speed, or compared with one."""
+        kinds = {kind for kind in (_kind(first), _kind(second)) if kind}
+        if len(kinds) > 1:
+            hint = "multiply one of them by a constant: a dist b >= 2 * speed(a)"
+            self.resolver.fault(written.span, scope, "a distance and a speed have different units", hint)
+
+    def _report_equality(self, written: ComparisonSyntax, scope: Scope) -> None:
+        left, right = (self._source(operand) for operand in (written.operands[0], written.operands[-1]))
+        is_sum = isinstance(written.operands[-1], Arithmetic)
+        hint = f"write abs({left} - {f'({right})' if is_sum else right}) <= 0.01"
+        match written.operands:
+            case (Name(), Name() as name):
+                definitions = self.resolver.names.definitions
+                constants = [key for key in definitions if isinstance(definitions[key], ConstStatement)]
+                nearest = self.resolver.faults.nearest(name.text, constants)
+                hint = nearest or f"{hint}; a text stands in quotes, {left} == {quoted(name.text)}"
+        (token, *_) = [token for token in written.operators if token.value in ("==", "!=")]
+        self.resolver.fault(span_of(token), scope, "two measured numbers are hardly ever equal", hint)
+
+    def _report_constants(self, written: ComparisonSyntax, scope: Scope) -> None:
+        names = [operand for operand in written.operands if isinstance(operand, Name)]
+        if names:
+            self._signal(names[0], scope)
+        else:
+            hint = "compare a signal, a distance or a rate"
+            self.resolver.fault(written.span, scope, "two constants are compared", hint)
+
+    def _source(self, written: ArgumentSyntax) -> str:
+        return self.resolver.faults.source.text[written.span.start : written.span.end]
+
+
+def _written_terms(expression: Expression) -> tuple[Term, ...]:
+    """Return the terms of a distance or a speed as written."""
+    match expression:
+        case Rate():
+            return expression.terms
+        case SignedDistance():
+            return expression.first, expression.second
+    return ()
+
+
+def _kind(expression: Expression) -> str:
+    """Return "length" or "speed" for a number of that unit; "" where a constant or a signal may have any."""
+    match expression:
+        case SignedDistance():
+            return "length"
+        case Rate(signal=None):
+            return "speed"
+        case Negative(operand):
+            return _kind(operand)
+        case Maximum(operands):
+            return _kind(operands[0])
+        case Sum(first, second):
+            return _kind(first) or _kind(second)
+    return ""
+
+
+def _range_hint(below: str, above: str) -> str:
+    if {"==", "!="} & {below, above}:
+        return "write a dist b == c, or c1 <= a dist b <= c2"
+    if below[0] == above[0]:
+        return "write the lesser limit first: c1 <= a dist b <= c2"
+    return "write it as c1 <= a dist b <= c2, or as two comparisons joined by and"
