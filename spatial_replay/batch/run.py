@@ -420,6 +420,12 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
             except UsageError as error:
                 for line in str(error).split("\n"):
                     faults.add(line)
+            else:
+                if len(logs) < case.at_least_logs:
+                    place, count = case.place("at_least_logs"), counted(len(logs), "log")
+                    faults.add(
+                        f"{place}{count}, and at_least_logs is {case.at_least_logs}; check the patterns"
+                    )
             cases.append(PreparedCase(case, tuple(logs), _files(case, suite.folder, texts, faults)))
     faults.check()
     return tuple(cases)

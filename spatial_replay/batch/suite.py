@@ -192,6 +192,7 @@ class Case:
         logs: relative paths are relative to the suite's folder.
         specs: the specification files, or their addresses.
         requirements: ids of requirements that the case is about; a spec can have one of its own.
+        at_least_logs: the least number of logs that its patterns have to find.
         places: file and line of each key, for errors; none on a command line.
         is_whole: whether its specs, and what is given for their constants and parameters, are all there:
             what is wrong in the file is left out.
@@ -203,6 +204,7 @@ class Case:
     conditions: Conditions = DEFAULT_CONDITIONS
     expectation: Expectation = DEFAULT_EXPECTATION
     requirements: tuple[str, ...] = ()
+    at_least_logs: int = 1
     places: Pairs[str] = ()
     is_whole: bool = True
 
@@ -340,6 +342,7 @@ def _case(
             frozenset(_listed(entry.get("allow"))),
         ),
         requirements=tuple(_listed(entry.get("requirements"))),
+        at_least_logs=entry.get("at_least_logs", 1),
         places=tuple(lines.items()),
         is_whole=is_whole,
     )
