@@ -26,6 +26,7 @@ from spatial_replay.batch.run_table import (
     Values,
     counts_of,
     damage_word,
+    flaky_results,
     requirement_of,
     result_name,
     summary_text,
@@ -42,7 +43,7 @@ from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.page import asset, html_page, text
 from spatial_replay.report.panels import sentence_parts
 from spatial_replay.report.write import write_report
-from spatial_replay.text import counted, cut, printable
+from spatial_replay.text import counted, cut, first_lines, printable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 _ANNOTATIONS: Final = 10
 """GitHub shows no more of one kind for a step."""
 _WORST: Final = 10
+_MOST_FLAKY: Final = 20
 _MOST_COMPARED: Final = 10_000
 """Number of worst rows that are searched for failures of different kinds."""
 
@@ -160,6 +162,8 @@ def markdown(table: pa.Table) -> str:
             names = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
             verdict = f"{verdict_word(row)}{damage_word(row)}"
             lines.append(_line([*names, verdict, row["failure"], row["reason"]]))
+    flaky = first_lines([result.text for result in flaky_results(table)], _MOST_FLAKY)
+    lines += ["", *(f"- {_markdown_cell(line)}" for line in flaky)] if flaky else []
     return "\n".join([*lines, "", ""])
 
 
@@ -257,6 +261,9 @@ def _lines(
         for total in totals(table)
         if total.is_edited
     }
+    flaky: dict[tuple[str, str, str], list[str]] = {}
+    for result in flaky_results(table):
+        flaky.setdefault((result.case, result.file, result.spec), []).append(result.text)
     for row in table.select([*keys, *found, *faults]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
@@ -280,7 +287,8 @@ def _lines(
             properties["tested"] = ", ".join(f"{count} {kind}" for kind, count in sorted(tested.items()))
         if (case, file, spec) in edited:
             properties["baseline"] = EDITED_SINCE
-        for key, value in properties.items():
+        pairs = [*properties.items(), *(("flaky", line) for line in flaky.get((case, file, spec), ()))]
+        for key, value in pairs:
             yield f"<property name={_quoted(key)} value={_quoted(value)}/>\n"
         yield "</properties>\n"
         # two files may have a spec of one name
@@ -392,6 +400,9 @@ def _panels(table: pa.Table, reports: Mapping[tuple[str, str], str]) -> Iterator
     worst = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
     if worst:
         yield _panel("The worst", _worst(worst, reports))
+    flaky = first_lines([result.text for result in flaky_results(table)], _MOST_FLAKY)
+    if flaky:
+        yield _panel("Flaky", element("ul", *(element("li", text(line)) for line in flaky)))
     yield _panel("Robustness", element("div", *_plots(table, by_spec[:_MOST_SPECS]), **{"class": "plots"}))
     yield _panel("Logs", *_matrix(table, by_spec[:_MOST_SPECS], reports))
 

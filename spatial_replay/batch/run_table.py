@@ -176,6 +176,48 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class FlakyResult:
+    """A result that passes in some runs of one log, and fails in others.
+
+    Attributes:
+        log: the log's name without the numbers of its runs.
+    """
+
+    case: str
+    log: str
+    file: str
+    spec: str
+    object: str | None
+    failed: int
+    runs: int
+
+    @property
+    def text(self) -> str:
+        """The result with both counts, in one line."""
+        name = result_name(self.spec or self.file, self.object)
+        return f"{self.log}: {name} is flaky: {self.failed:,} of {self.runs:,} runs failed"
+
+
+_RUN: Final = re.compile(r"#\d+(?=[./]|$)")
+"""The number of a run in the name of its log: "cross#2.mcap"."""
+
+
+def flaky_results(table: pa.Table) -> list[FlakyResult]:
+    """Return the flaky results among repeated runs: logs whose names differ in a number after "#" only."""
+    failures: dict[Key, list[bool]] = defaultdict(list)
+    for key, failure in zip(keys_of(table), table.column("failure").to_pylist(), strict=True):
+        case, log, *others = key
+        name = _RUN.sub("", log)
+        if name != log:
+            failures[(case, name, *others)].append(failure is not None)
+    return [
+        FlakyResult(*key, sum(failed), len(failed))
+        for key, failed in failures.items()
+        if 0 < sum(failed) < len(failed)
+    ]
+
+
 def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
     """Return the columns of counts of a table of totals; some only where any counts."""
     names = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}

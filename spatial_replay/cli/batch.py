@@ -409,7 +409,7 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     """
     import pyarrow.compute as pc
 
-    from spatial_replay.batch.run_table import WORSE, summary_text, totals
+    from spatial_replay.batch.run_table import WORSE, flaky_results, summary_text, totals
 
     reused = result.logs - result.evaluated
     news = f"{result.evaluated:,} evaluated now, {reused:,} known" if reused else "all evaluated now"
@@ -433,6 +433,8 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
                 summary += f", {edited:,} of specs edited since"
         show(f"{summary}, the worst {_WORST}:" if failures > _WORST else f"{summary}:")
         print_worst(result.table, _WORST, failing=True)
+    flaky = [result.text for result in flaky_results(result.table)]
+    show(*(f"  {line}" for line in first_lines(flaky, _MOST_DIFFERENCES)))
     show(f"wrote {folder}")
 
 

@@ -593,6 +593,33 @@ def test_a_suite_requires_what_info_prints_and_refuses_unfit_logs(fleet: Path) -
     assert "did you mean 'rate'?" in batch("suite.yaml").err
 
 
+def test_too_few_logs_of_a_case_are_an_error_of_the_suite(fleet: Path) -> None:
+    suite = "specs: gate.spatial\nat_least_logs: 2\ncases:\n  - {name: near, logs: 'logs/run-[01].jsonl'"
+    Path("suite.yaml").write_text(f"{suite}}}\n")
+    assert batch("suite.yaml").code == 0
+    Path("logs/run-0.jsonl").unlink()
+    done = batch("suite.yaml")
+    message = "suite.yaml:2: case 'near': 1 log, and at_least_logs is 2; check the patterns"
+    assert (done.code, message in done.err) == (2, True), done.err
+    Path("suite.yaml").write_text(f"{suite}, at_least_logs: 1}}\n")
+    assert batch("suite.yaml").code == 0
+
+
+def test_runs_of_one_log_that_pass_and_fail_are_flaky(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(4):
+        Path(f"logs/run-{number}.jsonl").rename(f"logs/cross#{number}.jsonl")
+        write_log(Path(f"logs/far#{number}/log.jsonl"), 0.5)
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    done = batch("logs", "--spec", "gate.spatial", "--junit", "junit.xml", "--html", "pages")
+    flaky = "logs/cross.jsonl: apart is flaky: 2 of 4 runs failed"
+    assert (done.code, done.out.count("flaky"), f"  {flaky}\n" in done.out) == (1, 1, True)
+    suites = ElementTree.parse("junit.xml").getroot()
+    assert [each.get("value") for each in suites.iterfind("*/properties/property[@name='flaky']")] == [flaky]
+    assert f"- {flaky}\n" in Path("summary.md").read_text()
+    assert f"<li>{flaky}</li>" in Path("pages/index.html").read_text()
+
+
 def test_a_suite_says_what_passes(fleet: Path) -> None:
     Path("suite.yaml").write_text(
         "specs: gate.spatial\n"
