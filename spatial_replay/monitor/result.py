@@ -15,6 +15,13 @@ from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, r
 from spatial_replay.lazy import Displayed, data_frame
 from spatial_replay.monitor.doubtful import doubts_of_instances
 from spatial_replay.monitor.ends import Needs, trim_trace
+from spatial_replay.monitor.invariants import (
+    LISTED,
+    MOST_EXPLAINED,
+    ViolatedInvariant,
+    find_violated_invariants,
+    invariant_sentences,
+)
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.sentences import (
@@ -274,6 +281,29 @@ class SpecResult(Displayed):
         """Return why a node is violated or unknown, as `causes` does for the root."""
         return self._causes(node, self._witnesses)
 
+    @cached_property
+    def violated_invariants(self) -> tuple[ViolatedInvariant, ...]:
+        """How often and where each violated part `G p` is violated; empty under the paper's semantics."""
+        return self.violated_invariants_of(0)
+
+    def violated_invariants_of(self, node: int, *, goes_on: bool = False) -> tuple[ViolatedInvariant, ...]:
+        """Return the violated parts `G p` of a node, as `violated_invariants` does for the root.
+
+        Args:
+            goes_on: whether samples may follow those evaluated.
+        """
+        return tuple(self._violated_invariants(self._conjuncts_of(node), goes_on=goes_on))
+
+    def _violated_invariants(
+        self, conjuncts: Sequence[Conjunct], *, goes_on: bool = False, most: int = MOST_EXPLAINED
+    ) -> Iterator[ViolatedInvariant]:
+        violated = [part for part in conjuncts if self.final[part.node, 1] < 0.0]
+        if self.leaves is None or not self.can_explain or not violated:
+            return iter(())
+        return find_violated_invariants(
+            self.evidence, self.leaves, self.times_ns, violated, goes_on=goes_on, most=most
+        )
+
     def _conjuncts_of(self, node: int) -> Sequence[Conjunct]:
         """Return the parts of a node that have to hold for it to hold."""
         return conjuncts_of(nodes_of(self.formula)[node], self._name_of(node), node)
@@ -469,13 +499,23 @@ class SpecResult(Displayed):
         found = self.sentences_about(0, self.causes, first_ns)
         return (*found, *counted_from(self.remarks, first_ns))
 
-    def sentences_about(self, node: int, causes: Sequence[Cause], first_ns: int) -> tuple[Sentence, ...]:
-        """Return the sentences on the verdict of a node, given why it failed, if it did."""
+    def sentences_about(
+        self, node: int, causes: Sequence[Cause], first_ns: int, *, goes_on: bool = False
+    ) -> tuple[Sentence, ...]:
+        """Return the sentences on the verdict of a node, given why it failed, if it did.
+
+        Args:
+            goes_on: whether samples may follow those evaluated.
+        """
+        conjuncts = {part.node: part for part in self._conjuncts_of(node)}
         found = [self._headline(node, causes, first_ns)]
         for cause in causes:
             about = cause_sentences(cause, first_ns=first_ns, object=self.object)
             # of the whole formula, the headline has said the first of them
             found += about if cause.node != node else about[1:]
+            part = [conjuncts[cause.node]]
+            for invariant in self._violated_invariants(part, goes_on=goes_on, most=LISTED):
+                found += invariant_sentences(invariant, first_ns, self.evidence.units)
         if not causes and self.can_explain:
             witness = self.worst if node == 0 and not self.causes else self.worst_of(node, causes)
             found += () if witness is None else sentences_of(witness, first_ns=first_ns)[1:]

@@ -442,9 +442,8 @@ def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) ->
     if missed.is_condition and deciding is not None and not deciding.unknown:
         measured = what_was_measured(deciding, witness.units, first_ns)
         # an operator such as `Y` measures in another sample
-        at_ns = witness.time_ns
-        at = () if at_ns == missed.time_ns else (" at ", Instant(at_ns, first_ns))
-        sentences.append(Sentence("The condition held: ", measured, *at, "."))
+        own_time = () if witness.time_ns == missed.time_ns else (" at ", Instant(witness.time_ns, first_ns))
+        sentences.append(Sentence("The condition held: ", measured, *own_time, "."))
     return tuple(sentences)
 
 

@@ -8,11 +8,12 @@ from typing import Any
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.invariants import ViolatedInvariant
 from spatial_replay.monitor.result import RESULT_COLUMNS, NodeResult, SpecResult, no_such_node
 from spatial_replay.monitor.sentences import Cause, sentences_of
 from spatial_replay.monitor.vacuity import UntestedPart
 from spatial_replay.monitor.verdict import Verdict, online_verdict
-from spatial_replay.monitor.witness.path import Measured
+from spatial_replay.monitor.witness.path import DecidingAtom, Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
@@ -64,6 +65,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         # what headline, arrow and event name
         "worst": None if result.worst is None else witness_document(result.worst, first_ns),
         "causes": [_cause(each, first_ns) for each in result.causes],
+        "violations": [_invariant(invariant) for invariant in result.violated_invariants],
         "tested": result.tested,
         "untested": [_untested(each, first_ns) for each in result.untested],
         "vacuous": [_untested(each, first_ns) for each in result.vacuous],
@@ -133,14 +135,38 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
     if witness.missed is not None:
         value["missed"] = json_fields(witness.missed, "condition", "response", "time_ns")
     if deciding is not None:
-        value["atom"] = {
-            **json_fields(deciding, "text", "objects", "value", "lower", "upper", "unknown"),
-            "relation": deciding.atom.relation,
-            "measured": [_measured(each) for each in deciding.measured],
-        }
+        value["atom"] = _atom(deciding)
     if threshold is not None:
         value["threshold"] = {**json_fields(threshold), "constant": threshold.constant or None}
     return value
+
+
+def _atom(deciding: DecidingAtom) -> dict[str, Any]:
+    return {
+        **json_fields(deciding, "text", "objects", "value", "lower", "upper", "unknown"),
+        "relation": deciding.atom.relation,
+        "measured": [_measured(number) for number in deciding.measured],
+    }
+
+
+def _invariant(invariant: ViolatedInvariant) -> dict[str, Any]:
+    entries, violated = invariant.entries
+    has_entries = invariant.condition is not None
+    return {
+        **json_fields(invariant, "spec", "node", "condition"),
+        "entries": entries if has_entries else None,
+        "violated_entries": violated if has_entries else None,
+        "intervals": [
+            {
+                **json_fields(
+                    interval, "start_ns", "end_ns", "samples", "worst_ns", "robustness", "deciding_ns"
+                ),
+                "place": None if interval.place is None else list(interval.place),
+                "atom": None if interval.deciding is None else _atom(interval.deciding),
+            }
+            for interval in invariant.intervals
+        ],
+    }
 
 
 def _measured(measured: Measured) -> dict[str, Any]:
@@ -262,7 +288,7 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     else:
         worst = result.worst_of(node, causes)
         witness = result.witness(node) if worst is None else worst
-        sentences = result.sentences_about(node, causes, first_ns)
+        sentences = result.sentences_about(node, causes, first_ns, goes_on=goes_on)
     is_whole = node == 0 and not is_open
     sentences += counted_from(result.remarks, first_ns) if is_whole else ()
     if words := units_text(units_of(nodes_of(result.formula)[node])):
@@ -280,6 +306,10 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
         **{key: decided[key] for key in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")},
         "worst": decided,
         "causes": [] if is_open else [_cause(each, first_ns) for each in causes],
+        "violations": [
+            _invariant(invariant)
+            for invariant in (() if is_open else result.violated_invariants_of(node, goes_on=goes_on))
+        ],
         "tested": result.tested if is_whole else None,
         "untested": [_untested(each, first_ns) for each in result.untested] if is_whole else [],
         "vacuous": [_untested(each, first_ns) for each in result.vacuous] if is_whole else [],

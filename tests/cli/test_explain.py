@@ -252,3 +252,40 @@ def test_every_command_keeps_words_and_numbers_whole_on_a_terminal(folder: Path)
         assert max(map(len, lines)) <= 72
         done = run_program(*command, cwd=folder)
         assert not Counter((done.stdout + done.stderr).split()) - Counter(" ".join(lines).split())
+
+
+def test_how_often_and_where_an_invariant_is_violated_is_listed(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "spec slow = G (robot closeto[1] ann -> speed <= 0.5)\nspec apart = G not (robot ovlp ann)\n"
+    (folder / "run.spatial").write_text(text)
+    with (folder / "run.jsonl").open("w") as log:
+        for second in range(30):
+            far, fast = (3, 3, 0.5, -0.25)[second % 4], second // 4 % 7 < 3 or second % 4 == 0
+            objects = ", ".join(
+                f'{{"name": "{name}", "polygon": [[{x}, 0], [{x + 1}, 0], [{x + 1}, 1], [{x}, 1]]}}'
+                for name, x in (("robot", second), ("ann", second + 1 + far))
+            )
+            signals = f'{{"speed": {1.25 if fast else 0.25}}}'
+            log.write(f'{{"time_ns": {second * 10**9}, "objects": [{objects}], "signals": {signals}}}\n')
+    _, text = said(capsys, *EXPLAIN)
+    assert [line for line in text.splitlines() if line.startswith(("It is", "From", "At"))] == [
+        "It is violated in 3 of 7 entries of `robot closeto[1] ann`:",
+        "From 2.000 s to 3.000 s, worst at 3.000 s, near (4, 0.5): speed is 1.25.",
+        "From 6.000 s to 7.000 s, worst at 7.000 s, near (8, 0.5): speed is 1.25.",
+        "From 10.000 s to 11.000 s, worst at 11.000 s, near (12, 0.5): speed is 1.25.",
+        "It is violated in 7 intervals; the first 5 are:",
+        *(
+            f"At {second}.000 s, near ({second + 1}, 0.5): robot and ann overlap by 0.25."
+            for second in (3, 7, 11, 15, 19)
+        ),
+    ]
+    _, text = said(capsys, *REPLAY, "--json", "-")
+    slow, apart = (result["violations"][0] for result in json.loads(text)["specifications"])
+    assert (slow["condition"], slow["entries"], slow["violated_entries"]) == ("robot closeto[1] ann", 7, 3)
+    last = apart["intervals"][-1]
+    assert (len(apart["intervals"]), apart["entries"]) == (7, None)
+    assert (last["start_ns"], last["samples"], last["robustness"]) == (27 * 10**9, 1, -0.25)
+    assert (last["atom"]["objects"], last["place"]) == (["robot", "ann"], [28.0, 0.5])
+    _, text = said(capsys, *EXPLAIN, "--at", "7s", "--result", "apart", "--json")
+    assert len(json.loads(text)[0]["violations"][0]["intervals"]) == 2

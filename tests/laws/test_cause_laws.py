@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import groupby
 
 import numpy as np
 from hypothesis import HealthCheck, assume, given
@@ -281,3 +282,30 @@ def test_the_body_over_an_empty_group_can_be_replaced_by_true(specification, rec
                 [replaced.robustness, replaced.lower, replaced.upper],
                 [result.robustness, result.lower, result.upper],
             )
+
+
+@examples(150)
+@given(trace=signal_runs(), limit=_NUMBERS)
+def test_a_violated_invariant_lists_each_run_of_samples_that_violate_it(trace, limit):
+    times, signals = trace.times_ns.tolist(), trace.signals
+    missing = np.full(len(times), np.nan)
+    p, q = (signals.get(name, missing) for name in "pq")
+    for text, fails, enters in (
+        (f"G (p >= {limit})", p < limit, None),
+        (f"not F (p >= {limit})", p > limit, None),
+        (f"G[0, 3] (p >= {limit} -> q >= 0)", (p > limit) & (q < 0) & (np.arange(len(p)) < 4), p >= limit),
+    ):
+        result = sr.evaluate(sr.parse_specification(text), trace).result()
+        runs = [list(run) for is_failing, run in groupby(range(len(times)), fails.__getitem__) if is_failing]
+        if not runs:
+            assert result.violated_invariants == ()
+            continue
+        (invariant,) = result.violated_invariants
+        spans = [(interval.start_ns, interval.end_ns, interval.samples) for interval in invariant.intervals]
+        assert spans == [(times[run[0]], times[run[-1]], len(run)) for run in runs]
+        assert result.upper == min(interval.robustness for interval in invariant.intervals)
+        if enters is not None:
+            window = range(min(len(times), 4))
+            entries = [set(run) for has_entered, run in groupby(window, enters.__getitem__) if has_entered]
+            missed = sum(any(run[0] in entry for run in runs) for entry in entries)
+            assert (invariant.condition, invariant.entries) == (f"p >= {limit:g}", (len(entries), missed))

@@ -87,7 +87,7 @@ def test_of_a_missed_response_all_is_about_what_came_nearest(tmp_path: Path) -> 
     assert (pointer["text"], pointer["label"], pointer["time"]) == ("a dist b <= 3", "-2", 2.0)
     assert soon["nodes"][soon["decided"]]["text"] == "a dist b <= 3"
     [event] = [each for each in page.facts["events"] if each["specification"] == "soon"]
-    assert "did not: a dist b <= 3 fails by 2." in "".join(event["parts"])
+    assert "held: a dist b <= 3 fails by 2." in "".join(event["parts"])
 
 
 PAST = ("O %s", "O[0s, 2s] %s", "H %s", "H[1s, 3s] %s", "Y %s", "%s S (q >= 0)", "%s S[0s, 2s] (q >= 0)")

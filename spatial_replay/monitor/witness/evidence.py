@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import NamedTuple
@@ -76,13 +76,24 @@ class Evidence:
         Raises:
             LookupError: there is none; the log changed since it was evaluated.
         """
-        for scene in self._scenes():
+        return self.scenes([time_ns])[time_ns]
+
+    def scenes(self, times_ns: Collection[int]) -> dict[int, TraceScene]:
+        """Return the sample of each of some times, as `scene` does, in one pass over the log."""
+        pending, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
+        for scene in self._scenes() if pending else ():
             trace = scene.trace
-            at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
-            if at < end:
+            while pending and pending[-1] <= trace.times_ns[-1]:
+                time_ns = pending.pop()
+                at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
+                if at == end:
+                    raise LookupError(f"there is no sample at {time_ns} ns any more")
                 past = tail(trace.slice(0, at), self._reach) if at else trace.slice(0, 0)
-                return TraceScene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
-        raise LookupError(f"there is no sample at {time_ns} ns any more")
+                sample = Trace.concatenate([past, trace.slice(at, end)])
+                scenes[time_ns] = TraceScene(sample, self._regions, len(past))
+            if not pending:
+                return scenes
+        raise LookupError(f"there is no sample at {pending[-1]} ns any more")
 
     def columns(self, formulas: Sequence[Formula]) -> Floats:
         """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished, windows_of
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.offline import (
+    OfflineNodes,
+    evaluate_offline,
+    evaluate_unfinished,
+    windows_of,
+)
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
@@ -180,17 +187,8 @@ def find_witness(
     lower, upper = done.interval(node)
     verdict = verdict_of(lower, upper)
     end = End.of(verdict)
-    nodes = [evidence.bound(formula) for formula, _ in done.tree]
-
-    def followed(found: DecidingPath) -> tuple[tuple[WitnessStep, ...], DecidingAtom | None]:
-        path = tuple(_step(step, nodes[step.node], times_ns) for step in found.steps)
-        leaf = nodes[path[-1].node]
-        if not isinstance(leaf, Atom | Quantified):
-            return path, None
-        return path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
-
     found = deciding_path(done, node, end)
-    path, deciding = followed(found)
+    path, deciding = _steps(evidence, done, found), atom_of_path(evidence, done, found, evidence.scene)
     at_ns = path[-1].time_ns
     gaps: tuple[Gap, ...] = ()
     if deciding is not None and deciding.unknown:
@@ -206,27 +204,13 @@ def find_witness(
         threshold = threshold_of(evidence, *over, node, verdict, deciding, goes_on=open_ended)
     open_end = None
     if end is not End.OPEN and lower < upper and not goes_on:
-        other_path, other = followed(deciding_path(done, node, end.turned))
+        other_path = deciding_path(done, node, end.turned)
+        other = atom_of_path(evidence, done, other_path, evidence.scene)
         if other is not None and other.lower < other.upper:
-            open_end = other, other_path[-1].time_ns
-    missed, nearest = None, None
+            open_end = other, int(times_ns[other_path.steps[-1].sample])
+    missed, closest, closest_path = _NOTHING_MISSED
     if verdict is Verdict.VIOLATED:
-        missed, nearest = missed_response(found, done, instance.bindings)
-    closest: tuple[DecidingAtom, int] | None = None
-    closest_path: tuple[WitnessStep, ...] = ()
-    if nearest is not None:
-        best_path, best = followed(nearest)
-        if best is not None and not best.unknown:
-            closest, closest_path = (best, best_path[-1].time_ns), best_path
-    last = nodes[path[-1].node]
-    if missed is None and verdict is Verdict.VIOLATED and isinstance(last, Quantified):
-        # an implication within the one node of an open group
-        scene = evidence.scene(at_ns)
-        if (within := failed_implication(scene, last, found.end)) is not None:
-            condition, response, is_condition = within
-            missed = MissedResponse(short_title(condition), short_title(response), at_ns, is_condition)
-            best = deciding_atom(scene, response, End.HIGH) if is_condition else None
-            closest = (best, at_ns) if best is not None and not best.unknown else None
+        missed, closest, closest_path = find_missed(evidence, done, found, evidence.scene)
     return Witness(
         instance.name,
         instance.object,
@@ -242,11 +226,74 @@ def find_witness(
         missed,
         gaps,
         closest,
-        closest_path,
+        () if closest_path is None else _steps(evidence, done, closest_path),
         evidence.units,
-        declared_unit(nodes[node], evidence.units),
+        declared_unit(evidence.bound(done.tree[node][0]), evidence.units),
         while_present,
     )
+
+
+SceneAt: TypeAlias = Callable[[int], TraceScene]
+"""Returns the one sample of a time (see `Evidence.scene`)."""
+
+
+class MissedWitness(NamedTuple):
+    """A response that failed on a deciding path.
+
+    Attributes:
+        missed: the outermost implication that failed; None if none did.
+        closest: if the condition decided, the atom that came closest to fulfilling the response, and the time
+            of its sample; else None.
+        path: from the response to that atom, unless both are in one node of an open group.
+    """
+
+    missed: MissedResponse | None = None
+    closest: tuple[DecidingAtom, int] | None = None
+    path: DecidingPath | None = None
+
+
+_NOTHING_MISSED: Final = MissedWitness()
+
+
+def atom_of_path(
+    evidence: Evidence, done: OfflineNodes, path: DecidingPath, scene_at: SceneAt
+) -> DecidingAtom | None:
+    """Return the atom that decides the leaf at the end of a path; None if that is no leaf."""
+    step = path.steps[-1]
+    leaf = evidence.bound(done.tree[step.node][0])
+    if not isinstance(leaf, Atom | Quantified):
+        return None
+    return deciding_atom(scene_at(int(done.times_ns[step.sample])), leaf, path.end)
+
+
+def find_missed(
+    evidence: Evidence, done: OfflineNodes, path: DecidingPath, scene_at: SceneAt
+) -> MissedWitness:
+    """Return the response that was missed on a path to what violates a formula."""
+    missed, nearest = missed_response(path, done, evidence.instance.bindings)
+    if missed is not None:
+        best = None if nearest is None else atom_of_path(evidence, done, nearest, scene_at)
+        if nearest is None or best is None or best.unknown:
+            return MissedWitness(missed)
+        return MissedWitness(missed, (best, int(done.times_ns[nearest.steps[-1].sample])), nearest)
+    step = path.steps[-1]
+    leaf, at_ns = evidence.bound(done.tree[step.node][0]), int(done.times_ns[step.sample])
+    if not isinstance(leaf, Quantified):
+        return _NOTHING_MISSED
+    # an implication within the one node of an open group
+    scene = scene_at(at_ns)
+    within = failed_implication(scene, leaf, path.end)
+    if within is None:
+        return _NOTHING_MISSED
+    condition, response, is_condition = within
+    missed = MissedResponse(short_title(condition), short_title(response), at_ns, is_condition)
+    best = deciding_atom(scene, response, End.HIGH) if is_condition else None
+    return MissedWitness(missed, None if best is None or best.unknown else (best, at_ns))
+
+
+def _steps(evidence: Evidence, done: OfflineNodes, path: DecidingPath) -> tuple[WitnessStep, ...]:
+    nodes = (evidence.bound(done.tree[step.node][0]) for step in path.steps)
+    return tuple(_step(step, node, done.times_ns) for step, node in zip(path.steps, nodes, strict=True))
 
 
 def _while_present(

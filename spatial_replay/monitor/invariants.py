@@ -1,0 +1,262 @@
+"""How often and where an invariant (`G p`) is violated: each interval, with its worst sample."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.measure import Point
+from spatial_replay.monitor.offline import (
+    OfflineNodes,
+    evaluate_offline,
+    evaluate_unfinished,
+    windows_of,
+)
+from spatial_replay.monitor.sentences import Conjunct, what_was_measured
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.path import (
+    DecidingAtom,
+    End,
+    deciding_path,
+    missed_response,
+    short_title,
+)
+from spatial_replay.monitor.witness.witness import atom_of_path, find_missed
+from spatial_replay.spec.formula import Temporal, operands_of, operator_of
+from spatial_replay.text import Instant, Sentence, counted, number_text
+
+LISTED: Final = 5
+"""Intervals that an explanation lists."""
+MOST_EXPLAINED: Final = 256
+"""Intervals of one invariant with an atom, since each looks into its sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViolatedInterval:
+    """Samples in a row at which the operand of a `G` is violated.
+
+    Attributes:
+        start_ns, end_ns: the first and the last of them.
+        samples: how many they are.
+        worst_ns: the first with the least robustness.
+        robustness: that of the operand there.
+        deciding: the atom that decides there: of a missed response, the one that came closest to it. None
+            after `MOST_EXPLAINED` intervals, and if no atom decides.
+        deciding_ns: the time of the sample in which this atom was measured.
+        place: a point on what it relates or, where that has none, on what its condition relates; else None.
+    """
+
+    start_ns: int
+    end_ns: int
+    samples: int
+    worst_ns: int
+    robustness: float
+    deciding: DecidingAtom | None = None
+    deciding_ns: int | None = None
+    place: Point | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ViolatedInvariant:
+    """A part `G p` of a result that is violated.
+
+    Attributes:
+        spec: the innermost named spec that it belongs to.
+        node: its id.
+        intervals: in which `p` is violated, by time.
+        condition: of `G (condition -> response)`, its condition; else None.
+        entries: the intervals in which the condition held, and in how many of them the response was missed.
+    """
+
+    spec: str
+    node: int
+    intervals: tuple[ViolatedInterval, ...]
+    condition: str | None = None
+    entries: tuple[int, int] = (0, 0)
+
+
+class _Runs(NamedTuple):
+    """Runs of samples: the first (K,) of each, and the one after its last."""
+
+    starts: Integers
+    ends: Integers
+
+    @classmethod
+    def of(cls, is_inside: NDArray[np.bool_]) -> _Runs:
+        turns = np.flatnonzero(np.diff(is_inside, prepend=False, append=False))
+        return cls(turns[::2], turns[1::2])
+
+
+def find_violated_invariants(
+    evidence: Evidence,
+    leaves: Floats,
+    times_ns: Integers,
+    conjuncts: Sequence[Conjunct],
+    *,
+    goes_on: bool = False,
+    most: int = MOST_EXPLAINED,
+) -> Iterator[ViolatedInvariant]:
+    """Yield the conjuncts `G p` and `not F p` that are violated, in their order.
+
+    Args:
+        leaves: (C, A, T), the instance's leaves.
+        times_ns: (T,), T at least 1.
+        goes_on: whether samples may follow: then only what they cannot change is violated.
+        most: intervals of each that get an atom, the first ones.
+    """
+    invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
+    if not invariants:
+        return
+    evaluate = evaluate_unfinished if goes_on else evaluate_offline
+    done = evaluate(evidence.instance.formula, evidence.instance.program.leaves, leaves, times_ns)
+    for invariant in invariants:
+        violated = _intervals_of(evidence, done, invariant, most)
+        if violated.intervals:
+            yield violated
+
+
+class _Invariant(NamedTuple):
+    """An operator over all samples of its window.
+
+    Attributes:
+        operator: `G`, or an `F` that is negated.
+        operand: the id of its operand.
+        condition: the id of the condition, if the operand is an implication; else None.
+    """
+
+    conjunct: Conjunct
+    operator: Temporal
+    operand: int
+    condition: int | None
+
+    @property
+    def end(self) -> End:
+        """Which end of the operand's interval decides a violation."""
+        return End.HIGH if self.operator.operator == "G" else End.LOW
+
+    @classmethod
+    def of(cls, conjunct: Conjunct) -> _Invariant | None:
+        formula, node, sign = conjunct.formula, conjunct.node, 1
+        while operator_of(formula) in ("not", "spec"):
+            sign = -sign if operator_of(formula) == "not" else sign
+            (formula,), node = operands_of(formula), node + 1
+        if not isinstance(formula, Temporal) or formula.operator != ("G" if sign > 0 else "F"):
+            return None
+        (body,), inner = operands_of(formula), node + 1
+        while operator_of(body) == "spec":
+            (body,), inner = operands_of(body), inner + 1
+        # the first operand of a node is numbered next
+        condition = inner + 1 if sign > 0 and operator_of(body) == "->" else None
+        return cls(conjunct, formula, node + 1, condition)
+
+
+def _intervals_of(
+    evidence: Evidence, done: OfflineNodes, invariant: _Invariant, most: int
+) -> ViolatedInvariant:
+    begins, ends = windows_of(invariant.operator, done.times_ns)
+    is_asked = np.zeros(len(done.times_ns), np.bool_)
+    is_asked[begins[0] : ends[0]] = True
+    low, high = done.judged_ends(invariant.operand)
+    robustness = high if invariant.end is End.HIGH else -low
+    runs = _Runs.of(is_asked & (robustness < 0.0))
+    intervals, worst = [], []
+    for start, end in zip(runs.starts.tolist(), runs.ends.tolist(), strict=True):
+        worst.append(start + int(np.argmin(robustness[start:end])))
+        first_ns, last_ns, worst_ns = done.times_ns[[start, end - 1, worst[-1]]].tolist()
+        least = float(robustness[worst[-1]])
+        intervals.append(ViolatedInterval(first_ns, last_ns, end - start, worst_ns, least))
+    intervals[:most] = _with_atoms(evidence, done, invariant, intervals[:most], worst[:most])
+    conjunct = invariant.conjunct
+    if invariant.condition is None:
+        return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
+    held = _Runs.of(is_asked & (done.ends(invariant.condition)[0] >= 0.0))
+    missed = np.unique(np.searchsorted(held.starts, runs.starts, side="right"))
+    condition = short_title(evidence.bound(done.tree[invariant.condition][0]))
+    entries = len(held.starts), len(missed)
+    return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals), condition, entries)
+
+
+def _with_atoms(
+    evidence: Evidence,
+    done: OfflineNodes,
+    invariant: _Invariant,
+    intervals: Sequence[ViolatedInterval],
+    worst: Sequence[int],
+) -> Iterator[ViolatedInterval]:
+    """Yield intervals with the atom that decides the worst sample of each."""
+    bindings, condition = evidence.instance.bindings, invariant.condition
+    paths = [deciding_path(done, invariant.operand, invariant.end, sample=sample) for sample in worst]
+    responses = [missed_response(path, done, bindings)[1] for path in paths]
+    conditions = [
+        path if condition is None else deciding_path(done, condition, End.LOW, sample=sample)
+        for path, sample in zip(paths, worst, strict=True)
+    ]
+    ends = [path.steps[-1].sample for path in (*paths, *responses, *conditions) if path is not None]
+    scene_at = evidence.scenes(set(done.times_ns[ends].tolist())).__getitem__
+    for interval, path, asked in zip(intervals, paths, conditions, strict=True):
+        deciding = atom_of_path(evidence, done, path, scene_at)
+        deciding_ns = int(done.times_ns[path.steps[-1].sample])
+        closest = find_missed(evidence, done, path, scene_at).closest
+        if closest is not None:
+            deciding, deciding_ns = closest
+        if deciding is None:
+            yield interval
+            continue
+        place = _place_of(deciding) or _place_of(atom_of_path(evidence, done, asked, scene_at))
+        yield replace(interval, deciding=deciding, deciding_ns=deciding_ns, place=place)
+
+
+def _place_of(deciding: DecidingAtom | None) -> Point | None:
+    measured = () if deciding is None else deciding.measured
+    return next((number.contact.first for number in measured if number.contact is not None), None)
+
+
+def invariant_sentences(
+    invariant: ViolatedInvariant, first_ns: int, units: Mapping[str, str]
+) -> Iterator[Sentence]:
+    """Yield sentences on how often an invariant is violated, and on the first of several intervals.
+
+    Args:
+        first_ns: the time that others are counted from.
+        units: those that the log declares.
+    """
+    intervals = invariant.intervals
+    entries, missed = invariant.entries
+    if len(intervals) == 1 and entries < 2:
+        (interval,) = intervals
+        if interval.samples > 1:
+            yield Sentence("It is violated ", *_span(interval, first_ns), ".")
+        return
+    often = counted(len(intervals), "interval")
+    if invariant.condition is not None:
+        among = f"{missed:,} of {entries:,} entries of `{invariant.condition}`"
+        often = among if missed == len(intervals) else f"{often}, in {among}"
+    more = f"; the first {LISTED} are" if len(intervals) > LISTED else ""
+    yield Sentence(f"It is violated in {often}{more}:")
+    for interval in intervals[:LISTED]:
+        yield _interval_sentence(interval, first_ns, units)
+
+
+def _span(interval: ViolatedInterval, first_ns: int) -> tuple[str | Instant, ...]:
+    start, end = Instant(interval.start_ns, first_ns), Instant(interval.end_ns, first_ns)
+    return ("at ", start) if interval.samples == 1 else ("from ", start, " to ", end)
+
+
+def _interval_sentence(interval: ViolatedInterval, first_ns: int, units: Mapping[str, str]) -> Sentence:
+    (word, *span), deciding = _span(interval, first_ns), interval.deciding
+    parts: list[str | Instant] = [str(word).capitalize(), *span]
+    if interval.samples > 1:
+        parts += [", worst at ", Instant(interval.worst_ns, first_ns)]
+    if interval.place is not None:
+        parts.append(f", near ({', '.join(map(number_text, interval.place))})")
+    if deciding is not None:
+        measured = " and ".join(deciding.unknown) or what_was_measured(deciding, units, first_ns)
+        parts += [": ", measured]
+        if interval.deciding_ns not in (None, interval.worst_ns):
+            parts += [" at ", Instant(interval.deciding_ns, first_ns)]
+    return Sentence(*parts, ".")
