@@ -183,7 +183,7 @@ def diff_logs(
 
     Args:
         specifications: one or several, parsed or as files; None takes those that a log was written with.
-        align: "time" since the first sample, the "progress" of an automaton, or the name of a spec, whose
+        align: "time" since the zero of each log, the "progress" of an automaton, or the name of a spec, whose
             first change of sign in each run is the event.
         output: a page to write, with both under one time cursor; its name ends in .html.
         options: how to evaluate and read both logs, as for `replay_log`.

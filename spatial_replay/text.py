@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
 from functools import partial, wraps
 from inspect import signature
 from reprlib import repr as shortened
@@ -66,6 +67,20 @@ class Sentence(str):
             own for part in parts for own in (part.parts if isinstance(part, Sentence) else (part,))
         )
         return made
+
+
+CALENDAR_NS: Final = 500_000_000 * 10**9
+"""Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
+
+
+def clock_text(time_ns: int, *, with_date: bool = False) -> str:
+    """Return a time as viewers show it: "19:25:04.500 UTC", or seconds on a clock of the log's own."""
+    if time_ns < CALENDAR_NS:
+        return f"{time_ns / 1e9:.3f} s on the log's clock"
+    milliseconds = round(time_ns / 10**6)
+    moment = datetime.fromtimestamp(milliseconds // 1000, UTC)
+    day = f"{moment:%Y-%m-%d} " if with_date else ""
+    return f"{day}{moment:%H:%M:%S}.{milliseconds % 1000:03} UTC"
 
 
 def counted_from(texts: Iterable[str], first_ns: int) -> tuple[Sentence, ...]:

@@ -166,9 +166,9 @@ class Annotator:
         self.extent: SceneBounds | None = None
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
+        self.standing.zero_ns = self._scene.zero_ns
         self._show = show
         self._written = dict.fromkeys(DERIVED, 0)
-        self._first_ns = self._scene.first_ns
         self._newest = deque[RecentEvent](maxlen=_MOST_RECENT)
 
     @property
@@ -186,6 +186,15 @@ class Annotator:
         """Deciding atoms of the results that are decided so far."""
         return [each.reporter.over for each in self._results]
 
+    def count_from(self, zero_ns: int) -> None:
+        """Set the time that texts count from; without it, that of the first sample."""
+        self._scene = replace(self._scene, zero_ns=zero_ns)
+        self.standing.zero_ns = zero_ns
+
+    def _find_zero(self, trace: Trace) -> None:
+        if self._scene.zero_ns is None:
+            self.count_from(int(trace.times_ns[0]))
+
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside the next samples.
 
@@ -195,6 +204,7 @@ class Annotator:
         self.extent = SceneBounds.of(trace, self.extent)
         if not len(trace):
             return []
+        self._find_zero(trace)
         messages = []
         if not self._written[FRAME]:
             messages.append(
@@ -207,7 +217,7 @@ class Annotator:
                 self._units,
                 [() if run is None else run.propositions for run in self._runs],
                 self._automata,
-                int(trace.times_ns[0]) if self._scene.first_ns is None else self._scene.first_ns,
+                self._scene.zero_ns or 0,
             )
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
@@ -231,6 +241,7 @@ class Annotator:
         """Take in the next samples and return only their events."""
         if not len(trace):
             return []
+        self._find_zero(trace)
         for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
                 run.pass_over(block)
@@ -297,8 +308,6 @@ class Annotator:
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """Return the events, by time, then in the order of results and of their nodes."""
         self._samples.extend(trace)
-        if self._first_ns is None:
-            self._first_ns = int(trace.times_ns[0])
         pairs = zip(self._results, blocks, strict=True)
         events = [event for result, block in pairs for event in result.extend(trace, block)]
         return sorted(events, key=lambda each: each.time_ns)
@@ -319,9 +328,9 @@ class Annotator:
 
         After a seek, viewers get no more of a topic of a file.
         """
-        first_ns = events[0].time_ns if self._first_ns is None else self._first_ns
+        zero_ns = events[0].time_ns if self._scene.zero_ns is None else self._scene.zero_ns
         for event in events:
-            seconds = round((event.time_ns - first_ns) / 1e9, 3)
+            seconds = round((event.time_ns - zero_ns) / 1e9, 3)
             self._newest.appendleft(RecentEvent(at=seconds, event=event.log.message))
         return RecentEvents(events=self._newest).SerializeToString(deterministic=True)
 

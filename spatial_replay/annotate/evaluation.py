@@ -151,6 +151,7 @@ class AnnotatedEvaluation:
         axes: Axes = OUR_AXES,
         images: Collection[str] = (),
         planned_for: str = "",
+        start: tuple[int, str] = (0, ""),
     ) -> Attachment:
         """Return the layout that opens the log in a viewer, once everything else is written.
 
@@ -159,14 +160,18 @@ class AnnotatedEvaluation:
             axes: those of the source.
             images: those of the topics that have images.
             planned_for: the file that decisions were made for, if these results are of another one.
+            start: the time of the first message that a viewer shows, and the name of the log that has it.
         """
-        from spatial_replay.annotate.foxglove_layout import layout_attachment
+        from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
 
         extent, standing = self.annotator.extent, self.annotator.standing
         contents = self.contents(extent, topics, axes, images)._replace(planned_for=planned_for)
         if not self.annotator.has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
-        return layout_attachment(contents._replace(outcomes=standing.outcomes, order=standing.order))
+        zero = TextZero(self.annotator.scene.zero_ns or 0, *start)
+        return layout_attachment(
+            contents._replace(outcomes=standing.outcomes, order=standing.order, zero=zero)
+        )
 
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:

@@ -36,7 +36,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SA
 from spatial_replay.palette import CURVES, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
 from spatial_replay.spec.walks import looks_ahead
-from spatial_replay.text import cut, number_text
+from spatial_replay.text import Instant, clock_text, cut, number_text, time_text
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
@@ -130,7 +130,9 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     ]
 
 
-def sample_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
+def sample_curves(
+    trees: Sequence[ReportedTree], units: Mapping[str, str], zero: TextZero | None = None
+) -> list[Panel]:
     """Return the curves of the results and of named specs, those of each unit in a panel of their own."""
     results = [(tree.title, tree.formula) for tree in trees]
     return [
@@ -143,6 +145,7 @@ def sample_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> li
             name,
             title,
             [_Curve(each, _standing_path(each, "robustness"), unit_of(node, units)) for each, node in shown],
+            zero,
         )
     ]
 
@@ -227,7 +230,12 @@ def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
     if outcome is None or outcome.standing != VIOLATED or not math.isfinite(outcome.by):
         return f"{title}{words}"
     unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
-    return f"{title}, by {number_text(outcome.by)}{unit} at {outcome.at_s:.3f} s{words}"
+    return f"{title}, by {number_text(outcome.by)}{unit} at {_with_clock(outcome.at)}{words}"
+
+
+def _with_clock(at: Instant) -> str:
+    """Return a time, and how a viewer's cursor shows it where that differs."""
+    return f"{at} ({clock_text(at.time_ns)})" if at.first_ns else str(at)
 
 
 def _titled(identifier: str, title: str, config: Config) -> Panel:
@@ -249,8 +257,9 @@ class _Curve(NamedTuple):
     unit: str
 
 
-def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
+def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero | None = None) -> list[Panel]:
     """Return a plot for each unit, with a line at 0: above it, things hold."""
+    offset = "" if text_zero is None else text_zero.offset
     panels = []
     for index, unit in enumerate(list(dict.fromkeys(curve.unit for curve in curves))[:_MOST_PLOTS]):
         own = [curve for curve in curves if curve.unit == unit][:_MOST_CURVES]
@@ -274,7 +283,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
             "legendDisplay": "left",
             "sidebarDimension": _LEGEND_PIXELS,
             "xAxisVal": "timestamp",
-            "xAxisLabel": "time [s]",
+            "xAxisLabel": f"time [s]; texts count from {offset}" if offset else "time [s]",
             "yAxisLabel": words,
         }
         panels.append(_titled(f"Plot!{name}{index or ''}", f"{title} [{words}]", config))
@@ -298,6 +307,32 @@ _MARGIN = 1.5
 """The height of the picture by the size of what is in it; a panel may be narrower than it is high."""
 
 
+class TextZero(NamedTuple):
+    """The time that texts count from, and the one that the axes of a viewer do.
+
+    Attributes:
+        zero_ns: of the texts.
+        start_ns: of the first message that the viewer shows.
+        name: the name of what begins there.
+    """
+
+    zero_ns: int
+    start_ns: int
+    name: str
+
+    @property
+    def offset(self) -> str:
+        """How far the two are apart; "" where they are the same."""
+        if self.zero_ns == self.start_ns:
+            return ""
+        side = "after" if self.zero_ns > self.start_ns else "before"
+        return f"{time_text(abs(self.zero_ns - self.start_ns))} {side} the start of {self.name}"
+
+    def __str__(self) -> str:
+        clock = clock_text(self.zero_ns, with_date=True)
+        return f"0 s = {clock}{', ' if self.offset else ''}{self.offset}"
+
+
 class LayoutContents(NamedTuple):
     """Content of a layout for a log.
 
@@ -312,6 +347,7 @@ class LayoutContents(NamedTuple):
         order: the places of the trees, the worst first; empty while that is not known.
         images: the topics with images.
         planned_for: the file that the planner's decisions were made for, if these results are of another one.
+        zero: the time that texts count from; None before it is known.
     """
 
     trees: Sequence[ReportedTree]
@@ -324,6 +360,7 @@ class LayoutContents(NamedTuple):
     images: Sequence[str] = ()
     order: Sequence[int] = ()
     planned_for: str = ""
+    zero: TextZero | None = None
 
     def worst_first(self) -> LayoutContents:
         """Return the same with the worst results first, which then have lights and curves if not all can."""
@@ -349,7 +386,7 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
     unit at a time, the states of results, and a panel of tabs.
     """
     contents = contents.worst_first()
-    return _layout(contents, sample_curves(contents.trees, contents.units), _details(contents))
+    return _layout(contents, sample_curves(contents.trees, contents.units, contents.zero), _details(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
@@ -402,7 +439,8 @@ def _details(contents: LayoutContents) -> _Details:
         shown.append(("events", "Table!events", "Events", f"{RECENT_EVENTS}.events"))
     if trees:
         sources = f"{SPECIFICATION}.files[:].source"
-        shown.append(("specification", "RawMessages!specification", "Specification", sources))
+        title = "Specification" if contents.zero is None else f"Specification; {contents.zero}"
+        shown.append(("specification", "RawMessages!specification", title, sources))
     if any(contents.has_states):
         title = trees[contents.has_states.index(True)].title
         path = _standing_path(title, "automaton")

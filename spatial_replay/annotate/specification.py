@@ -155,7 +155,7 @@ def encode_specification(
         units: those that are declared, of signals by their names, of lengths by "".
         propositions: of each tree, the nodes that are propositions of its automaton.
         automata: of each tree, its automaton.
-        start_ns: the time of the first sample.
+        start_ns: the time that texts count from.
     """
     # imported here since an evaluation without messages needs no message types
     from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage

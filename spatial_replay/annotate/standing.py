@@ -23,6 +23,7 @@ from spatial_replay.logs.wire import WireTemplate, placed, rounded, words_of
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.spec.walks import looks_ahead
+from spatial_replay.text import Instant
 from spatial_replay.trace.trace import LATEST_NS
 
 _MOST_TEMPLATES: Final = 1024
@@ -81,13 +82,13 @@ class FinalStanding(NamedTuple):
     Attributes:
         standing: satisfied, violated or unknown, a number of `Standing`.
         by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
-        at_s: since when it is that, in seconds after the first sample.
+        at: since when it is that.
         unit: of the robustness.
     """
 
     standing: int
     by: float
-    at_s: float
+    at: Instant
     unit: str
 
 
@@ -99,6 +100,7 @@ class StandingEncoder:
     Attributes:
         outcomes: of each result, once the log has ended.
         order: then the places of results, the worst first: of those violated, the one that was so first.
+        zero_ns: the time that seconds count from; None before it is known.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class StandingEncoder:
         self._words = [""] * len(trees)
         self._violated_ns = [LATEST_NS] * len(trees)
         self._least, self._least_ns = [math.inf] * len(trees), [0] * len(trees)
-        self._first_ns: int | None = None
+        self.zero_ns: int | None = None
         self._written_ns: int | None = None
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         self.outcomes: tuple[FinalStanding, ...] = ()
@@ -161,8 +163,6 @@ class StandingEncoder:
         for index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue
-            if self._first_ns is None:
-                self._first_ns = min(int(each.times_ns[0]) for each in blocks if len(each.times_ns))
             self._violated_ns[index] = int(self._violated(index, block)[-1])
             self._least_ns[index] = int(self._became_least(index, block)[-1])
             self._least[index] = float(np.fmin.reduce(block.series[0, 3], initial=self._least[index]))
@@ -193,7 +193,7 @@ class StandingEncoder:
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
             over: of each tree, what decided it.
         """
-        first_ns = time_ns if self._first_ns is None else self._first_ns
+        zero_ns = time_ns if self.zero_ns is None else self.zero_ns
         since_ns = self._violated_ns
         for place, final in enumerate(finals):
             if final[0, 1] < self._least[place]:
@@ -207,7 +207,7 @@ class StandingEncoder:
             code = int(standing_codes(ended[:1], final=True)[0, 0])
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
-            outcomes.append(FinalStanding(code, by, (min(least_ns, time_ns) - first_ns) / 1e9, unit))
+            outcomes.append(FinalStanding(code, by, Instant(min(least_ns, time_ns), zero_ns), unit))
         self.outcomes, codes = tuple(outcomes), [each.standing for each in outcomes]
         since = [at_ns if code == VIOLATED else 0 for code, at_ns in zip(codes, since_ns, strict=True)]
         self.order = np.lexsort((np.array(since), _RANKS[codes])).tolist()
@@ -259,7 +259,7 @@ class StandingEncoder:
             own = [each[members] for each in (times_ns[:, None], *numbers)]
             for each, _ in layout.violated:
                 if each not in of_violated:
-                    seconds = (np.minimum(instants_ns[:, each], times_ns) - (self._first_ns or 0)) / 1e9
+                    seconds = (np.minimum(instants_ns[:, each], times_ns) - (self.zero_ns or 0)) / 1e9
                     since, at = np.round(seconds, 3)[:, :, None]
                     of_violated[each] = since, rounded(_finite(-series[each][0, 3, :, None])), at
                 own += [column[members] for column in of_violated[each]]

@@ -96,7 +96,8 @@ class ResultRow:
         doubtful: a sentence on each of them.
         dropped: what the recorder of the log dropped, in words; None for nothing.
         samples: how many were evaluated.
-        start_ns: time of the first of them.
+        zero_ns: the time that sentences about the log count from.
+        start_ns: time of the first sample evaluated.
         duration_ns: from the first to the last.
         faults, remarks, missing: what was lost while reading, what was remarkable, names that the log lacks.
         seconds: how long reading and evaluating the log took, for all its specifications.
@@ -131,6 +132,7 @@ class ResultRow:
     doubtful: tuple[str, ...] = ()
     dropped: str | None = None
     samples: int = 0
+    zero_ns: int | None = None
     start_ns: int | None = None
     duration_ns: int | None = None
     faults: tuple[str, ...] = ()
@@ -251,6 +253,7 @@ def _rows_of_file(
     lines = spec_lines(file)
     log = ResultRow(
         samples=replayed.samples,
+        zero_ns=replayed.first_ns,
         start_ns=replayed.start_ns,
         duration_ns=replayed.end_ns - replayed.start_ns,
         faults=_some(replayed.faults),

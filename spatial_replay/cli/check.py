@@ -246,7 +246,7 @@ def _compare_with_log(
     # only needed with --log: log readers load the numerical libraries
     from spatial_replay.monitor.ends import Needs, RunEnds
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
-    from spatial_replay.replay.selection import LogNames
+    from spatial_replay.replay.selection import LogNames, Window, log_zero_ns
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log, **reading)
@@ -272,12 +272,13 @@ def _compare_with_log(
     compare(ends.finish())
     remarks = [doubt.remark(source.name) for doubt in dict.fromkeys(doubts)]
     remarks += [Sentence(f"{source.name}: ", remark) for remark in ends.remarks]
-    warn(*counted_from((*faults, *remarks), ends.log_begin_ns))
+    zero_ns = log_zero_ns(source, Window(), ends)
+    warn(*counted_from((*faults, *remarks), zero_ns))
     unknown = names.check(specification, {})
     missing = sum(diagnostic.severity == "error" for diagnostic in unknown)
     if not strict_names:
         unknown = tuple(replace(diagnostic, severity="warning") for diagnostic in unknown)
-    doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source, ends))
+    doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source, ends, zero_ns))
     counts = [counted(missing, "name") + " that it never has"] if missing else []
     others = len(unknown) - missing + len(doubtful)
     counts += [counted(others, "other warning" if missing else "warning")] if others else []
@@ -311,8 +312,8 @@ class _CutResults:
         for blocks, block in zip(self._kept, self._stream.extend(trace), strict=True):
             blocks.append(replace(block, series=block.series[..., :0].copy()))
 
-    def warnings(self, source: Source, ends: RunEnds) -> Iterator[Diagnostic]:
-        """Yield a warning for each result, at its window."""
+    def warnings(self, source: Source, ends: RunEnds, zero_ns: int) -> Iterator[Diagnostic]:
+        """Yield a warning for each result, at its window; times count from `zero_ns`."""
         from spatial_replay.monitor.result import SpecResult
         from spatial_replay.monitor.stream import join_blocks
         from spatial_replay.monitor.witness.evidence import Evidence
@@ -325,7 +326,7 @@ class _CutResults:
         for stream, blocks in zip(self._stream.streams, self._kept, strict=True):
             if not len(stream):
                 continue
-            evidence = Evidence(stream.instance, specification.regions, traces, units)
+            evidence = Evidence(stream.instance, specification.regions, traces, units, zero_ns)
             result = SpecResult.from_stream(stream, evidence, join_blocks(blocks), has_series=False)
             for part in result.untested if result.tested == "cut" else ():
                 node = nodes_of(result.formula)[part.node or 0]

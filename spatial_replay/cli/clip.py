@@ -241,7 +241,7 @@ def verify(
     from spatial_replay.logs.output_file import replacing
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.read import recompute_decisions
-    from spatial_replay.replay.selection import known_start_ns
+    from spatial_replay.replay.selection import known_zero_ns
     from spatial_replay.replay.verification import (
         recorded_reading,
         sign_certificate,
@@ -273,7 +273,7 @@ def verify(
         planned = annotated if original is None else original
         with progress("samples") as advance:
             recomputed = recompute_decisions(planned, advance)
-        faults += counted_from(recomputed.faults, known_start_ns(planned) if recomputed.faults else 0)
+        faults += counted_from(recomputed.faults, known_zero_ns(planned) if recomputed.faults else 0)
         differences += [f"{planned.name}: {difference}" for difference in recomputed.differences]
         if not recomputed.differences:
             show(

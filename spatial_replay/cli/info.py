@@ -179,11 +179,11 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
 def _print_decisions(log: LogFile, as_json: bool) -> int:
     """Print the decisions of a planned run."""
     from spatial_replay.planning.read import read_decisions
-    from spatial_replay.replay.selection import known_start_ns
+    from spatial_replay.replay.selection import known_zero_ns
     from spatial_replay.sources.open_log import open_source
 
     recorded = read_decisions(log)
-    warn(*counted_from(recorded.faults, known_start_ns(open_source(log)) if recorded.faults else 0))
+    warn(*counted_from(recorded.faults, known_zero_ns(open_source(log)) if recorded.faults else 0))
     if as_json:
         show_json(recorded.document)
     else:

@@ -101,7 +101,7 @@ def _redo(
     # imported here so that --help stays fast
     from spatial_replay.planning.read import ReplannedSource, planner_of, redo_decisions
     from spatial_replay.replay.engine import load_files, run_replay
-    from spatial_replay.replay.selection import ReplayOptions, known_start_ns
+    from spatial_replay.replay.selection import ReplayOptions, known_zero_ns
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
@@ -112,7 +112,7 @@ def _redo(
         require_choice(file, of)
     with progress("samples") as advance:
         redone = redo_decisions(source, file, changes, name=of, advance=advance)
-    warn(*counted_from(redone.faults, known_start_ns(source) if redone.faults else 0))
+    warn(*counted_from(redone.faults, known_zero_ns(source) if redone.faults else 0))
     if output is not None:
         files = load_files((), source) if file is None else [file]
         beside = ReplannedSource(source, redone.messages)

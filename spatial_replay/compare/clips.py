@@ -28,6 +28,7 @@ from spatial_replay.replay.engine import Replay, Replayed, run_replay
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
+    ZERO,
     ReplayOptions,
     Selection,
     Window,
@@ -363,6 +364,7 @@ def cut_clip(
         "samples": str(whole.samples),
         "start_ns": str(start_ns),
         "end_ns": str(end_ns),
+        ZERO: str(whole.first_ns),
         "keep": json.dumps(list(keep)),
         "kept": ", ".join(each.title for each in chosen),
     }

@@ -61,7 +61,7 @@ class Alignment:
     """How the samples of run A correspond to those of run B.
 
     Attributes:
-        kind: by "time" since the first sample, by an "event", by the "progress" of an automaton.
+        kind: by "time" since the zero of each log, by an "event", by the "progress" of an automaton.
         about: what the event or the progress is of.
         knots: at least one; between two, time runs evenly, and outside them as fast in both.
         a, b: (P,) indices of the samples that stand beside each other, by time in A.
@@ -75,7 +75,7 @@ class Alignment:
 
     def __str__(self) -> str:
         if self.kind == "time":
-            return "aligned by time since the first sample"
+            return "aligned by time since the zero of each log"
         return f"aligned by the {'event' if self.kind == 'event' else 'progress of'} {self.about}"
 
 
@@ -95,6 +95,7 @@ class Parting(NamedTuple):
 
 def align_runs(
     times_ns: tuple[Integers, Integers],
+    zeros_ns: tuple[int, int],
     results: Sequence[tuple[SpecResult, SpecResult]],
     files: Sequence[Specification],
     align: str,
@@ -103,6 +104,7 @@ def align_runs(
 
     Args:
         times_ns: of the samples of A and of B, at least one each.
+        zeros_ns: the times that texts about A and B count from.
         results: of both runs, in pairs.
         align: "time", "progress", "progress:NAME", or the name of a spec, whose first change of sign is the
             event.
@@ -111,9 +113,8 @@ def align_runs(
         UsageError: no such spec, a spec that never changes its sign, no result with an automaton.
     """
     a, b = times_ns
-    start = Knot(int(a[0]), int(b[0]))
     if align == "time":
-        return _alignment("time", None, [start], a, b)
+        return _alignment("time", None, [Knot(*zeros_ns)], a, b)
     kind, colon, wanted = align.partition(":")
     if kind != "progress" or (colon and not wanted):
         return _alignment("event", align, [_event(results, align)], a, b)
@@ -185,7 +186,10 @@ def _alignment(
     nearest = np.where(beside_ns - b_ns[before] <= b_ns[after] - beside_ns, before, after)
     # where one run has no sample within a step, there is nothing to compare with
     steps = [int(np.median(np.diff(times_ns))) for times_ns in (a_ns, b_ns) if len(times_ns) > 1]
-    inside = np.flatnonzero(np.abs(b_ns[nearest] - beside_ns) <= max(steps, default=0))
+    step_ns = max(steps, default=0)
+    is_beyond = (beside_ns < b_ns[0]) | (beside_ns > b_ns[-1])
+    is_near = np.abs(b_ns[nearest] - beside_ns) <= np.where(is_beyond, step_ns // 2, step_ns)
+    inside = np.flatnonzero(is_near)
     return Alignment(kind, about, tuple(increasing), inside, nearest[inside])
 
 
@@ -512,24 +516,24 @@ class RunSpecDiff:
         """Whether the verdict or a final number differs."""
         return not EditOutcome.of(self.a).same_as(EditOutcome.of(self.b))
 
-    def sentences(self, starts_ns: tuple[int, int]) -> Iterator[Sentence]:
+    def sentences(self, zeros_ns: tuple[int, int]) -> Iterator[Sentence]:
         """Yield what differs; times of each run count from its own start."""
         yield Sentence(
             " | ".join(map(outcome_text, (self.a, self.b))) + ("" if self.is_different else ", the same")
         )
         if self.first_ns is not None:
-            yield Sentence("the sign of its value differs since ", Instant(self.first_ns, starts_ns[0]))
+            yield Sentence("the sign of its value differs since ", Instant(self.first_ns, zeros_ns[0]))
         if self.parting is not None:
             where = self.parting
             yield Sentence(
                 "they part in the automaton: ",
-                *_entered(where.a_ns, where.a_states, starts_ns[0]),
+                *_entered(where.a_ns, where.a_states, zeros_ns[0]),
                 " | ",
-                *_entered(where.b_ns, where.b_states, starts_ns[1]),
+                *_entered(where.b_ns, where.b_states, zeros_ns[1]),
             )
         for node in self.nodes:
             yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
-        for which, result, start_ns in zip("AB", (self.a, self.b), starts_ns, strict=True):
+        for which, result, start_ns in zip("AB", (self.a, self.b), zeros_ns, strict=True):
             if self.is_flipped and result.causes and result.causes[0].witness is not None:
                 reason = cause_reason(result.causes[0], start_ns)
                 yield Sentence(f"{which}: ", *reason.parts)
@@ -713,7 +717,7 @@ class LogDiff(Printed, Displayed):
     Attributes:
         a, b: the names of the logs.
         samples: how many each has, where they were compared.
-        starts_ns: the times of their first samples, which sentences count from.
+        zeros_ns: the times that sentences count from: of the first sample of each log.
         alignment: how samples correspond.
         objects: those that moved differently, the first apart first.
         signals: those with other values, in the order of their names.
@@ -729,7 +733,7 @@ class LogDiff(Printed, Displayed):
     a: str
     b: str
     samples: tuple[int, int]
-    starts_ns: tuple[int, int]
+    zeros_ns: tuple[int, int]
     alignment: Alignment
     objects: tuple[ObjectDiff, ...]
     signals: tuple[SignalDiff, ...]
@@ -751,13 +755,13 @@ class LogDiff(Printed, Displayed):
     def movements(self) -> list[Sentence]:
         """Sentences on `objects`."""
         unit = self.traces[0].units.get("", "")
-        return [_movement_sentence(each, self.starts_ns[0], unit) for each in self.objects]
+        return [_movement_sentence(each, self.zeros_ns[0], unit) for each in self.objects]
 
     @property
     def signal_changes(self) -> list[Sentence]:
         """Sentences on `signals`."""
         units = self.traces[0].units
-        return [_signal_sentence(each, self.starts_ns[0], units.get(each.name, "")) for each in self.signals]
+        return [_signal_sentence(each, self.zeros_ns[0], units.get(each.name, "")) for each in self.signals]
 
     def lines(self) -> Iterator[str]:
         """Yield the diff as text, as the command `diff` prints it."""
@@ -778,7 +782,7 @@ class LogDiff(Printed, Displayed):
             if names:
                 yield f"  only in {which}: {', '.join(names[:_MOST_LISTED])}"
         for spec in self.specs:
-            first, *rest = spec.sentences(self.starts_ns)
+            first, *rest = spec.sentences(self.zeros_ns)
             yield f"  {spec.a.title}: {first}"
             if spec.is_different:
                 yield from (f"    {sentence}" for sentence in rest)
@@ -792,6 +796,7 @@ class LogDiff(Printed, Displayed):
         return {
             "a": self.a,
             "b": self.b,
+            "zero_ns": list(self.zeros_ns),
             "same": self.is_empty,
             "damaged": bool(self.faults),
             "alignment": {
@@ -823,8 +828,8 @@ def diff_sources(
 
     Args:
         options: how each log is evaluated.
-        align: "time" since the first sample, "progress" of the automaton with the most states in common, or
-            "progress:NAME" of a spec's automaton. The name of a spec aligns by its first change of sign in
+        align: "time" since the zero of each log, "progress" of the automaton with the most states in common,
+            or "progress:NAME" of a spec's automaton. The name of a spec aligns by its first change of sign in
             each run.
         advance: called with the number of samples of each block that is read.
 
@@ -837,18 +842,19 @@ def diff_sources(
         Selection(source, tuple(files), replace(each, keep=()))
         for source, each in zip(sources, options, strict=True)
     ]
-    (a, missing), (b, also_missing) = (selection.checked_trace(advance) for selection in selections)
+    checked = [selection.checked_trace(advance) for selection in selections]
+    (a, b), zeros_ns = [read.trace for read in checked], (checked[0].zero_ns, checked[1].zero_ns)
     pairs = zip((a, b), options, strict=True)
     evaluations = [[evaluate_with(own, file, trace) for file in files] for trace, own in pairs]
     results = _paired(evaluations)
-    alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
+    alignment = align_runs((a.times_ns, b.times_ns), zeros_ns, results, files, align)
     objects = compare_objects(a, b, alignment)
     titles = [{result.title for evaluation in own for result in evaluation} for own in evaluations]
     return LogDiff(
         sources[0].name,
         sources[1].name,
         (len(a), len(b)),
-        (int(a.times_ns[0]), int(b.times_ns[0])),
+        zeros_ns,
         alignment,
         objects,
         compare_signals(a, b, alignment),
@@ -857,19 +863,15 @@ def diff_sources(
         tuple(compare_results(one, other, alignment, (a, b), objects, files) for one, other in results),
         compare_decisions(sources),
         not objects and a == b,
-        (*_faults(a), *_faults(b)),
+        tuple(text for read in checked for text in counted_from(read.trace.faults, read.zero_ns)),
         (a, b),
-        tuple(dict.fromkeys((*missing, *also_missing))),
+        tuple(dict.fromkeys(remark for read in checked for remark in read.missing)),
     )
 
 
 def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:
     names = sorted(set(one.names) - set(other.names)) + sorted(set(one.signals) - set(other.signals))
     return (*names, *sorted(titles))
-
-
-def _faults(trace: Trace) -> tuple[str, ...]:
-    return counted_from(trace.faults, int(trace.times_ns[0]))
 
 
 def _paired(evaluations: Sequence[Sequence[Evaluation]]) -> list[tuple[SpecResult, SpecResult]]:

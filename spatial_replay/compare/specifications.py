@@ -390,7 +390,12 @@ class SpecificationDiff(Printed, Displayed):
     def document(self) -> dict[str, Any]:
         """The diff as values for JSON."""
         return {
-            "log": {"name": self.log, "samples": self.samples, "damaged": bool(self.faults)},
+            "log": {
+                "name": self.log,
+                "samples": self.samples,
+                "zero_ns": self.first_ns,
+                "damaged": bool(self.faults),
+            },
             "same": self.is_empty,
             "old": self.old.filename,
             "new": self.new.filename,
@@ -423,7 +428,7 @@ def diff_over_source(
         SpecificationError: names that the log never has, if names are strict.
     """
     selection = Selection(source, (old, new), replace(options, keep=()))
-    trace, missing = selection.checked_trace(advance)
+    trace, missing, zero_ns = selection.checked_trace(advance)
     versions = TextVersions(old, new, trace.units)
     old, new = versions.old, versions.new
     pairs, removed, added = _paired(old, new)
@@ -457,7 +462,7 @@ def diff_over_source(
     return SpecificationDiff(
         source.name,
         len(before.results[0].times_ns) if before.results else 0,
-        int(trace.times_ns[0]),
+        zero_ns,
         old,
         new,
         tuple(
@@ -466,7 +471,7 @@ def diff_over_source(
         ),
         removed,
         added,
-        counted_from(trace.faults, int(trace.times_ns[0])),
+        counted_from(trace.faults, zero_ns),
         missing,
     )
 

@@ -803,7 +803,7 @@ def evaluate(
     results = tuple(
         SpecResult.from_stream(
             own,
-            Evidence(own.instance, specification.regions, lambda: [trace], trace.units),
+            Evidence(own.instance, specification.regions, lambda: [trace], trace.units, first_ns),
             block,
             doubts=of_result,
         )

@@ -254,7 +254,7 @@ def draw_runs(diff: LogDiff) -> tuple[Axes, ...]:
         UsageError: no spec was evaluated, or matplotlib is not installed.
     """
     sides = tuple(zip(diff.traces, (diff.alignment.a, diff.alignment.b), strict=True))
-    seconds = (diff.traces[0].times_ns[diff.alignment.a] - diff.starts_ns[0]) / 1e9
+    seconds = (diff.traces[0].times_ns[diff.alignment.a] - diff.zeros_ns[0]) / 1e9
     pairs = []
     for spec in diff.specs:
         columns = []

@@ -60,7 +60,7 @@ from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import requirement_text
-from spatial_replay.trace.trace import FOREVER, Sample, Trace
+from spatial_replay.trace.trace import FOREVER, LATEST_NS, Sample, Trace
 from spatial_replay.trace.units import Axes
 
 if TYPE_CHECKING:
@@ -127,6 +127,7 @@ class Recording:
             units=self._axes.units,
         )
         self._samples = self._messages = self._end_ns = 0
+        self._start_ns = LATEST_NS
         self._topics: set[str] = set()
         self._plan: Mapping[str, str] | None = None
         self._doubts: tuple[str, ...] = ()
@@ -210,6 +211,7 @@ class Recording:
             self._images |= image_topics(beside.channels.values())
             self._messages += len(kept)
         if len(written):
+            self._start_ns = min(self._start_ns, int(written.log_time_ns[0]))
             self._end_ns = max(self._end_ns, int(written.log_time_ns[-1]))
         self._samples += len(trace)
         self._hashes.add_samples(trace, own)
@@ -229,7 +231,8 @@ class Recording:
         if self._samples:
             annotator = self._evaluation.annotator
             self._sink.write_messages(merge(annotator.end(self._end_ns, self._evaluation.finals)))
-        layout = self._evaluation.layout(self._topics, self._axes, self._images)
+        start = self._start_ns, "this log"
+        layout = self._evaluation.layout(self._topics, self._axes, self._images, start=start)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:

@@ -37,6 +37,7 @@ def document_from_replay(
     return {
         "log": {
             "name": replayed.log,
+            "zero_ns": replayed.first_ns,
             **json_fields(replayed, "samples", "start_ns", "end_ns", "faults", "remarks"),
             "damaged": bool(replayed.faults),
             "doubts": [json_doubt(doubt) for doubt in replayed.doubts],
@@ -298,6 +299,7 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     document = {
         "specification": result.name,
         "object": result.object,
+        "zero_ns": first_ns,
         "node": node,
         **_of_node(about),
         "verdict": str(verdict),

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from spatial_replay.annotate.specification import (
     specification_attachments,
 )
 from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import (
     AUTOMATA,
     AUTOMATA_PREFIX,
@@ -52,12 +54,14 @@ from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
+    ZERO,
     LogNames,
     ReplayOptions,
     Selection,
     Window,
     default_keep,
-    first_sample_ns,
+    first_message_ns,
+    log_zero_ns,
 )
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification
@@ -65,7 +69,7 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications, parse_specification
 from spatial_replay.text import Instant, Sentence, counted, counted_from
 from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
-from spatial_replay.trace.trace import FOREVER, LONG_PAUSE, Trace
+from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
@@ -105,7 +109,8 @@ class Replayed:
     Attributes:
         log: base name of the log.
         samples: how many samples were evaluated, without those that fill pauses.
-        first_ns: time of the log's first sample, evaluated or not.
+        first_ns: the time that texts count from: the log's first sample, evaluated or not, or the zero that a
+            cut log names.
         start_ns, end_ns: times of the first and the last of those evaluated.
         faults: what was lost while reading, each with its place.
         remarks: what the source reports about its samples where nothing was lost; doubts come first.
@@ -208,6 +213,8 @@ class Replay:
         self._stillness = Stillness()
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
+        self._start_ns, self._is_beside = LATEST_NS, False
+        self._zero_ns: int | None = None
         self._traces = _KeptTraces(self._selection, min(_KEPT_BYTES * len(self.trees), _MOST_KEPT_BYTES))
 
     def run(
@@ -215,12 +222,14 @@ class Replay:
         write: Callable[[Messages], None] | None = None,
         *,
         layer: bool = False,
+        begin: Callable[[int], None] = lambda zero_ns: None,
         advance: Callable[[int], None] = lambda samples: None,
     ) -> Replayed:
         """Evaluate the whole source and return the results.
 
         Args:
             write: receives the messages of the annotated log, block by block; without it, none are made.
+            begin: called before `write` with the time that texts count from.
             layer: leave out the source's own messages.
             advance: called with the number of samples of each block that is done.
 
@@ -229,6 +238,7 @@ class Replay:
             UsageError: no sample in the window.
             SpecificationError: names that the log never has, if names are strict.
         """
+        self._is_beside = layer
         needs_messages = write is not None or self._hashes is not None
         # the next block is evaluated while messages of this one are made, if a core is free for that
         for block, trace, stretches in read_ahead(self._evaluated(messages=needs_messages)):
@@ -244,9 +254,15 @@ class Replay:
                 self._topics.update(channel.topic for channel in own.channels.values())
                 self._images |= image_topics(own.channels.values())
             self._add(inside, own, stretches)
+            if self._zero_ns is None:
+                self._zero_ns = log_zero_ns(self._source, self._selection.window, self._ends)
+                begin(self._zero_ns)
             if write is not None:
+                self._evaluation.annotator.count_from(self._zero_ns)
                 derived = self._evaluation.annotator.messages(inside, stretches)
-                write(merge([*derived, *([] if layer else [own])]))
+                messages = merge([*derived, *([] if layer else [own])])
+                self._start_ns = min(self._start_ns, *messages.log_time_ns[:1].tolist(), LATEST_NS)
+                write(messages)
             advance(len(inside))
         replayed = self._replayed()
         if write is not None:
@@ -269,7 +285,15 @@ class Replay:
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
         planned = planned_for(self._source, self.files)
-        return self._evaluation.layout(self._topics, self._source.axes, self._images, planned)
+        return self._evaluation.layout(
+            self._topics, self._source.axes, self._images, planned, self._shown_start()
+        )
+
+    def _shown_start(self) -> tuple[int, str]:
+        """Return the first message that a viewer shows, of this log or of the one opened next to it."""
+        is_bag = self._selection.options.keep == () and not isinstance(self._source, McapSource)
+        start_ns = first_message_ns(self._source) if self._is_beside or is_bag else None
+        return (self._start_ns, "this log") if start_ns is None else (start_ns, self._source.name)
 
     def _evaluated(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
         """Yield each block with its samples and their evaluation."""
@@ -313,7 +337,7 @@ class Replay:
         missing = self._selection.missing_names(self._names)
         dropped = dropped_samples(self._source)
         options = self._selection.options
-        first_ns = first_sample_ns(self._source) if options.window.start_ns else self._ends.log_begin_ns
+        first_ns = self._zero_ns or 0
         left = self._left(first_ns)
         doubts = distinct_doubts(self._doubts, first_ns)
         return Replayed(
@@ -339,6 +363,7 @@ class Replay:
                 self.files,
                 [join_blocks(kept) if kept else None for kept in self._kept],
                 self._traces.read,
+                first_ns,
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
                 doubts=doubts,
@@ -422,6 +447,7 @@ def replayed_specs(
     files: Sequence[Specification],
     kept: Sequence[SeriesBlock | None],
     traces: Callable[[], Iterable[Trace]],
+    zero_ns: int,
     *,
     has_series: bool = True,
     has_leaves: bool = True,
@@ -432,6 +458,7 @@ def replayed_specs(
     Args:
         kept: for each of its trees every sample, or None if nothing was kept.
         traces: reads the samples again.
+        zero_ns: the time that sentences count from.
         has_series, has_leaves: whether the stretches hold the numbers, and the atoms.
         doubts: those about the log.
     """
@@ -439,7 +466,7 @@ def replayed_specs(
     return tuple(
         SpecResult.from_stream(
             stream,
-            Evidence(stream.instance, files[tree.file].regions, traces, evaluation.units),
+            Evidence(stream.instance, files[tree.file].regions, traces, evaluation.units, zero_ns),
             block,
             name=tree.name,
             has_series=has_series,
@@ -521,8 +548,8 @@ def run_replay(
         sink = stack.enter_context(
             LogWriter(stack.enter_context(replacing(output, inputs)), chunk_ns=WHOLE_CHUNK_NS)
         )
-        _begin(sink, source, replay, options, layer=layer)
-        replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
+        begin = partial(_begin, sink, source, replay, options, layer=layer)
+        replayed = replay.run(sink.write_messages, layer=layer, begin=begin, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
@@ -578,7 +605,9 @@ def recorded_texts(source: Source) -> list[SpecificationText]:
     return []
 
 
-def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *, layer: bool) -> None:
+def _begin(
+    sink: Sink, source: Source, replay: Replay, options: ReplayOptions, zero_ns: int, *, layer: bool
+) -> None:
     """Write what comes before the first message: our metadata, and that of the source."""
     before = dict(source.metadata()).get(METADATA, {})
     is_replayed = before.get("written_by") == "replay"
@@ -590,6 +619,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
         "source": before.get("source", source.name) if is_replayed else source.name,
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
+        ZERO: str(zero_ns),
     }
     about |= source.axes.metadata()
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}

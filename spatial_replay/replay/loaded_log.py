@@ -20,7 +20,7 @@ import numpy as np
 
 from spatial_replay.annotate.annotator import shown_regions
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
-from spatial_replay.annotate.foxglove_layout import layout_attachment
+from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
 from spatial_replay.annotate.robustness import encode_curves
 from spatial_replay.annotate.scene.scene_template import SceneBounds
 from spatial_replay.annotate.scene.scene_update import scene_start
@@ -52,7 +52,7 @@ from spatial_replay.replay.selection import (
     LogNames,
     ReplayOptions,
     Selection,
-    first_sample_ns,
+    log_zero_ns,
     look_before,
 )
 from spatial_replay.replay.specification_files import SpecificationFiles, constant_value
@@ -299,7 +299,7 @@ class LoadedLog:
             raise selection.nothing_to_evaluate(self.faults)
         self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
-        self.first_ns = first_sample_ns(source) if options.window.start_ns else ends.log_begin_ns
+        self.first_ns = log_zero_ns(source, options.window, ends)
         self.doubts = distinct_doubts(doubts, self.first_ns)
         self._needs, self._has_spans = ends.needs, ends.has_spans
         self._places = _places(self._files)
@@ -475,6 +475,7 @@ class Evaluated:
                 self.edited.files,
                 self.stretches,
                 self.selection.iter_traces,
+                loaded.first_ns,
                 doubts=loaded.doubts,
             ),
             vacuous=idle_templates(
@@ -515,7 +516,8 @@ class Evaluated:
         topics = {each.topic for each in self.loaded.own.channels}
         contents = self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics)
         order = worst_first(self.replayed.results)
-        return layout_attachment(contents._replace(order=order), live=True)
+        zero = TextZero(self.loaded.first_ns, int(self.loaded.inside.times_ns[0]), "this playback")
+        return layout_attachment(contents._replace(order=order, zero=zero), live=True)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Return samples `begin` to before `end` of those in the window, with their evaluation."""
@@ -607,7 +609,7 @@ class Playback:
         self.evaluated = evaluated
         self.arrow = ""
         self._regions = shown_regions(evaluated.edited.files)
-        self._start = scene_start(evaluated.loaded.inside, self._regions)
+        self._start = scene_start(evaluated.loaded.inside, self._regions, evaluated.loaded.first_ns)
         self._annotator = evaluated.evaluation.new_annotator(self._start)
         self._own = MessageCursor(own, self.start_ns)
         self._next = 0
@@ -635,7 +637,8 @@ class Playback:
         shown = max(self._next - 1, 0)
         regions = shown_regions(self.evaluated.edited.files)
         if regions != self._regions:
-            self._start, self._regions = scene_start(self.evaluated.loaded.inside, regions), regions
+            loaded = self.evaluated.loaded
+            self._start, self._regions = scene_start(loaded.inside, regions, loaded.first_ns), regions
         scene = replace(self._annotator.scene, written_ns=None, last={}, place=self._start.place)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import (
     ALL,
     MAPPED,
+    METADATA,
     OBJECTS,
     SAMPLES_A_GAP,
     Block,
@@ -47,7 +49,7 @@ from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import Sentence, listed, time_text
-from spatial_replay.trace.trace import FOREVER, TimePoint, Trace, within
+from spatial_replay.trace.trace import FOREVER, LATEST_NS, TimePoint, Trace, within
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
@@ -55,6 +57,12 @@ if TYPE_CHECKING:
 
 KEEP_ALL: Final = (ALL,)
 """Default selection of a copy."""
+
+ZERO: Final = "zero_ns"
+"""The metadata entry of the time that texts about a log count from."""
+_DECIMAL: Final = re.compile(r"\d{1,19}", re.ASCII)
+CLIP_METADATA: Final = "spatial_replay_clip"
+"""The metadata record that says what a clip was cut from."""
 
 
 def default_keep(source: Source) -> tuple[str, ...]:
@@ -186,6 +194,45 @@ def first_sample_ns(source: Source) -> int:
     raise LogError(f"{source.name} has no sample")
 
 
+def named_zero_ns(source: Source) -> int | None:
+    """Return the zero that a log names: the first sample of the log that it was cut from."""
+    records = dict(source.metadata())
+    for name in (METADATA, CLIP_METADATA):
+        text = records.get(name, {}).get(ZERO, "")
+        if _DECIMAL.fullmatch(text) and int(text) <= LATEST_NS:
+            return int(text)
+    return None
+
+
+def zero_ns(source: Source) -> int:
+    """Return the time that texts about a log count from: its first sample, or the zero that it names.
+
+    Raises:
+        LogError: it has no sample.
+    """
+    named_ns = named_zero_ns(source)
+    return first_sample_ns(source) if named_ns is None else named_ns
+
+
+def first_message_ns(source: Source) -> int | None:
+    """Return the time of a log's first message, if its index says so."""
+    path = source.path
+    if not isinstance(path, LogFile) or not (isinstance(source, McapSource) or hasattr(source, "mapping")):
+        return None
+    # readers of external logs are loaded when there is one
+    from spatial_replay.bags.open import open_messages
+
+    return open_messages(path).start_ns
+
+
+def log_zero_ns(source: Source, window: Window, ends: RunEnds) -> int:
+    """Return the zero of a log of which samples were read (see `zero_ns`)."""
+    if window.start_ns or ends.begin_ns is None:
+        return known_zero_ns(source)
+    named_ns = named_zero_ns(source)
+    return ends.log_begin_ns if named_ns is None else named_ns
+
+
 def last_sample_ns(source: Source) -> int:
     """Return the time of a log's last sample; the whole log is read for it.
 
@@ -206,7 +253,7 @@ def absolute_ns(point: TimePoint, source: Source) -> int:
     """
     if point.origin == "last sample":
         return point.absolute_ns(last_ns=last_sample_ns(source))
-    return point.absolute_ns(first_sample_ns(source) if point.origin == "first sample" else 0)
+    return point.absolute_ns(zero_ns(source) if point.origin == "first sample" else 0)
 
 
 def window_from_points(
@@ -224,10 +271,10 @@ def window_from_points(
     return Window(start_ns, end_ns, every)
 
 
-def known_start_ns(source: Source) -> int:
-    """Return the time of the first sample that can be read of a damaged log; 0 if it has none."""
+def known_zero_ns(source: Source) -> int:
+    """Return the zero of a damaged log; 0 if it has no sample."""
     try:
-        return first_sample_ns(source)
+        return zero_ns(source)
     except LogError:
         return 0
 
@@ -262,6 +309,19 @@ class LogNames:
         """Compare the names of a specification with these (see `check_names`)."""
         objects, signals, classes = sorted(self.objects), sorted(self.signals), sorted(self.classes)
         return check_names(file, objects, signals, classes=classes, each=each)
+
+
+class CheckedTrace(NamedTuple):
+    """The samples of a log that are evaluated.
+
+    Attributes:
+        missing: a warning for each name that they lack.
+        zero_ns: the time that texts about the log count from.
+    """
+
+    trace: Trace
+    missing: tuple[Diagnostic, ...]
+    zero_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,38 +392,43 @@ class Selection:
                 trace = trace.take(chosen)
             yield block, trace
 
-    def iter_traces(self) -> Iterator[Trace]:
+    def iter_traces(self, ends: RunEnds | None = None) -> Iterator[Trace]:
         """Read the samples of `read_blocks`."""
-        for _, trace in read_ahead(self.read_blocks(messages=False)):
+        for _, trace in read_ahead(self.read_blocks(messages=False, ends=ends)):
             yield trace
 
-    def trace(self, advance: Callable[[int], None] = lambda samples: None) -> Trace:
+    def trace(
+        self, advance: Callable[[int], None] = lambda samples: None, ends: RunEnds | None = None
+    ) -> Trace:
         """Read the samples of `read_blocks` as one trace.
 
         Args:
             advance: called with the number of samples of each block.
+            ends: see `read_blocks`.
         """
         if isinstance(self.source, MemorySource) and self.window.is_whole and not self.source.trace.spans:
             # with the measurements that it has cached
             advance(len(self.source.trace))
             return self.source.trace
         traces = []
-        for trace in self.iter_traces():
+        for trace in self.iter_traces(ends):
             traces.append(trace)
             advance(len(trace))
         return replace(Trace.concatenate(traces), units=self.source.axes.units)
 
-    def checked_trace(self, advance: Callable[[int], None]) -> tuple[Trace, tuple[Diagnostic, ...]]:
+    def checked_trace(self, advance: Callable[[int], None]) -> CheckedTrace:
         """Return that trace, with a warning for each name that it lacks; see `missing_names`.
 
         Raises:
             LogError, UsageError: it has no sample in the window.
             SpecificationError: it lacks names, and these are strict.
         """
-        trace = self.trace(advance)
+        ends = self.run_ends()
+        trace = self.trace(advance, ends)
         if not len(self.inside(trace)):
             raise self.nothing_to_evaluate(trace.faults)
-        return trace, self.missing_names(LogNames.of(trace))
+        missing = self.missing_names(LogNames.of(trace))
+        return CheckedTrace(trace, missing, log_zero_ns(self.source, self.window, ends))
 
     def inside(self, trace: Trace) -> Trace:
         """Return those samples that are in the window."""
@@ -458,10 +523,6 @@ def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
             )
             remedy = f"make it {format_duration(step_ns)} long, or max_gap shorter"
             raise UsageError(f"{what} of a pause, {format_duration(step_ns)} apart; {remedy}")
-
-
-CLIP_METADATA: Final = "spatial_replay_clip"
-"""The metadata record that says what a clip was cut from."""
 
 
 @dataclass(frozen=True)

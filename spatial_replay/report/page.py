@@ -24,10 +24,8 @@ from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_dat
 from spatial_replay.report.panels import final_text, json_text, sentence_parts
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import declared_unit, units_of, units_text
-from spatial_replay.text import Instant, Sentence, counted, printable, time_text
+from spatial_replay.text import CALENDAR_NS, Instant, Sentence, counted, printable, time_text
 
-_CALENDAR_NS: Final = 500_000_000 * 10**9
-"""Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
@@ -99,7 +97,7 @@ def text(words: str) -> Html:
 def _about(report: RunReport) -> Iterator[str]:
     replayed = report.replayed
     yield ", ".join(file.filename for file in report.files)
-    if replayed.first_ns >= _CALENDAR_NS:
+    if replayed.first_ns >= CALENDAR_NS:
         yield f"{datetime.fromtimestamp(replayed.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     start, end = (time_text(time_ns, replayed.first_ns) for time_ns in (replayed.start_ns, replayed.end_ns))
     yield f"{start} to {end}" if replayed.start_ns != replayed.first_ns else end

@@ -276,7 +276,7 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
     if diff.is_empty:
         return
     for spec in diff.specs:
-        yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.starts_ns)), first_ns)
+        yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.zeros_ns)), first_ns)
     if diff.objects:
         yield _change("who moved differently", None, diff.movements, first_ns)
     if diff.signals:

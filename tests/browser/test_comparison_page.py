@@ -71,7 +71,7 @@ def test_the_decisions_that_differ_stand_side_by_side_with_their_maps(page: Page
     assert diff.decision.a_ns is not None
     page.goto((tmp_path / "diff.html").as_uri())
     expect(page.locator("html[data-ready]")).to_have_count(1)
-    seconds = (diff.decision.a_ns - diff.starts_ns[0]) / 1e9
+    seconds = (diff.decision.a_ns - diff.zeros_ns[0]) / 1e9
     expect(page.locator(".now")).to_contain_text(f"{seconds:.3f} s")
     for side in ("#decision-a", "#decision-b"):
         expect(page.locator(f"{side} .candidate canvas").first).to_be_visible()

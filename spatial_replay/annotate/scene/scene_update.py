@@ -143,7 +143,7 @@ class SceneState:
     """State that the next message depends on, besides its own sample.
 
     Attributes:
-        first_ns: the time of the first sample, or None before it.
+        zero_ns: the time that texts count from; None before the first sample.
         written_ns: the time of the last message, or None before the first.
         shown: the objects in it.
         last: of the objects that specifications name, where they were last seen: a row of footprints.
@@ -155,7 +155,7 @@ class SceneState:
         templates: those of the layouts so far; a cache that changes no message.
     """
 
-    first_ns: int | None = None
+    zero_ns: int | None = None
     written_ns: int | None = None
     shown: tuple[str, ...] = ()
     last: Mapping[str, tuple[FootprintBatch, int]] = field(default_factory=lambda: MappingProxyType({}))
@@ -166,15 +166,15 @@ class SceneState:
     templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
-def scene_start(trace: Trace, regions: Mapping[str, Outline]) -> SceneState:
+def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> SceneState:
     """Return the scale and the banner's place of a run's scene (see `SceneState`), before its first message.
 
     Args:
         trace: from the first sample on.
+        zero_ns: the time that texts count from.
     """
     rows = trace.rows[spaced(trace.times_ns, None)]
-    state = SceneState(first_ns=int(trace.times_ns[0]) if len(trace) else None)
-    return SceneEncoder(regions).scaled(state, trace, rows)[0]
+    return SceneEncoder(regions).scaled(SceneState(zero_ns), trace, rows)[0]
 
 
 class SceneMessages(NamedTuple):
@@ -221,8 +221,8 @@ class SceneEncoder:
             state: what the call before returned, or None to begin.
         """
         state = state or SceneState()
-        if state.first_ns is None and len(trace):
-            state = replace(state, first_ns=int(trace.times_ns[0]))
+        if state.zero_ns is None and len(trace):
+            state = replace(state, zero_ns=int(trace.times_ns[0]))
         written = spaced(trace.times_ns, state.written_ns)
         times_ns = trace.times_ns[written]
         if not len(written):
@@ -240,7 +240,7 @@ class SceneEncoder:
         has_label = labelled_objects(self.named, names, rows >= 0, objects)
         labels = has_label, failed_objects(results, names, times_ns)
         banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
-        arrows = arrow_texts(results, violations, state.first_ns or 0, self.unit)
+        arrows = arrow_texts(results, violations, state.zero_ns or 0, self.unit)
         content = _content(trace, names, rows, state, violations, arrows, labels, missing, banners)
         shades = colours(objects, scales), colours(regions, scales)
         shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
@@ -259,7 +259,7 @@ class SceneEncoder:
             is_pointing=bool(content.violations.is_shown[-1]),
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
-        find_arrows = partial(_arrows_of, results, trace, written, state.first_ns or 0, self.unit)
+        find_arrows = partial(_arrows_of, results, trace, written, state.zero_ns or 0, self.unit)
         find_shades = partial(_shades_of, results, presence, [each.name for each in self._drawn], scales)
         frames = SceneFrames(
             times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades

@@ -53,13 +53,16 @@ class Evidence:
         regions: Mapping[str, Outline],
         traces: Callable[[], Iterable[Trace]],
         units: Mapping[str, str] = MappingProxyType({}),
+        zero_ns: int | None = None,
     ) -> None:
         """Store how to read the samples.
 
         Args:
             traces: iterates over the samples, with those looked back at, in blocks of any length.
             units: those that the log declares, of signals by their names, of lengths by "".
+            zero_ns: the time that sentences count from; None for that of the first sample.
         """
+        self._zero_ns = zero_ns
         self.instance = instance
         self.units = dict(units)
         self._regions = regions
@@ -109,7 +112,9 @@ class Evidence:
         return joined_channels([leaf_values(scene, [each], bindings) for each in formulas], axis=1)
 
     def first_ns(self) -> int:
-        """Return the time of the first sample, those looked back at included."""
+        """Return the zero, or else the time of the first sample, those looked back at included."""
+        if self._zero_ns is not None:
+            return self._zero_ns
         return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
 
     def times_ns(self) -> Integers:
