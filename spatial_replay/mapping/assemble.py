@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import compress, repeat
-from math import inf, pi
+from math import inf
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -27,12 +27,14 @@ from spatial_replay.geometry.arrays import Booleans, Integers, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
-from spatial_replay.mapping.binding import BY_PLACE, Codes
+from spatial_replay.mapping.assumptions import contradictions
+from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import MISFITS, Extractor, ReadingPlan, TopicReader
+from spatial_replay.mapping.topic_reader import MISFITS, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence, counted, nearest_hint, number_text, times_apart
+from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart
+from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
@@ -87,6 +89,7 @@ class _Assembling:
             what = reason.removeprefix(f"topic {topic!r}: ")
             self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {what}")
         self._remarks = Remarks(name, plan.mapping)
+        self._doubts: list[Doubt] = []
         self._tree = FrameTree()
         self._knows_static = False
         names, classes = Codes(), Codes()
@@ -158,8 +161,6 @@ class _Assembling:
             self._remarks.add(Sentence(self.jump, what_follows))
         for reader in self._readers.values():
             reader.finish()
-            for doubt in () if reader.extractor is None else _doubts_of(reader.extractor):
-                self._remarks.add(f"{reader.name}: {doubt}")
             for signal, texts in reader.unnamed.items():
                 listed = ", ".join(map(repr, texts))
                 what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
@@ -178,6 +179,11 @@ class _Assembling:
                     f"{reader.name}: {reader.unstamped} {were} left out, without a stamp, or with one of 0,"
                     " for the clock header"
                 )
+        for contradiction in contradictions(self._tracker.evidence, self._plan.mapping):
+            if isinstance(contradiction, Doubt):
+                self._doubts.append(contradiction)
+            else:
+                self._remarks.add(contradiction)
         self._check_fixed_frame()
         self._settled_ns = LATEST_NS
         return trace
@@ -202,6 +208,11 @@ class _Assembling:
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place."""
         return self._faults.take(last=last or self._settled_ns == LATEST_NS)
+
+    def take_doubts(self) -> tuple[Doubt, ...]:
+        """Return the assumptions that the log contradicts; none before `finish`."""
+        doubts, self._doubts = tuple(self._doubts), []
+        return doubts
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return counts of stale objects and missing transforms; none before `finish`, when they are
@@ -285,6 +296,12 @@ class _Assembling:
         if len(stamped.times_ns):
             self._note_arrived(reader, stamped.times_ns, stamped.contents)
         log_times_ns = arrived.log_time_ns[stamped.places]
+        if reader.is_mapped:
+            arrivals = self._tracker.evidence[reader.name].arrivals
+            publish_times_ns, channels = (
+                column[stamped.places] for column in (arrived.publish_time_ns, arrived.channel)
+            )
+            arrivals.add(stamped.times_ns, log_times_ns, publish_times_ns, channels)
         if reader.transforms is not None and not (self._knows_static and reader.planned.is_static):
             for time_ns, log_ns, message in zip(
                 stamped.times_ns.tolist(), log_times_ns.tolist(), stamped.contents, strict=True
@@ -427,33 +444,6 @@ class Assembler(_Assembling):
     def move_faults(self, other: FaultList) -> None:
         """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
         self._faults.move_to(other)
-
-
-_MOST_TURNED = 4 * pi
-"""Angles that robots reach in radians, who count whole turns."""
-
-
-def _doubts_of(extractor: Extractor) -> Iterator[str]:
-    if extractor.namer.is_by_place:
-        yield BY_PLACE
-    if extractor.cornerless:
-        is_bounds = extractor.layout.is_bounds
-        what = "other than two corners" if is_bounds else "fewer than three corners"
-        hint = "" if is_bounds else "; `bounds` reads two opposite corners of a box"
-        outlines = counted(extractor.cornerless, "outline")
-        yield f"{outlines} with {what}: objects are unknown there{hint}"
-    for path, count in extractor.unset.items():
-        yield f"{counted(count, 'object')} did not set {path}, so it is unknown there"
-    if extractor.widest_turn > _MOST_TURNED:
-        yield (
-            f"its angles reach {number_text(extractor.widest_turn)} and are read as radians;"
-            " `yaw: {field: PATH, unit: deg}` reads degrees"
-        )
-    if 0 < extractor.unturned < extractor.turned:
-        yield (
-            f"{extractor.unturned:,} of {counted(extractor.turned, 'pose')} have a quaternion of zeros, as"
-            " trackers send for what they have lost; they count as poses without a turn"
-        )
 
 
 class _Stamped(NamedTuple):

@@ -359,6 +359,7 @@ class Detections:
         is_locked: (R,) whether an object stays in its frame, which may move; None if none does.
         deleted: (message, code of the name or `EVERY_OBJECT`) of each deletion.
         skipped: the number of objects without a solid.
+        numbers: (R, W) every number that the binding reads, as messages have them; None without a binding.
     """
 
     message: Integers
@@ -375,6 +376,7 @@ class Detections:
     is_locked: Booleans | None = None
     deleted: list[tuple[int, int]] = field(default_factory=list)
     skipped: int = 0
+    numbers: Floats | None = None
 
     def scaled(self, factor: float) -> Detections:
         """Return the same objects with lengths times a factor."""
@@ -417,6 +419,7 @@ class DetectionChunk:
         places: the place of each message in its batch.
         deleted, message: messages as indices into `places`.
         numbers: (R, W) every number that the binding reads from an object.
+        noted_stamps: places of messages in their batch, and their stamps: one of many where no frames matter.
         corner_counts, corners: of polygons: (R,) counts, and all corners (V, 3).
     """
 
@@ -427,6 +430,7 @@ class DetectionChunk:
     class_code: list[int] = field(default_factory=list)
     frames: list[str] | None = None
     stamps: list[int] | None = None
+    noted_stamps: list[tuple[int, int]] = field(default_factory=list)
     numbers: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats | None = None
     lifetimes: list[int] = field(default_factory=list)
@@ -487,6 +491,7 @@ def detections_from_chunks(
         is_locked=np.array(locked, np.bool_) if any(locked) else None,
         deleted=deleted,
         skipped=skipped,
+        numbers=numbers,
     )
 
 
@@ -659,7 +664,7 @@ def outlines_from_lists(
         is_bounds: whether each list has two opposite corners of a box, which become four.
         have_size: whether bounds have width and height instead of the second corner.
     """
-    counts, points = _points_from_lists(lists)
+    counts, points = points_from_lists(lists)
     if is_bounds:
         few = counts != 2
         starts = starts_from_counts(counts)[:-1][~few]
@@ -681,7 +686,7 @@ def outlines_from_lists(
     return np.where(few, 1, counts), points, int(np.count_nonzero(few))
 
 
-def _points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
+def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     """Return the counts (R,) and the corners (V, 3) of lists of points, of pairs, or of x, y, x, y …."""
     example = next((each[0] for each in lists if len(each)), None)
     flat = list(chain.from_iterable(lists))

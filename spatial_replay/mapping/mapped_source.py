@@ -223,8 +223,9 @@ class _Blocks:
         remarks = (*self.remarks, *self.reader.take_remarks(), *self.assembler.take_remarks())
         self.remarks = []
         copied = self.copied.passed_on(messages, trace, last=last)
-        if len(trace) or len(copied) or faults or remarks:
-            yield Block(replace(trace, faults=faults), copied, remarks)
+        doubts = self.assembler.take_doubts()
+        if len(trace) or len(copied) or faults or remarks or doubts:
+            yield Block(replace(trace, faults=faults), copied, remarks, doubts)
 
 
 class _CopiedMessages:

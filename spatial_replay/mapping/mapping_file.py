@@ -204,6 +204,7 @@ class LogMapping:
         trims_ends: whether samples before a needed topic begins, and after it ends, are left out.
         axes: those of the fixed frame, or of the messages without one.
         origin: latitude and longitude in degrees where the fixes of satellite receivers have (0, 0).
+        accept: names of assumptions that may be contradicted.
     """
 
     name: str
@@ -217,6 +218,7 @@ class LogMapping:
     trims_ends: bool = True
     axes: Axes = OUR_AXES
     origin: tuple[float, float] | None = None
+    accept: tuple[str, ...] = ()
 
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}

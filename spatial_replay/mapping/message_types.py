@@ -215,6 +215,17 @@ GENERIC = MessageLayout(
 """The layout of an unknown type: the names that fields of poses usually have."""
 
 
+_LATITUDE, _LONGITUDE = re.compile(r"lat(itude)?", re.I), re.compile(r"lon|lng|long(itude)?", re.I)
+
+
+def geodetic_order(paths: Alternatives) -> Alternatives | None:
+    """Return the paths of latitude and longitude among those of a position; None if it has none by name."""
+    names = [path.rpartition(".")[2] for path in paths]
+    latitude = [path for path, name in zip(paths, names, strict=True) if _LATITUDE.fullmatch(name)]
+    longitude = [path for path, name in zip(paths, names, strict=True) if _LONGITUDE.fullmatch(name)]
+    return (latitude[0], longitude[0]) if latitude and longitude else None
+
+
 def short_type(name: str) -> str:
     """Return `pkg/Name` for a type as written by ROS 1, ROS 2, protobuf or Foxglove's JSON schemas."""
     words = re.split(r"[/.]|::", name)

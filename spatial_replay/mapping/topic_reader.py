@@ -43,6 +43,7 @@ from spatial_replay.mapping.detections import (
     detections_from_chunks,
     lenient_getter,
     outlines_from_lists,
+    points_from_lists,
     rows_from_tuples,
     solids_of_entity,
     solids_of_marker,
@@ -56,6 +57,7 @@ from spatial_replay.mapping.field_paths import (
     NameTemplate,
     elements_of,
     enum_names,
+    field_names,
     from_protobuf_json,
     getter,
     is_set,
@@ -84,6 +86,7 @@ from spatial_replay.mapping.message_types import (
     GEODETIC_TYPES,
     TRANSFORM_TYPES,
     MessageLayout,
+    geodetic_order,
     layout_of_topic,
     short_type,
 )
@@ -123,6 +126,11 @@ class PlannedTopic:
     is_lasting: bool
     is_latched: bool = False
     is_protobuf_json: bool = False
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether positions are latitudes and longitudes, counted from the mapping's origin."""
+        return self.layout is not None and self.layout.origin is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +192,12 @@ class ReadingPlan:
         if sampled is not None and sampled not in names:
             names.append(sampled)
         planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
+        is_whole = all(topic in known for topic in mapped)
+        if mapping.origin is not None and is_whole and not any(topic.is_geodetic for topic in planned):
+            raise UsageError(
+                f"{mapping.name}: origin: it has no effect, since no topic has positions in degrees; name"
+                " fields called latitude and longitude as `position`, or leave it out"
+            )
         waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
         fallback_topics = _fallback_topics(planned, sampled)
         silences_ns = (topic.silence_ns for topic in planned if topic.name == sampled)
@@ -362,6 +376,10 @@ def _planned(
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
     if layout is not None and GEODETIC in layout.position:
         layout = replace(layout, origin=mapping.origin)
+    elif layout is not None and mapping.origin is not None and layout.position:
+        paths = geodetic_order(layout.position[0])
+        if paths is not None:
+            layout = replace(layout, origin=mapping.origin, position=(paths,))
     stays = topic.latched or (layout is not None and layout.stays)
     default = FOREVER_NS if stays else DEFAULT_MAX_AGE_NS
     given = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
@@ -416,12 +434,14 @@ class Extractor:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
         """Outlines with too few corners, whose objects are unknown."""
-        self.widest_turn = 0.0
-        """The greatest angle that is read as radians."""
         self.unset: Counter[str] = Counter()
         """Objects that do not set a field of protobuf, by its path."""
         self._scene_stamps_ns: dict[int, int] = {}
         """Timestamps of the entities of a scene by the codes of their names, until they are deleted."""
+        self.boxes, self.leftward, self.downward = 0, 0, 0
+        """Bounds, and those whose second corner lies left of, and below in numbers, the first."""
+        self.differences = 0
+        """Messages that say of themselves that they list changes only."""
         self.turned, self.unturned = 0, 0
         """Poses with an orientation, and those whose quaternion is zeros."""
         self.layout = layout
@@ -434,6 +454,11 @@ class Extractor:
         self._time: TimeGetter | None = None
         self._time_of_empty: TimeGetter | None = None
         self._is_time_bound = False
+
+    @property
+    def binding(self) -> Binding | None:
+        """The getters of its fields; None before the first object."""
+        return self._binding
 
     @property
     def is_bound(self) -> bool:
@@ -486,6 +511,9 @@ class Extractor:
                 from the others; FieldError says how.
         """
         values, index, order = self._flatten(messages)
+        if messages and "is_diff" in field_names(messages[0]):
+            get = lenient_getter(style_of(messages[0]))
+            self.differences += sum(bool(get(message, "is_diff")) for message in messages)
         of_message = [messages[number] for number in index] if self.namer.needs_messages else None
         objects = _Objects(values, index, self.namer.codes(values, order, of_message))
         deleted: list[tuple[int, int]] = []
@@ -526,6 +554,8 @@ class Extractor:
                 chunk.locked = [bool(get(each, "frame_locked")) for each in objects.values]
         elif binding.polygon is not None:
             corners = [binding.polygon(each) for each in objects.values]
+            if self.layout.is_bounds and not self.layout.bounds_have_size:
+                self._count_corners(corners)
             outlines = outlines_from_lists(
                 corners, is_bounds=self.layout.is_bounds, have_size=self.layout.bounds_have_size
             )
@@ -541,13 +571,10 @@ class Extractor:
                 is_turned = chunk.numbers[:, list(binding.orientation)].any(axis=1)
                 self.turned += len(values)
                 self.unturned += len(values) - int(is_turned.sum())
-            elif binding.yaw is not None and abs(self.layout.angle_scale) == 1.0:
-                turns = np.abs(chunk.numbers[:, binding.yaw])
-                self.widest_turn = float(np.fmax.reduce(turns, initial=self.widest_turn))
         chunk.covariance = covariances(self.layout, binding, values)
         chunk.class_code = class_codes(self.layout, binding, values, self._classes)
         chunk.frames = self._frames(binding, messages, objects)
-        chunk.stamps = self._stamps(messages, objects)
+        self._fill_stamps(chunk, messages, objects)
         if binding.lifetime is not None:
             chunk.lifetimes = binding.lifetime.nanoseconds(values)
         elif self.layout.stays:
@@ -562,6 +589,15 @@ class Extractor:
                 if not is_set(path, objects[row]):
                     numbers[row, column] = nan
                     self.unset[path.text] += 1
+
+    def _count_corners(self, lists: Sequence[Any]) -> None:
+        """Count the boxes of a chunk, and how their second corners lie."""
+        counts, points = points_from_lists([corners for corners in lists if len(corners)])
+        first = (np.cumsum(counts) - counts)[counts == 2]
+        along = points[first + 1] - points[first] if len(first) else points[:0]
+        self.boxes += len(along)
+        self.leftward += int(np.count_nonzero(along[:, 0] < 0))
+        self.downward += int(np.count_nonzero(along[:, 1] < 0))
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
         """Return all objects, the index of each one's message, and its index, or key, in that message."""
@@ -624,13 +660,23 @@ class Extractor:
         self.noted_frames.update(frames)
         return [frames[index] for index in objects.message] if from_message else frames
 
-    def _stamps(self, messages: Sequence[object], objects: _Objects) -> list[int] | None:
-        if self._time is None or not self._needs_frame:
-            return None
-        if self._time.path.from_message:
-            of_message = self._time.nanoseconds(messages)
-            return [of_message[index] for index in objects.message]
-        return self._time.nanoseconds(objects.values)
+    def _fill_stamps(self, chunk: DetectionChunk, messages: Sequence[object], objects: _Objects) -> None:
+        """Read the stamps of objects where frames matter; elsewhere only the first, to compare clocks."""
+        if self._time is None:
+            return
+        from_message = self._time.path.from_message
+        if not self._needs_frame:
+            first = messages[:1] if from_message else objects.values[:1]
+            stamps = self._time.nanoseconds(first)
+            chunk.noted_stamps = list(zip(chunk.places[:1].tolist(), stamps, strict=False))
+        elif from_message:
+            stamps = self._time.nanoseconds(messages)
+            chunk.stamps = [stamps[index] for index in objects.message]
+            chunk.noted_stamps = list(zip(chunk.places.tolist(), stamps, strict=True))
+        else:
+            chunk.stamps = self._time.nanoseconds(objects.values)
+            places = chunk.places[objects.message].tolist()
+            chunk.noted_stamps = list(zip(places, chunk.stamps, strict=True))
 
 
 def _stamp_of_scene(thing: Any) -> int:
@@ -690,11 +736,13 @@ class TopicColumns(NamedTuple):
         good: (N,) which messages could be read.
         detections: the objects of the M good messages, or None for a topic without objects.
         signals: (M, S) the value of each signal in each good message.
+        stamps: (K, 2) the places of some messages among the N, and their stamps.
     """
 
     good: Booleans
     detections: Detections | None
     signals: Floats
+    stamps: Integers
 
 
 class TopicReader:
@@ -719,7 +767,9 @@ class TopicReader:
     ) -> None:
         needs_frame = mapping.fixed_frame is not None
         self.planned = planned
+        self.needs_frame = needs_frame
         self.name = planned.name
+        self.axes = mapping.axes
         self.pending = PendingMessages(has_own_clock=planned.clock == "header")
         self.decodes_on_arrival = (
             planned.is_transforms
@@ -836,6 +886,9 @@ class TopicReader:
             good=good,
             detections=None if self.extractor is None else self.extractor.detections(chunks, good),
             signals=np.array(signals, np.float64).reshape(int(good.sum()), len(self._signal_fields)),
+            stamps=np.array([stamp for chunk in chunks for stamp in chunk.noted_stamps], np.int64).reshape(
+                -1, 2
+            ),
         )
 
     def finish(self) -> None:

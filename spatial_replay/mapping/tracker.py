@@ -21,6 +21,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatena
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, footprints_from_solids
+from spatial_replay.mapping.evidence import TopicEvidence
 from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping
 from spatial_replay.mapping.message_types import name_pattern, possible_classes
 from spatial_replay.mapping.topic_reader import (
@@ -346,6 +347,11 @@ class Tracker:
         self._topic_of_name: dict[int, str] = {}
         self._objects_of: dict[str, frozenset[str]] = {}
         self._advances = 0
+        self.evidence = {
+            name: TopicEvidence(reader, self.names, self.classes)
+            for name, reader in self.readers.items()
+            if reader.is_mapped
+        }
         self._unheard = {
             name: _unheard(reader.planned) for name, reader in self.readers.items() if reader.is_mapped
         }
@@ -365,6 +371,11 @@ class Tracker:
             is_placed = np.ones(len(times_ns), np.bool_)
             if reader.is_mapped:
                 columns = reader.read(log_times_ns, contents)
+                arrivals = self.evidence[name].arrivals
+                if reader.planned.clock == "header":
+                    arrivals.add_stamps(times_ns, log_times_ns)
+                else:
+                    arrivals.add_stamps(columns.stamps[:, 1], log_times_ns[columns.stamps[:, 0]])
                 times_ns, log_times_ns = times_ns[columns.good], log_times_ns[columns.good]
                 if len(times_ns) and self._lost_until_ns.get(name) == FOREVER_NS:
                     self._lost_until_ns[name] = int(times_ns[0])
@@ -551,6 +562,7 @@ class Tracker:
 
         transforms = self._transforms(reader, detections, times_ns, log_times_ns)
         rows = rows_from_detections(detections, transforms, self.plan.mapping.axes, self.concave, report)
+        self.evidence[reader.name].add_objects(detections, rows.shapes, rows.yaw, rows.uncertainty, times_ns)
         number = self._add(rows)
         for place in self._follows(reader, detections).tolist():
             frame = (detections.frames or ())[place]

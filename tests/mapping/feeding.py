@@ -16,6 +16,7 @@ from spatial_replay.bags.reader import Message
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.trace.doubts import Doubt
 
 SECOND = 10**9
 
@@ -161,11 +162,12 @@ class Feed:
 
 @dataclass(frozen=True)
 class Made:
-    """A trace with faults and remarks."""
+    """A trace with faults, remarks and doubts."""
 
     trace: Trace
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
+    doubts: tuple[Doubt, ...] = ()
 
     def centre(self, sample: int, name: str) -> tuple[float, float]:
         """Return the mean of an object's corners, rounded."""
@@ -198,4 +200,5 @@ def make(mapping: str, feed: Feed, *, batch: int = 1000, late_ns: int = SECOND, 
     traces = [assembler.add(raw[begin : begin + batch]) for begin in range(0, len(raw), batch)]
     traces.append(assembler.finish())
     trace = Trace.concatenate(traces)
-    return Made(trace, assembler.take_faults(), (*plan.remarks, *assembler.take_remarks()))
+    remarks = (*plan.remarks, *assembler.take_remarks())
+    return Made(trace, assembler.take_faults(), remarks, assembler.take_doubts())

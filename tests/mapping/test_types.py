@@ -584,9 +584,9 @@ def test_angles_in_degrees_and_poses_of_zeros_are_remarked() -> None:
             feed.add("/thing", second * SECOND, content)
         return make(f"topics: {{/thing: {{{keys}}}}}", feed).remarks
 
-    turns = [{"x": 0.0, "y": 0.0, "theta": theta} for theta in (0.0, -90.0)]
+    turns = [{"x": 0.0, "y": 0.0, "theta": theta} for theta in (0.0, -9.0)]
     assert remarks(*turns, keys="yaw: theta") == (
-        "test.bag: /thing: its angles reach 90 and are read as radians; `yaw: {field: PATH, unit: deg}` reads"
+        "test.bag: /thing: its angles reach 9 and are read as radians; `yaw: {field: PATH, unit: deg}` reads"
         " degrees",
     )
     assert remarks(*turns, keys="yaw: {field: theta, unit: deg}") == ()

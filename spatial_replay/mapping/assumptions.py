@@ -1,0 +1,654 @@
+"""The assumptions by which a mapped log is read, and what in the log contradicts them.
+
+`ASSUMPTIONS` is the table: what is assumed, which measurement contradicts it, and which key settles it. A new
+assumption is one entry and one function. `contradictions` compares the table with the evidence of a log.
+"""
+
+from __future__ import annotations
+
+from cmath import phase
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from math import degrees, pi
+from statistics import median
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from spatial_replay.mapping.binding import BY_PLACE
+from spatial_replay.mapping.evidence import TopicEvidence
+from spatial_replay.mapping.mapping_file import UNITS_NS, LogMapping
+from spatial_replay.text import Instant, Sentence, counted, number_text
+from spatial_replay.trace.doubts import Doubt
+
+Log: TypeAlias = Mapping[str, TopicEvidence]
+Check: TypeAlias = Callable[[TopicEvidence, Log], str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Assumption:
+    """An assumption about the messages of a topic.
+
+    Attributes:
+        name: as `accept` in a mapping takes it.
+        assumed: for readers.
+        measured: what is measured, and when that contradicts the assumption, for readers.
+        check: returns what contradicts it, as a clause after the topic and a colon; None if nothing does.
+        remedy: the key that settles it.
+        is_remark: whether data that are only odd look like this, so that verdicts are not doubtful.
+        is_about_signals: whether signals of the topic rest on it, too.
+    """
+
+    name: str
+    assumed: str
+    measured: str
+    check: Check
+    remedy: str
+    is_remark: bool = False
+    is_about_signals: bool = False
+
+
+def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
+    """Yield what contradicts the assumptions: doubts, and remarks where the data may be only odd.
+
+    A contradiction in many topics is one sentence.
+    """
+    for evidence in log.values():
+        evidence.settle()
+    for assumption in ASSUMPTIONS:
+        clauses = {}
+        for topic, evidence in log.items():
+            clause = assumption.check(evidence, log) if evidence.arrivals.messages else None
+            if clause is not None:
+                clauses[topic] = clause
+        if not clauses:
+            continue
+        for topics in [list(clauses)] if len(clauses) >= _MANY_TOPICS else [[topic] for topic in clauses]:
+            others = f" (as in {counted(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
+            remedy = f"; {assumption.remedy}" if assumption.remedy else ""
+            text = Sentence(f"{topics[0]}: ", clauses[topics[0]], f"{others}{remedy}")
+            if assumption.is_remark:
+                yield text
+                continue
+            rests = [log[topic] for topic in topics]
+            signals = [
+                signal.name
+                for evidence in rests
+                if assumption.is_about_signals and evidence.planned.mapping is not None
+                for signal in evidence.planned.mapping.signals
+            ]
+            yield Doubt(
+                assumption.name,
+                topics[0],
+                text,
+                objects=frozenset[str]().union(*(evidence.object_names for evidence in rests)),
+                signals=frozenset(signals),
+                is_accepted=assumption.name in mapping.accept,
+            )
+
+
+_MANY_TOPICS: Final = 3
+_FEW: Final = 3
+"""Messages or reports from which on a measurement says something."""
+
+
+def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
+    arrivals = evidence.arrivals
+    period_ns = arrivals.period_s.median * 1e9
+    if evidence.planned.clock == "header" or arrivals.messages <= _FEW or arrivals.first_ns is None:
+        return None
+    for unit, ns in list(UNITS_NS.items())[1:]:
+        year = _year(arrivals.first_ns * ns)
+        if year is not None and period_ns < _SHORTEST_PERIOD_NS < period_ns * ns:
+            return (
+                f"its times look like {unit}: {arrivals.first_ns} is {year} in {unit} and January 1970 in ns;"
+                f" messages would come every {period_ns:.3g} ns"
+            )
+    return None
+
+
+_SHORTEST_PERIOD_NS: Final = 200_000
+_FIRST_YEAR, _LAST_YEAR = 2005, 2100
+
+
+def _year(time_ns: int) -> int | None:
+    """Return the year of a time at which robots are recorded; None for another one."""
+    if time_ns > 2**62:
+        return None
+    year = datetime.fromtimestamp(time_ns / 1e9, UTC).year
+    return year if _FIRST_YEAR <= year <= _LAST_YEAR else None
+
+
+def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
+    arrivals = evidence.arrivals
+    is_constant = evidence.planned.clock == "log" and not arrivals.log_varies
+    if not is_constant or arrivals.messages < _FEW or not arrivals.publish_varies:
+        return None
+    return f"its {arrivals.messages:,} messages have one log time, and different publish times"
+
+
+def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
+    arrivals, planned = evidence.arrivals, evidence.planned
+    if planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays):
+        return None
+    still_s, usual_s = arrivals.longest_still_s, arrivals.log_period_s.median
+    if not still_s > max(_LONG_STILL_S, _LONG_STILL * usual_s):
+        return None
+    return (
+        Sentence(
+            "its stamps stand still from ",
+            Instant(arrivals.still_ns, 0),
+            f" on for {still_s:.3g} s, while messages",
+        )
+        + f" come every {usual_s:.3g} s"
+    )
+
+
+_LONG_STILL_S, _LONG_STILL = 0.3, 5
+
+
+def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
+    late_s = evidence.arrivals.lateness_s.median
+    others = [other.arrivals.lateness_s.median for other in log.values() if other is not evidence]
+    others = [other_s for other_s in others if other_s == other_s]
+    uses_stamps = evidence.planned.clock == "header" or evidence.uses_frames
+    if not uses_stamps or not others or late_s != late_s or abs(late_s - median(others)) < _OTHER_CLOCK_S:
+        return None
+    return (
+        f"its stamps lie {_signed_s(late_s)} the log's clock, and those of other topics"
+        f" {_signed_s(median(others))}"
+    )
+
+
+_OTHER_CLOCK_S: Final = 5.0
+
+
+def _signed_s(late_s: float) -> str:
+    return f"{number_text(abs(late_s))} s {'behind' if late_s >= 0 else 'ahead of'}"
+
+
+def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
+    layout, count = evidence.planned.layout, evidence.quaternions
+    if layout is None or not layout.order or count < _FEW:
+        return None
+    upright, other_upright = evidence.upright, evidence.upright_otherwise
+    if other_upright < _MOST_UPRIGHT * count or upright > _FEW_UPRIGHT * count:
+        return None
+    other = "xyzw" if layout.order == "wxyz" else "wxyz"
+    return (
+        f"{upright:,} of {counted(count, 'object')} stand upright if the order of the four numbers is"
+        f" {layout.order}, and {other_upright:,} if it is {other}"
+    )
+
+
+_MOST_UPRIGHT, _FEW_UPRIGHT = 0.9, 0.5
+
+
+def _length_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
+    length = evidence.quaternion_length
+    if not length.count or (length.least > 1 - _LENGTH_ERROR and length.greatest < 1 + _LENGTH_ERROR):
+        return None
+    odd = length.greatest if length.greatest - 1 > 1 - length.least else length.least
+    return f"its quaternions have lengths of up to {number_text(odd)} instead of 1"
+
+
+_LENGTH_ERROR: Final = 0.05
+
+
+def _radians(evidence: TopicEvidence, log: Log) -> str | None:
+    layout, turn = evidence.planned.layout, evidence.turn
+    most = max(turn.greatest, -turn.least)
+    if layout is None or abs(layout.angle_scale) != 1.0 or not most > _MANY_TURNS:
+        return None
+    return f"its angles reach {number_text(most)} and are read as radians"
+
+
+_MANY_TURNS: Final = 8 * pi
+
+
+def _some_turns(evidence: TopicEvidence, log: Log) -> str | None:
+    layout, turn = evidence.planned.layout, evidence.turn
+    most = max(turn.greatest, -turn.least)
+    if layout is None or abs(layout.angle_scale) != 1.0 or not 2 * pi + _ROUNDING < most <= _MANY_TURNS:
+        return None
+    return f"its angles reach {number_text(most)} and are read as radians"
+
+
+_ROUNDING: Final = 0.01
+
+
+def _beyond_a_turn(evidence: TopicEvidence, log: Log) -> str | None:
+    layout, turn = evidence.planned.layout, evidence.turn
+    if layout is None or abs(layout.angle_scale) == 1.0 or not turn.greatest > _A_TURN:
+        return None
+    reached = number_text(turn.greatest)
+    return f"its yaw reaches {reached} degrees, which is beyond a turn; {reached} often means not available"
+
+
+_A_TURN: Final = 360.5
+
+
+def _heading(evidence: TopicEvidence, log: Log) -> str | None:
+    """Compare where objects head with where they go, for each reading of their angle."""
+    motions, layout = evidence.motions, evidence.planned.layout
+    if layout is None or motions.steps < _FEW_STEPS or evidence.has_given_heading:
+        return None
+    courses = motions.courses
+    read = courses.pop("read")
+    if abs(read) > _STEADY and abs(phase(read)) < _ASKEW:
+        return None
+    fits = {name: mean for name, mean in courses.items() if abs(mean) > _STEADY and abs(phase(mean)) < _ALONG}
+    name = max(fits, key=lambda name: fits[name].real, default=None)
+    # on one straight way, a robot may go sideways; only the name of the field says more
+    is_straight = abs(motions.course) > _STEADY
+    if name is None or (is_straight and not ("north" in name and evidence.is_called_heading)):
+        return None
+    off = f"{degrees(phase(read)):.0f} degrees" if abs(read) > _STEADY else "by changing angles"
+    fitting = f"they move along it if {evidence.turn_path} is an angle in {name}"
+    return f"its objects move {off} off their yaw; {fitting}"
+
+
+_FEW_STEPS: Final = 5
+_STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
+
+
+def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
+    layout = evidence.planned.layout
+    if layout is None or layout.origin is not None or not evidence.is_called_degrees:
+        return None
+    if not (abs(evidence.low[:2]).max() <= 360 and abs(evidence.high[:2]).max() <= 360):
+        return None
+    low, high = (", ".join(map(number_text, corner[:2].tolist())) for corner in (evidence.low, evidence.high))
+    return f"its latitudes and longitudes, from {low} to {high}, are taken as metres"
+
+
+def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
+    layout = evidence.planned.layout
+    if layout is None or layout.origin is None:
+        return None
+    most = max(abs(evidence.low[0]), abs(evidence.high[0]))
+    if not most > 90:
+        return None
+    as_e7 = f"; times 1e-7 it is {number_text(most * 1e-7)}" if 1e6 < most <= 9e8 else ""
+    return f"{most:.0f} is no latitude in degrees{as_e7}"
+
+
+def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
+    layout = evidence.planned.layout
+    if layout is None or layout.origin is None:
+        return None
+    origin = np.array(layout.origin)
+    away = max(np.abs(evidence.low[:2] - origin).max(), np.abs(evidence.high[:2] - origin).max())
+    if not (away > _FAR_DEGREES and np.abs(evidence.high[:2]).max() <= 360):
+        return None
+    return f"its fixes are up to {number_text(away)} degrees from the origin, where the earth is not flat"
+
+
+_FAR_DEGREES: Final = 2.0
+
+
+def _precision(evidence: TopicEvidence, log: Log) -> str | None:
+    most = float(max(np.abs(evidence.low[:2]).max(), np.abs(evidence.high[:2]).max()))
+    if not (evidence.is_single and evidence.has_fraction and np.isfinite(most)):
+        return None
+    step = float(np.spacing(np.float32(most)))
+    sizes = [other.size.median for other in log.values() if other.size.median > 0]
+    if step < _COARSE * min(sizes, default=np.inf):
+        return None
+    return (
+        f"its coordinates are float32, whose step at {most:.0f} is {number_text(step)}; the smallest objects"
+        f" are {number_text(min(sizes))} long"
+    )
+
+
+_COARSE: Final = 0.05
+
+
+def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
+    zeros, count = evidence.zero_covariances, evidence.covariances
+    if not zeros or zeros < count / 2:
+        return None
+    return f"{zeros:,} of {counted(count, 'covariance')} are zeros, which means unknown, and count as exact"
+
+
+def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
+    arrivals, extractor, layout = evidence.arrivals, evidence.reader.extractor, evidence.planned.layout
+    if len(arrivals.publishers) < 2 or arrivals.switches < _FEW:
+        return None
+    shares_names = extractor is None or extractor.namer.is_constant or evidence.motions.returns > 0
+    if not (shares_names or (layout is not None and layout.complete)):
+        return None
+    return (
+        f"{len(arrivals.publishers)} publishers (channels of the log) send it in turn, and their objects"
+        " are read under the same names"
+    )
+
+
+def _one_object(evidence: TopicEvidence, log: Log) -> str | None:
+    motions = evidence.motions
+    moment = motions.return_moment
+    if moment is None or motions.returns < max(_FEW, motions.triples / 4):
+        return None
+    return Sentence(
+        f"{moment.name} leaps by {number_text(moment.amount)} at ",
+        Instant(moment.time_ns, 0),
+        f" and back, and so in {motions.returns:,} of {counted(motions.triples, 'report')}, as two objects"
+        " under one name do",
+    )
+
+
+def _complete_list(evidence: TopicEvidence, log: Log) -> str | None:
+    layout, gaps = evidence.planned.layout, evidence.motions.gaps
+    if layout is None or not layout.complete:
+        return None
+    if evidence.reader.extractor is not None and evidence.reader.extractor.differences:
+        count = counted(evidence.reader.extractor.differences, "message")
+        return f"{count} have `is_diff`: lists of changes, and objects that they leave out are still there"
+    usual = int(gaps.argmax())
+    if usual < 2 or gaps[usual] < max(2 * _FEW, _REGULAR * gaps.sum()):
+        return None
+    return (
+        f"its objects leave and return in turn: most are in every {_ordinal(usual)} message only, as if"
+        " a list came in parts"
+    )
+
+
+_REGULAR: Final = 0.8
+
+
+def _ordinal(number: int) -> str:
+    return {2: "second", 3: "third"}.get(number, f"{number}th")
+
+
+def _one_class(evidence: TopicEvidence, log: Log) -> str | None:
+    changes, count = evidence.motions.changes, evidence.motions.change_count
+    if not changes:
+        return None
+    first = changes[0]
+    more = f", and so {count - 1:,} more times" if count > 1 else ""
+    return Sentence(
+        f"the class of {first.name} changes from {first.before or 'none'} to {first.after or 'none'} at ",
+        Instant(first.time_ns, 0),
+        f"{more}; a formula about a class says nothing of its object afterwards",
+    )
+
+
+def _corners(evidence: TopicEvidence, log: Log) -> str | None:
+    extractor = evidence.reader.extractor
+    if extractor is None or not extractor.boxes:
+        return None
+    left, low, count = extractor.leftward, extractor.downward, extractor.boxes
+    if left < count / 5 and not count / 5 < low < count * 4 / 5:
+        return None
+    return (
+        f"in {left:,} of {count:,} boxes the second corner lies left of the first: these may be x, y,"
+        " width and height"
+    )
+
+
+def _extent(evidence: TopicEvidence, log: Log) -> str | None:
+    layout = evidence.planned.layout
+    if layout is None or not evidence.pointlike or not (layout.sizes or layout.solids or layout.shape):
+        return None
+    outlines = counted(evidence.objects, "outline")
+    return f"{evidence.pointlike:,} of {outlines} have no extent: a size or scale is 0"
+
+
+def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
+    sizes = [other.size.median for other in log.values() if other is not evidence and other.size.median > 0]
+    speeds = [
+        other.motions.speed.quantile(0.9) for other in log.values() if other is not evidence and other.objects
+    ]
+    speeds = [speed for speed in speeds if speed > 0]
+    size, speed = evidence.size.median, evidence.motions.speed.quantile(0.9)
+    if not (sizes and speeds and size > _THOUSAND * max(sizes) and speed > _THOUSAND * max(speeds)):
+        return None
+    return (
+        f"its objects are {number_text(size)} long and move at {number_text(speed)} a second, and others at"
+        f" most {number_text(max(sizes))} and {number_text(max(speeds))}: it may be in millimetres"
+    )
+
+
+_THOUSAND: Final = 200
+
+
+def _by_place(evidence: TopicEvidence, log: Log) -> str | None:
+    extractor = evidence.reader.extractor
+    return BY_PLACE if extractor is not None and extractor.namer.is_by_place else None
+
+
+def _cornerless(evidence: TopicEvidence, log: Log) -> str | None:
+    extractor = evidence.reader.extractor
+    if extractor is None or not extractor.cornerless:
+        return None
+    is_bounds = extractor.layout.is_bounds
+    count = "other than two corners" if is_bounds else "fewer than three corners"
+    hint = "" if is_bounds else "; `bounds` reads two opposite corners of a box"
+    outlines = counted(extractor.cornerless, "outline")
+    return f"{outlines} with {count}: objects are unknown there{hint}"
+
+
+def _unset(evidence: TopicEvidence, log: Log) -> str | None:
+    extractor = evidence.reader.extractor
+    if extractor is None or not extractor.unset:
+        return None
+    counts = (f"{counted(count, 'object')} did not set {path}" for path, count in extractor.unset.items())
+    return f"{', '.join(counts)}, so it is unknown there"
+
+
+def _unturned(evidence: TopicEvidence, log: Log) -> str | None:
+    extractor = evidence.reader.extractor
+    if extractor is None or not 0 < extractor.unturned < extractor.turned:
+        return None
+    return (
+        f"{extractor.unturned:,} of {counted(extractor.turned, 'pose')} have a quaternion of zeros, as"
+        " trackers send for what they have lost; they count as poses without a turn"
+    )
+
+
+def _leap(evidence: TopicEvidence, log: Log) -> str | None:
+    motions = evidence.motions
+    jump, usual = motions.jump, motions.speed.quantile(0.9)
+    if jump is None or motions.speed.count < _FEW_LEAPS or not evidence.size.greatest > 0:
+        return None
+    speed = jump.amount / motions.jump_s if motions.jump_s > 0 else np.inf
+    if not (jump.amount > _FAR_LEAP * evidence.size.greatest and speed > _FAST_LEAP * max(usual, 0.0)):
+        return None
+    return Sentence(
+        f"{jump.name} is {number_text(jump.amount)} farther at ",
+        Instant(jump.time_ns, 0),
+        f", after {number_text(motions.jump_s)} s; usual speeds are below {number_text(usual)}",
+    )
+
+
+_FEW_LEAPS, _FAR_LEAP, _FAST_LEAP = 10, 5.0, 20.0
+
+_DEGREES: Final = "`yaw: {field: PATH, unit: deg}` reads degrees"
+
+ASSUMPTIONS: Final = (
+    Assumption(
+        "log_time_unit",
+        "Log and publish times are nanoseconds.",
+        "the date and the period of messages; in us, ms or s both are usual, in ns neither is",
+        _unit_of_log_times,
+        "write the log with nanoseconds, or take `clock: header`",
+        is_about_signals=True,
+    ),
+    Assumption(
+        "log_times_set",
+        "Messages have log times.",
+        "log times and publish times; all log times are equal, and publish times differ",
+        _times_never_set,
+        "`clock: publish` takes publish times",
+        is_about_signals=True,
+    ),
+    Assumption(
+        "stamps_advance",
+        "Stamps advance with messages.",
+        "how long a stamp repeats while messages come; longer than 0.3 s and five periods contradicts",
+        _still_stamps,
+        "`clock: log` takes the times of recording",
+    ),
+    Assumption(
+        "one_clock",
+        "All stamps are of one clock.",
+        "how late messages are recorded after their stamps; 5 s from other topics contradicts",
+        _another_clock,
+        "`clock: log` takes one clock for all",
+        is_about_signals=True,
+    ),
+    Assumption(
+        "quaternion_order",
+        "Four numbers without names are in the order that the mapping says.",
+        "how many objects stand upright in this order, and in the other",
+        _order_of_quaternion,
+        "change `order`",
+    ),
+    Assumption(
+        "quaternion_length",
+        "Quaternions have the length 1.",
+        "their lengths; 5 % off contradicts",
+        _length_of_quaternion,
+        "give the path of a quaternion as `orientation`",
+    ),
+    Assumption(
+        "radians",
+        "Angles without a unit are radians.",
+        "the greatest angle; four turns contradict, one turn is remarked",
+        _radians,
+        _DEGREES,
+    ),
+    Assumption(
+        "one_turn",
+        "Angles in radians stay within a turn.",
+        "the greatest angle",
+        _some_turns,
+        _DEGREES,
+        is_remark=True,
+    ),
+    Assumption(
+        "degrees",
+        "Angles in degrees stay within a turn.",
+        "the greatest angle; above 360.5 contradicts",
+        _beyond_a_turn,
+        "`invalid: [NUMBER]` makes the object unknown there",
+    ),
+    Assumption(
+        "heading",
+        "An angle counts from x, counter-clockwise.",
+        "where objects move, against their angle in each reading",
+        _heading,
+        "`yaw: {field: PATH, unit: deg, zero: north, clockwise: true}` reads compass headings",
+    ),
+    Assumption(
+        "metres",
+        "Positions are lengths.",
+        "names of fields and the range of coordinates; latitudes and longitudes contradict",
+        _degrees_as_metres,
+        "`origin: [LATITUDE, LONGITUDE]` brings them into metres",
+    ),
+    Assumption(
+        "latitude",
+        "Latitudes are degrees.",
+        "the greatest latitude; above 90 contradicts",
+        _no_degrees,
+        "`scale: 1e-7` for the topic reads such integers",
+    ),
+    Assumption(
+        "origin",
+        "The origin is near the fixes.",
+        "how far they are away; 2 degrees contradict",
+        _far_origin,
+        "give the `origin` a fix of this log",
+    ),
+    Assumption(
+        "precision",
+        "Coordinates are exact enough.",
+        "whether float32 holds them all; a step of 5 % of the smallest objects contradicts",
+        _precision,
+        "read them from a topic with float64, or nearer to the origin",
+    ),
+    Assumption(
+        "covariance",
+        "A covariance of zeros is exact.",
+        "how many are all zeros; half of them contradict",
+        _covariances,
+        "give a radius as `uncertainty`",
+    ),
+    Assumption(
+        "one_publisher",
+        "One publisher sends a topic.",
+        "channels of the topic that alternate and share names",
+        _publishers,
+        "split the log by channel, and give each its own topic",
+        is_about_signals=True,
+    ),
+    Assumption(
+        "one_object",
+        "A name is one object.",
+        "reports that leap by more than the object's size, and back; a quarter of all contradicts",
+        _one_object,
+        "give a `name` with the field that tells them apart",
+    ),
+    Assumption(
+        "complete_list",
+        "A list has all objects.",
+        "after how many messages objects return; mostly the same number above one contradicts",
+        _complete_list,
+        "`complete: false` keeps objects that a message leaves out",
+    ),
+    Assumption(
+        "one_class",
+        "An object keeps its class.",
+        "changes of class",
+        _one_class,
+        "`class: {field: PATH, changes: split}` makes two objects of it, `first` keeps its first class",
+        is_remark=True,
+    ),
+    Assumption(
+        "corners",
+        "Bounds are two opposite corners.",
+        "where the second lies; left of the first in a fifth of all contradicts",
+        _corners,
+        "give `position` and `shape: {box: [WIDTH, HEIGHT]}`",
+    ),
+    Assumption(
+        "extent",
+        "Outlines of messages have an extent.",
+        "outlines whose size is 0",
+        _extent,
+        "give a `shape`",
+    ),
+    Assumption(
+        "one_unit",
+        "All topics have one unit of length.",
+        "sizes and speeds; 200 times those of all other topics contradicts",
+        _one_unit,
+        "`scale: 0.001` for the topic brings it into metres",
+    ),
+    Assumption("places", "Places in a list name objects.", "whether ids do", _by_place, "", True),
+    Assumption(
+        "outlines", "Outlines have corners.", "how many have too few", _cornerless, "", is_remark=True
+    ),
+    Assumption("fields_set", "Fields are set.", "presence of protobuf fields", _unset, "", True),
+    Assumption(
+        "orientation_set",
+        "Orientations are set.",
+        "quaternions of zeros among others",
+        _unturned,
+        "",
+        is_remark=True,
+    ),
+    Assumption(
+        "motion",
+        "Objects move steadily.",
+        "the longest step; five sizes at 20 times the usual speed is remarked",
+        _leap,
+        "a `name` with an id may tell objects apart, `max_gap` marks pauses",
+        is_remark=True,
+    ),
+)
+
+NAMES: Final = tuple(assumption.name for assumption in ASSUMPTIONS)
+"""Names that `accept` takes."""
