@@ -315,6 +315,8 @@ class Binding:
         unset: columns of numbers that a protobuf sender may not set, with their paths and defaults.
         frame: reads the frame's name, and whether from the message instead of the object; None for the fixed
             frame.
+        outer_frame: reads the frame of the message, for objects whose own is empty.
+        own_stamp: reads the stamp of an object in a message that has another one.
     """
 
     style: Style
@@ -334,6 +336,8 @@ class Binding:
     frame: tuple[Get, bool] | None
     lifetime: TimeGetter | None
     unset: tuple[tuple[int, FieldPath, float], ...] = ()
+    outer_frame: Get | None = None
+    own_stamp: TimeGetter | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -494,6 +498,10 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     if len(class_paths) == 1:
         # alternatives may all be missing, a single path of the mapping must not
         walk(class_paths[0], example)
+    frame = _frame(layout.frame, example, message, needs_frame)
+    outer_frames = [path for path in layout.frame if FieldPath.of(path).from_message]
+    outer_frame = None if frame is None or frame[1] else _frame(outer_frames, example, message, False)
+    own_stamps = (Stamp(layout.own_stamp), Stamp(layout.own_stamp)) if layout.own_stamp else ()
     lifetime = bind_time((Stamp("lifetime"),), example, message) if layout.stays and style != "keys" else None
     paths = columns.paths
     return Binding(
@@ -511,7 +519,9 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         covariance=covariance,
         class_gets=tuple(getter(path, example) for path in class_paths),
         class_names=_enum_of(class_paths, example),
-        frame=_frame(layout, example, message, needs_frame),
+        frame=frame,
+        outer_frame=None if outer_frame is None else outer_frame[0],
+        own_stamp=bind_time(own_stamps, example, message),
         lifetime=lifetime,
         unset=tuple(
             (column, path, _default(path, example))
@@ -650,12 +660,12 @@ def _uncertainty(layout: MessageLayout, columns: _Columns) -> tuple[float | int 
 
 
 def _frame(
-    layout: MessageLayout, example: object, message: object, needs_frame: bool
+    paths: Sequence[str], example: object, message: object, needs_frame: bool
 ) -> tuple[Get, bool] | None:
-    for text in layout.frame:
+    for text in paths:
         path = FieldPath.of(text)
         root = message if path.from_message else example
-        if (len(layout.frame) > 1 or not needs_frame) and not leads_somewhere(path, root):
+        if (len(paths) > 1 or not needs_frame) and not leads_somewhere(path, root):
             continue
         value = walk(path, root)
         if not isinstance(value, str):

@@ -46,7 +46,9 @@ class MessageLayout:
             the paths of their four numbers.
         bounds_have_size: whether the last two numbers are width and height instead of a corner.
         sizes: alternatives, each the paths of length, width and maybe height of a box.
-        frame, stamp: in the object, or with `$.` in the message.
+        frame, stamp: in the object, or with `$.` in the message. An empty frame in the object is that of the
+            message.
+        own_stamp: of an object in a message with a time of its own, for the transforms that place it.
         solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
         origin: where positions that are latitudes and longitudes are counted from; None for metres.
@@ -77,6 +79,7 @@ class MessageLayout:
     frame: Alternatives = ("$.header.frame_id",)
     frame_name: str | None = None
     stamp: tuple[Stamp, ...] = (Stamp("$.header.stamp"),)
+    own_stamp: str = ""
     solids: Literal["", "marker", "scene", "primitive"] = ""
     shape: ShapeMapping | None = None
     height: tuple[Measure, Measure] | None = None
@@ -104,8 +107,14 @@ _POSES = MessageLayout(
     position=(("position",),),
     orientation=("orientation",),
 )
+_OWN_FRAME = ("header.frame_id", "$.header.frame_id")
 _DETECTIONS = MessageLayout(
-    objects="detections[*]", complete=True, name="{topic}_{id|tracking_id|index}", class_field=_RESULT_CLASS
+    objects="detections[*]",
+    complete=True,
+    name="{topic}_{id|tracking_id|index}",
+    class_field=_RESULT_CLASS,
+    frame=_OWN_FRAME,
+    own_stamp="header.stamp",
 )
 _TRANSFORM = MessageLayout(
     name="{child_frame_id}",
@@ -174,6 +183,8 @@ BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
             name="object_{id}",
             position=(("pose.position",),),
             orientation=("pose.orientation",),
+            frame=_OWN_FRAME,
+            own_stamp="header.stamp",
             solids="primitive",
             class_field=("classification",),
             class_table=_OBJECT_CLASSES,
@@ -276,7 +287,7 @@ def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
         paths = (mapping.frame_field,) if mapping.frame_field else ()
         changes |= {"frame_name": mapping.frame, "frame": paths}
     if mapping.stamp is not None:
-        changes["stamp"] = (mapping.stamp,)
+        changes |= {"stamp": (mapping.stamp,), "own_stamp": ""}
     if mapping.uncertainty is not None:
         changes["uncertainty"] = mapping.uncertainty
     changes |= {"scale": mapping.scale, "invalid": mapping.invalid}

@@ -574,7 +574,7 @@ class Extractor:
         chunk.covariance = covariances(self.layout, binding, values)
         chunk.class_code = class_codes(self.layout, binding, values, self._classes)
         chunk.frames = self._frames(binding, messages, objects)
-        self._fill_stamps(chunk, messages, objects)
+        self._fill_stamps(chunk, binding, messages, objects)
         if binding.lifetime is not None:
             chunk.lifetimes = binding.lifetime.nanoseconds(values)
         elif self.layout.stays:
@@ -651,16 +651,18 @@ class Extractor:
         if binding.frame is None or not objects.values:
             return None
         get, from_message = binding.frame
-        if not self._needs_frame:
-            # one of many, enough to remark that topics are in different frames
-            example = messages[objects.message[0]] if from_message else objects.values[0]
-            self.noted_frames.add(str(get(example)))
-            return None
-        frames = [str(get(each)).removeprefix("/") for each in (messages if from_message else objects.values)]
+        frames = [str(get(part)).removeprefix("/") for part in (messages if from_message else objects.values)]
+        if binding.outer_frame is not None and not all(frames):
+            outer = [str(binding.outer_frame(message)).removeprefix("/") for message in messages]
+            frames = [frame or outer[index] for frame, index in zip(frames, objects.message, strict=True)]
         self.noted_frames.update(frames)
+        if not self._needs_frame:
+            return None
         return [frames[index] for index in objects.message] if from_message else frames
 
-    def _fill_stamps(self, chunk: DetectionChunk, messages: Sequence[object], objects: _Objects) -> None:
+    def _fill_stamps(
+        self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
+    ) -> None:
         """Read the stamps of objects where frames matter; elsewhere only the first, to compare clocks."""
         if self._time is None:
             return
@@ -672,6 +674,10 @@ class Extractor:
         elif from_message:
             stamps = self._time.nanoseconds(messages)
             chunk.stamps = [stamps[index] for index in objects.message]
+            if binding.own_stamp is not None:
+                own_stamps = binding.own_stamp.nanoseconds(objects.values)
+                # a stamp of 0 was never set
+                chunk.stamps = [own or outer for own, outer in zip(own_stamps, chunk.stamps, strict=True)]
             chunk.noted_stamps = list(zip(chunk.places.tolist(), stamps, strict=True))
         else:
             chunk.stamps = self._time.nanoseconds(objects.values)

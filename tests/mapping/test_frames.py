@@ -573,3 +573,27 @@ def test_simulated_time_is_remarked_where_log_times_count() -> None:
     (remark,) = ReadingPlan.of(parse_mapping(text), feed.topics()).remarks
     assert remark.startswith("/clock has simulated time, which may run at another rate than the recording")
     assert ReadingPlan.of(parse_mapping(f"clock: header\n{text}"), feed.topics()).remarks == ()
+
+
+def test_detections_are_placed_by_their_own_headers() -> None:
+    def detection(name: str, frame: str, time_ns: int = 0) -> Any:
+        box = ros("vision_msgs/BoundingBox3D", center=pose(1.0, 0.0))
+        return ros("vision_msgs/Detection3D", header=header(frame, time_ns), id=name, bbox=box)
+
+    feed = moving(0, SECOND)
+    feed.latched = frozenset({"/tf_static"})
+    feed.add("/tf_static", 0, tf(transform("map", "mast", (20, 0, 0))))
+    listed = [
+        detection("a", "mast"),
+        detection("b", ""),
+        detection("c", "base", SECOND),
+        detection("d", "base"),
+    ]
+    message = ros("vision_msgs/Detection3DArray", header=header("map", SECOND // 2), detections=listed)
+    feed.add("/d", SECOND, message)
+    made = make("fixed_frame: map\ntopics: {/d: {name: '{id}'}}", feed)
+    assert [made.centre(0, name) for name in "abc"] == [(21.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
+    # d has the time of its message, when the base had turned by half as much
+    assert made.centre(0, "d") == pytest.approx((0.5 + cos(pi / 4), sin(pi / 4)))
+    # without a fixed frame, all frames of the topic are named
+    assert "'base', 'map', 'mast'" in make("topics: {/d: {name: '{id}'}}", feed).remarks[0]
