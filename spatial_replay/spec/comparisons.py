@@ -23,6 +23,7 @@ from spatial_replay.spec.formula import (
     Scaled,
     Signal,
     SignedDistance,
+    Span,
     Sum,
     Term,
     TrackedName,
@@ -109,6 +110,8 @@ class ComparisonBuilder:
                 return self._of_text(left, signs[0], right, scope)
             if left.is_quoted:
                 return self._of_text(right, signs[0], left, scope)
+        self._check_constant(left, right, scope)
+        self._check_constant(right, left, scope)
         return self._of_sums(written, scope)
 
     # ------------------------------------------------------------------------------- one with a constant
@@ -212,6 +215,7 @@ class ComparisonBuilder:
             case Arithmetic(operands=(operand,)):
                 return -self._number(operand, scope)
             case Arithmetic(operator="+" | "-" as sign, operands=(left, right)):
+                self._check_hyphen(written, scope)
                 first, second = self._number(left, scope), self._number(right, scope)
                 self._check_units(first, second, written, scope)
                 return first + second if sign == "+" else first - second
@@ -330,6 +334,35 @@ class ComparisonBuilder:
         if len(kinds) > 1:
             hint = "multiply one of them by a constant: a dist b >= 2 * speed(a)"
             self.resolver.fault(written.span, scope, "a distance and a speed have different units", hint)
+
+    def _check_constant(self, limit: FormulaSyntax, quantity: FormulaSyntax, scope: Scope) -> None:
+        """Report a limit that is most likely a misspelt constant, not a signal."""
+        definitions = self.resolver.names.definitions
+        if not isinstance(limit, Name) or limit.is_quoted or limit.text in {*definitions, *scope.values}:
+            return
+        constants = [key for key in definitions if isinstance(definitions[key], ConstStatement)]
+        if isinstance(quantity, Name):
+            # signals that are compared have similar names
+            constants = [key for key in constants if key.casefold() == limit.text.casefold()]
+        if nearest := self.resolver.faults.nearest(limit.text, constants):
+            hint = f"{nearest} A signal of that name is written in quotes: {quoted(limit.text)}"
+            self.resolver.fault(limit.span, scope, f"unknown constant {limit.text!r}", hint)
+
+    def _check_hyphen(self, written: Arithmetic, scope: Scope) -> None:
+        """Report `cup dist base-link`: a difference of a distance is written with blanks."""
+        left, right = written.operands
+        sign = Span(left.span.end, right.span.start)
+        if sign.end - sign.start > 1 or written.operator != "-":
+            return
+        match left, right:
+            case DistanceSyntax(second=Name() as first), Name() as last:
+                name = f"{first.text}-{last.text}"
+            case Name() as first, DistanceSyntax(first=Name() as last):
+                name = f"{first.text}-{last.text}"
+            case _:
+                return
+        hint = f"a name with - is written in quotes: {quoted(name)}; a difference has blanks around its -"
+        self.resolver.fault(sign, scope, "'-' within a name, or without blanks", hint)
 
     def _report_equality(self, written: ComparisonSyntax, scope: Scope) -> None:
         left, right = (self._source(operand) for operand in (written.operands[0], written.operands[-1]))
