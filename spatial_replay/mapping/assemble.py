@@ -123,6 +123,7 @@ class _Assembling:
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
         self._recorded = 0
+        self._channel_by_topic: dict[str, int] = {}
         self.jump: Sentence | None = None
         """Where time jumped back so far that the log is taken to end there."""
 
@@ -364,8 +365,11 @@ class _Assembling:
         log_ns, publish_ns, sequence = (np.array(each, np.int64) for each in numbers)
         place = self._recorded + np.arange(len(messages))
         self._recorded += len(messages)
-        codes = {topic: code for code, topic in enumerate(dict.fromkeys(topics))}
-        channels = {code: Channel(topic, "", None) for topic, code in codes.items()}
+        # a topic keeps its number, since another one is another publisher
+        codes = self._channel_by_topic
+        channels = {
+            codes.setdefault(topic, len(codes)): Channel(topic, "", None) for topic in dict.fromkeys(topics)
+        }
         channel = np.array([codes[topic] for topic in topics], np.int64)
         return MessageColumns(channels, channel, sequence, log_ns, publish_ns, payloads, place)
 
