@@ -177,8 +177,8 @@ def monitor(
     """Monitor a running robot through foxglove_bridge, or another Foxglove WebSocket server.
 
     Prints each change of a verdict with its reason. While the connection is lost, everything is unknown.
-    Ctrl-C ends the run. Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown,
-    3 if the server does not answer or its time jumps back.
+    Ctrl-C ends the run. Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown
+    or doubtful, 3 if the server does not answer or its time jumps back.
 
     With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1
     fires it, too, and so does the service `trigger` of --serve.
@@ -376,6 +376,7 @@ class _Run:
                 ticking.cancel()
                 ending.cancel()
                 self._status.clear()
+        self._session.close()
         self._show_end()
 
     @property
@@ -486,6 +487,7 @@ class _Run:
             warn(str(self._session.failure))
         endings = self._session.endings()
         self._verdicts = [str(ending.verdict) for ending in endings]
+        self._verdicts += ["unknown" for ending in endings if ending.doubts]
         span = "no time" if status.time_ns is None else time_text(status.time_ns, self.first_ns)
         lost = ""
         if status.dropped or status.messages_dropped:

@@ -52,10 +52,11 @@ def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
 def _ending_numbers(ending: Ending) -> str:
     robustness, lower, upper = ending.robustness, ending.lower, ending.upper
     low, high = with_unit(lower, ending.unit), with_unit(upper, ending.unit)
+    doubtful = "doubtful, " if ending.doubts else ""
     if math.isnan(robustness):
-        return f"robustness not determined, between {low} and {high}"
+        return f"{doubtful}robustness not determined, between {low} and {high}"
     between = "" if lower == upper == robustness else f", between {low} and {high}"
-    return f"robustness {with_unit(robustness, ending.unit)}{between}"
+    return f"{doubtful}robustness {with_unit(robustness, ending.unit)}{between}"
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:

@@ -30,6 +30,7 @@ from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.monitor.doubtful import ClassMembers, doubts_about, needs_of_spec
 from spatial_replay.monitor.ends import Needs, RunEnds
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation
 from spatial_replay.monitor.result import no_such_node
@@ -50,6 +51,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted, counted_from
+from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 if TYPE_CHECKING:
@@ -120,6 +122,10 @@ class ObjectsAssembler:
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what is remarkable where nothing was lost: nothing."""
+        return ()
+
+    def take_doubts(self) -> tuple[Doubt, ...]:
+        """Return no doubts: samples are read without a mapping."""
         return ()
 
 
@@ -307,7 +313,11 @@ class LiveSession:
         self._early = Inbox()
         self._refused: set[str] = set()
         self._remarked: set[Diagnostic] = set()
+        self._members = ClassMembers(self._ends.needs.classes)
+        self._is_closed = False
         self.remarks: tuple[str, ...] = ()
+        self.doubts: tuple[Doubt, ...] = ()
+        """Assumptions that the run contradicts; known after `close`, or at the end of `updates`."""
         self.failure: LogError | None = None
         """Why the run ended before it was stopped: time that jumped back."""
 
@@ -330,7 +340,11 @@ class LiveSession:
 
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends with the newest sample."""
-        return tuple(each for monitor in self._monitors for each in monitor.endings())
+        endings = (ending for monitor in self._monitors for ending in monitor.endings())
+        return tuple(
+            ending._replace(doubts=doubts_about(needs_of_spec(ending.spec), self.doubts, self._members))
+            for ending in endings
+        )
 
     def take_notes(self, *, last: bool = False) -> tuple[str, ...]:
         """Return what happened since the last update, if anything did; at last, how often besides."""
@@ -354,6 +368,22 @@ class LiveSession:
                 f"{topic} is unknown where no transform of {frame!r} came within {self._max_delay_s:g} s; if"
                 " transforms come later or seldom, give --max-delay (max_delay_s) more"
             )
+
+    def close(self) -> None:
+        """Compare the run with the assumptions of its mapping, where `updates` was left before its end."""
+        if self._assembler is not None and not self._is_closed:
+            self._assembler.finish()
+            self._conclude(self._assembler)
+
+    def _conclude(self, assembler: LiveAssembler | ObjectsAssembler) -> None:
+        """Take the doubts and remarks of an assembler that has finished."""
+        self._is_closed = True
+        first_ns = self._ends.begin_ns or 0
+        self.doubts = distinct_doubts(assembler.take_doubts(), first_ns)
+        remarks = counted_from(assembler.take_remarks(), first_ns)
+        self.remarks = (*(doubt.remark(self._address) for doubt in self.doubts), *remarks)
+        for log in self._logs:
+            log.doubts = self.doubts
 
     def stop(self) -> None:
         """End `updates` once what has come is evaluated."""
@@ -394,7 +424,7 @@ class LiveSession:
                 trace = self._assembler.finish()
                 async for update in self._evaluated(trace, time.monotonic(), self._ends.finish):
                     yield update
-                self.remarks = counted_from(self._assembler.take_remarks(), self._ends.begin_ns or 0)
+                self._conclude(self._assembler)
         finally:
             listening.cancel()
             with suppress(asyncio.CancelledError, Exception):
@@ -691,6 +721,7 @@ class LiveSession:
     def _counting(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
         """Return the samples that count: none before each needed topic can be judged, nor where the run may
         have ended."""
+        self._members.add(trace)
         ends = self._ends
         had_begun, remarks = ends.begin_ns is not None, ends.remarks
         # a sample that can be judged does not wait for the next one, which may not be

@@ -52,6 +52,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit, iter_expressions
 from spatial_replay.text import Instant, Sentence, counted, named_arguments, time_text, times_apart, with_unit
+from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import (
     FOREVER,
     Sample,
@@ -198,6 +199,7 @@ class Ending(NamedTuple):
         lower, upper: the ends of the value's interval over the finished log.
         unit: the declared one of these, or "".
         reason: why it is unknown, as `explain` has it; "" if it is not, or if that was not noted.
+        doubts: assumptions that the verdict rests on, and that the run contradicts.
     """
 
     spec: NamedSpec
@@ -207,6 +209,7 @@ class Ending(NamedTuple):
     upper: float
     unit: str = ""
     reason: str = ""
+    doubts: tuple[Doubt, ...] = ()
 
 
 @named_arguments

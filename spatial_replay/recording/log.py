@@ -60,6 +60,7 @@ from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import requirement_text
+from spatial_replay.trace.doubts import Doubt, metadata_from_doubts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Sample, Trace
 from spatial_replay.trace.units import Axes
 
@@ -82,11 +83,18 @@ class RunEvent(NamedTuple):
 
 
 class RunEnd(NamedTuple):
-    """How a recording ended: whether early, and how many samples and messages beside them found no place."""
+    """How a recording ended.
+
+    Attributes:
+        interrupted: whether early.
+        dropped, messages_dropped: how many samples, and messages beside them, found no place.
+        doubts: assumptions that its source contradicts.
+    """
 
     interrupted: bool = False
     dropped: int = 0
     messages_dropped: int = 0
+    doubts: tuple[Doubt, ...] = ()
 
 
 _WHOLE: Final = RunEnd()
@@ -228,6 +236,8 @@ class Recording:
     def end(self, end: RunEnd = _WHOLE) -> None:
         """Write what follows the last sample; the certificate is that of a replay of the log."""
         ending = self._ending(end)
+        if end.doubts:
+            self.add_metadata(DOUBTS, metadata_from_doubts(end.doubts))
         if self._samples:
             annotator = self._evaluation.annotator
             self._sink.write_messages(merge(annotator.end(self._end_ns, self._evaluation.finals)))

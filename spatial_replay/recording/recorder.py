@@ -535,6 +535,7 @@ class SampleWriter:
 
     Attributes:
         dropped: how many samples were dropped because the queue was full, or given to `miss`.
+        doubts: assumptions that the source contradicts; the end of the log has those set by then.
     """
 
     def __init__(
@@ -562,6 +563,7 @@ class SampleWriter:
         missed = partial(log.miss, kind="message")
         self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring, missed=missed)
         self.dropped = 0
+        self.doubts: tuple[Doubt, ...] = ()
         self._last_ns = self._queued_ns = -1
         self._unsafe_s: float | None = None
         self._drains = False
@@ -657,7 +659,7 @@ class SampleWriter:
 
     def _finish(self, *, interrupted: bool) -> None:
         """Write the end of the log; after a failure, as far as that is possible, and say that it failed."""
-        end = RunEnd(interrupted, self.dropped, self._messages.dropped)
+        end = RunEnd(interrupted, self.dropped, self._messages.dropped, self.doubts)
         try:
             if self._messages.failure is not None:
                 with suppress(Exception):

@@ -1062,3 +1062,30 @@ def test_a_message_that_comes_too_late_is_said(tmp_path: Path) -> None:
     assert [update.time_ns for update in updates] == [0, 100 * MS, 200 * MS]
     notes = [note for update in updates for note in update.notes if "it came after the samples" in note]
     assert len(notes) == 1 and "/vase at 0.100 s" in notes[0] and "the next sample has it" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("formula", "accept", "code", "said"),
+    [
+        ("F[0s, 50ms] (robot dist vase >= 1)", "", 4, "doubtful: /robot: its angles reach 200 "),
+        ("F[0s, 50ms] (vase dist vase <= 1)", "", 0, "doubtful: /robot: its angles reach 200 "),
+        ("F[0s, 50ms] (robot dist vase >= 1)", "accept: [radians]", 0, "accepted: /robot: its angles reach"),
+        ("F[0s, 50ms] (robot dist vase >= 9)", "", 1, "doubtful: /robot"),
+    ],
+)
+def test_a_run_is_doubtful_where_it_contradicts_its_mapping_and_its_log_keeps_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], formula: str, accept: str, code: int, said: str
+) -> None:
+    mapping = "topics: {/robot: {position: [x, y], yaw: yaw}, /vase: {position: [x, y]}}"
+    mapped, spec = files(tmp_path, f"{mapping}\n{accept}", f"spec goal = {formula}")
+    log = tmp_path / "live.mcap"
+    turned = b'{"x": 2.0, "y": 0.0, "yaw": 200}'
+    sent = [each for tick in range(30) for each in (pose(2, tick), frame(1, tick * 10 * MS, turned))]
+    with rude_server(*sent) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "-o", str(log)]
+        # it is left at a sample, before its end
+        assert run([*command, "--until", "settled"]) == code
+    output = capsys.readouterr()
+    assert (said in output.err, "doubtful, robustness" in output.out) == (True, code != 0)
+    assert run(["replay", str(log), "--spec", str(spec)]) == code
+    assert said in capsys.readouterr().err
