@@ -52,8 +52,9 @@ class Assumption:
 def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
     """Yield what contradicts the assumptions: doubts, and remarks where the data may be only odd.
 
-    A contradiction in many topics is one sentence.
+    A contradiction in many topics is one sentence. A name that the mapping accepts in vain is remarked.
     """
+    in_vain = dict.fromkeys(mapping.accept)
     for evidence in log.values():
         evidence.settle()
     for assumption in ASSUMPTIONS:
@@ -64,12 +65,14 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
                 clauses[topic] = clause
         if not clauses:
             continue
+        is_accepted = assumption.name in mapping.accept
+        in_vain.pop(assumption.name, None)
         for topics in [list(clauses)] if len(clauses) >= _MANY_TOPICS else [[topic] for topic in clauses]:
             others = f" (as in {counted(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
             remedy = f"; {assumption.remedy}" if assumption.remedy else ""
             text = Sentence(f"{topics[0]}: ", clauses[topics[0]], f"{others}{remedy}")
             if assumption.is_remark:
-                yield text
+                yield Sentence("accepted: ", text) if is_accepted else text
                 continue
             rests = [log[topic] for topic in topics]
             signals = [
@@ -84,8 +87,10 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
                 text,
                 objects=frozenset[str]().union(*(evidence.object_names for evidence in rests)),
                 signals=frozenset(signals),
-                is_accepted=assumption.name in mapping.accept,
+                is_accepted=is_accepted,
             )
+    for name in in_vain:
+        yield f"{mapping.name}: `accept: [{name}]` has no effect: the messages do not contradict that"
 
 
 _MANY_TOPICS: Final = 3

@@ -300,6 +300,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
         max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
         trims_ends=value.get("ends", "trim") == "trim",
+        accept=tuple(value.get("accept", ())),
         origin=(float(origin[0]), float(origin[1])) if origin else None,
         axes=Axes(
             value.get("axes", {}).get("y", "up"),

@@ -291,7 +291,9 @@ def _described(error: Any) -> Iterator[tuple[Place, str]]:
         yield place, "a name is empty; give it a name"
     else:
         wanted = error.schema.get("description", _around(error))
-        yield place, f"expected {wanted}; got {_shown(error.instance)}"
+        is_word = keyword == "enum" and isinstance(error.instance, str)
+        hint = nearest_hint(error.instance, map(str, error.validator_value)) if is_word else ""
+        yield place, "; ".join(filter(None, (f"expected {wanted}", f"got {_shown(error.instance)}", hint)))
 
 
 def _around(error: Any) -> str:

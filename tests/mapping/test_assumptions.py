@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
+from pathlib import Path
 
 import pytest
 
+from bags.bag_files import write_mcap
+from spatial_replay.cli import run as run_program
+from spatial_replay.mapping.assumptions import NAMES
+from spatial_replay.mapping.yaml_document import schema_of
 from tests.mapping.feeding import SECOND, Feed, make
 
 
@@ -61,3 +67,28 @@ def test_a_list_that_comes_in_parts_is_not_complete() -> None:
     # detections that are missed now and then
     flickering = (part((0, 1) if i % 3 == 1 else (0, 1, 2, 3), i / 10) for i in range(20))
     assert doubts(mapping, *run("/radar", flickering)) == []
+
+
+def test_an_accepted_contradiction_is_a_remark_and_one_in_vain_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = [json.dumps({"x": 1.0, "y": 2.0, "yaw": 90.0 * number}).encode() for number in range(5)]
+    log, mapping, spec = (tmp_path / name for name in ("run.mcap", "m.yaml", "s.spatial"))
+    channels = [("/bot", "json", "Pose", "jsonschema", b'{"type":"object"}')]
+    write_mcap(log, channels, (("/bot", number * SECOND, pose) for number, pose in enumerate(poses, 1)))
+    spec.write_text("region zone = box(0, 0, 9, 9)\nspec stays = G (bot enclosedin zone)")
+    command = ["replay", str(log), "--mapping", str(mapping), "--spec", str(spec)]
+    for accept, code, said in (
+        ("", 4, "doubtful: /bot: its angles reach 360"),
+        ("accept: [radians, origin]", 0, "accepted: /bot: its angles reach 360"),
+        ("accept: [radians, origin]", 0, "m.yaml: `accept: [origin]` has no effect"),
+        ("\naccept:\n- radian", 2, "m.yaml:5: accept[0]: expected the name of an assumption"),
+        ("accept: [radian]", 2, "did you mean 'radians'?"),
+    ):
+        mapping.write_text(f"topics:\n  /bot: {{position: [x, y], yaw: yaw, shape: {{disc: 0.1}}}}\n{accept}")
+        assert run_program(command) == code
+        assert said in capsys.readouterr().err
+
+
+def test_the_schema_of_mappings_names_every_assumption() -> None:
+    assert schema_of("mapping", "mapping")["properties"]["accept"]["items"]["enum"] == list(NAMES)
