@@ -90,7 +90,7 @@ shapes:
     errors = str(caught.value).splitlines()
     for line in (
         "drive.yaml:2: fixed_fram: unknown key; did you mean 'fixed_frame'?",
-        'drive.yaml:3: clock: expected one of log, publish, header; got "logs"',
+        "drive.yaml:3: clock: expected one of log, publish, header; got \"logs\"; did you mean 'log'?",
         "drive.yaml:4: sample.every: '0ms' is not a time; give a duration above 0",
         "drive.yaml:5: max_age: expected a duration above 0 such as 500ms, or forever; got 5",
         "drive.yaml:7: topics./a.nam: unknown key; did you mean 'name'?",
