@@ -337,6 +337,7 @@ class RemoteFile(PathLike[str]):
             raise UsageError(
                 f"{self._shown} names no file; give the address of one log, such as s3://bucket/run.mcap"
             )
+        _refuse_empty_parts(self._shown, self._key)
         self.name = name
         self._obstore = obstore_library()
         self._store = open_store(self._scheme, bucket)
@@ -562,6 +563,19 @@ def _store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> A
         ) from None
 
 
+_EMPTY_PART: Final = "cannot be read: // or a leading / in its key; copy it to a key without an empty part"
+
+
+def _refuse_empty_parts(shown: str, key: str) -> None:
+    """Refuse a key that the library cannot read, or reads as another one.
+
+    Raises:
+        UsageError: the key has an empty part.
+    """
+    if key.startswith("/") or "//" in key:
+        raise UsageError(f"{shown} {_EMPTY_PART}")
+
+
 def store_failure(shown: str, scheme: str, error: Exception, done: str = "read") -> SpatialReplayError:
     """Return the error for an address that cannot be read or written, with what helps."""
     exceptions = obstore_library().exceptions
@@ -570,6 +584,9 @@ def store_failure(shown: str, scheme: str, error: Exception, done: str = "read")
     if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)):
         return MissingFileError(f"{shown}: access denied; {_CREDENTIALS[scheme]}")
     text = str(error).partition("\n")[0].strip()
+    if "empty path segment" in text:
+        key = text.partition('"')[2].rpartition('"')[0]
+        return RemoteError(f"{shown}: the object {key!r} {_EMPTY_PART}, or name a folder without it")
     if "404 " in text:
         return MissingFileError(f"{shown}: there is no such bucket; check the address")
     if "416 " in text:
@@ -853,6 +870,7 @@ def matching_addresses(pattern: str) -> list[str]:
     if scheme in WEB_SCHEMES:
         raise UsageError(f"{pattern}: web servers do not list their files; give each address")
     bucket, _, key = rest.partition("/")
+    _refuse_empty_parts(pattern, key)
     begin = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
     fixed, wanted = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
     keys = RemoteFolder(f"{scheme}://{bucket}").names(fixed)

@@ -311,6 +311,13 @@ def test_a_bucket_of_an_s3_server_is_listed_and_read(
         assert len(sr.read_trace("s3://fleet/2026-11/table.jsonl")) == 300
         with pytest.raises(MissingFileError, match="there is no such file"):
             sr.read_trace("s3://fleet/none.mcap")
+        for address in ("s3://fleet/2026//run.mcap", "s3://fleet//run.mcap"):
+            with pytest.raises(UsageError, match="// or a leading / in its key; copy it to a key without"):
+                sr.read_trace(address)
+        urlopen(Request(f"{server}/fleet/2025//run.mcap", b"", method="PUT")).close()
+        with pytest.raises(RemoteError, match="'2025//run.mcap' cannot be read: // or a leading /"):
+            matching_addresses("s3://fleet/**/*.mcap")
+        assert len(matching_addresses("s3://fleet/2026-11/")) == 2
 
         # the protocol of Google's buckets is that of S3, but for the signatures
         everyone = {"Effect": "Allow", "Principal": "*", "Action": "s3:*", "Resource": "arn:aws:s3:::fleet*"}
