@@ -30,11 +30,12 @@ from spatial_replay.spec.checks import (
 from spatial_replay.spec.comparisons import ComparisonBuilder
 from spatial_replay.spec.constants import replaced
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
-from spatial_replay.spec.format import format_atom, format_number
+from spatial_replay.spec.format import format_atom, format_duration, format_number, title_text
 from spatial_replay.spec.formula import (
     Atom,
     Axis,
     Boolean,
+    Constant,
     Earlier,
     Enlarged,
     Expression,
@@ -89,7 +90,7 @@ from spatial_replay.spec.syntax import (
     TruthSyntax,
     UseStatement,
 )
-from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, tokenize
+from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, span_of, tokenize
 from spatial_replay.spec.walks import (
     base_of,
     is_centre,
@@ -939,9 +940,51 @@ def load_specifications(
     _check_names(files, constants)
     own = [_own_constants(file, constants) for file in files]
     return [
-        _parsed(source, values) if values else file
+        _with_titles(_parsed(source, values), file, values) if values else file
         for source, file, values in zip(sources, files, own, strict=True)
     ]
+
+
+def _with_titles(
+    changed: Specification, written: Specification, values: Mapping[str, float | str]
+) -> Specification:
+    """Return a specification whose titles name the values that are not those of its text.
+
+    A title such as "keep 30 cm from people" may say a number that does not hold any more.
+
+    Args:
+        changed: with the values.
+        written: the same without them.
+        values: of constants, by name.
+    """
+    before = {spec.name: spec.formula for spec in written.specs}
+    pairs = {name: (changed.constants[name], written.constants[name]) for name in values}
+    overrides = [
+        f"{name} = {_constant_text(new)} instead of {_constant_text(old)}"
+        for name, (new, old) in pairs.items()
+        if new != old
+    ]
+    text = changed.source
+    faults = Faults(SourceText.of(text, changed.filename))
+    tokens = tokenize(text, RELATION_NAMES | changed.relations, faults)
+    # from the last one, so that places before it stay
+    for spec in sorted(changed.specs, key=lambda spec: spec.span.start, reverse=True):
+        if spec.title is None or spec.formula == before[spec.name]:
+            continue
+        title = next(
+            span_of(token)
+            for token in tokens
+            if token.type == "TITLE" and span_of(token).start >= spec.span.end
+        )
+        words = quoted(f"{title_text(spec)} ({', '.join(overrides)})")
+        text = f"{text[: title.start]}{words}{text[title.end :]}"
+    return _parsed(SpecificationText(text, changed.filename), {})
+
+
+def _constant_text(constant: Constant) -> str:
+    if constant.duration_ns is None:
+        return format_number(constant.value)
+    return format_duration(constant.duration_ns)
 
 
 def is_formula(source: Path) -> bool:

@@ -935,6 +935,24 @@ def test_the_terminal_the_page_and_junit_say_which_requirement_fails(fleet: Path
     assert [text.startswith(f"{about}\n`apart` is violated") for text in texts] == [True] * 2
 
 
+def test_titles_name_the_constants_that_were_overridden(fleet: Path) -> None:
+    Path("gate.spatial").write_text(f"const near = 0.3\nconst late = 2s\n{GATE.replace('>= 0.3', '>= near')}")
+    given = ("--spec", "gate.spatial", "--const", "near=0.15", "--const", "late=2s")
+    title = "REQ-3: keep 30 cm from people (near = 0.15 instead of 0.3)"
+    done = batch("logs", *given, "--junit", "junit.xml", "--html", "pages")
+    assert done.out.count(f"      {title}\n") == 1
+    assert "    get to the person\n" in done.out
+    root = ElementTree.parse("junit.xml").getroot()
+    titles = [each.get("value") for each in root.iterfind("*/properties/property[@name='title']")]
+    assert titles == [title.removeprefix("REQ-3: "), "get to the person"]
+    assert title in Path("pages/index.html").read_text()
+    replayed = command("replay", "logs/run-3.jsonl", *given, "-o", "annotated.mcap")
+    assert title.removeprefix("REQ-3: ") in replayed.out
+    recorded = command("info", "annotated.mcap", "--specification").out
+    assert f'# at least as far apart as in the standard\nspec apart   "{title}" = G' in recorded
+    assert command("verify", "annotated.mcap", "--source", "logs/run-3.jsonl").code == 0
+
+
 def test_annotations_name_files_from_the_top_of_the_repository(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

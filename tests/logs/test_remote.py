@@ -315,7 +315,7 @@ def test_a_bucket_of_an_s3_server_is_listed_and_read(
             with pytest.raises(UsageError, match="// or a leading / in its key; copy it to a key without"):
                 sr.read_trace(address)
         urlopen(Request(f"{server}/fleet/2025//run.mcap", b"", method="PUT")).close()
-        with pytest.raises(RemoteError, match="'2025//run.mcap' cannot be read: // or a leading /"):
+        with pytest.raises(RemoteError, match=r"'2025//run\.mcap' cannot be read: // or a leading /"):
             matching_addresses("s3://fleet/**/*.mcap")
         assert len(matching_addresses("s3://fleet/2026-11/")) == 2
 
