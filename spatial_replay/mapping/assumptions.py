@@ -67,10 +67,13 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
             continue
         is_accepted = assumption.name in mapping.accept
         in_vain.pop(assumption.name, None)
-        for topics in [list(clauses)] if len(clauses) >= _MANY_TOPICS else [[topic] for topic in clauses]:
-            others = f" (as in {counted(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
+        for topics in _group_topics(clauses):
+            others = f" (and so in {counted(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
+            if len({clauses[topic] for topic in topics}) == 1:
+                others = ""
+            subjects = topics[:1] if others else topics[:_MOST_NAMED]
             remedy = f"; {assumption.remedy}" if assumption.remedy else ""
-            text = Sentence(f"{topics[0]}: ", clauses[topics[0]], f"{others}{remedy}")
+            text = Sentence(f"{', '.join(subjects)}: ", clauses[topics[0]], f"{others}{remedy}")
             if assumption.is_remark:
                 yield Sentence("accepted: ", text) if is_accepted else text
                 continue
@@ -93,7 +96,18 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
         yield f"{mapping.name}: `accept: [{name}]` has no effect: the messages do not contradict that"
 
 
+def _group_topics(clauses: Mapping[str, str]) -> list[list[str]]:
+    """Return the topics of each sentence: many of them share one, and so do those with equal clauses."""
+    if len(clauses) >= _MANY_TOPICS:
+        return [list(clauses)]
+    groups: dict[str, list[str]] = {}
+    for topic, clause in clauses.items():
+        groups.setdefault(clause, []).append(topic)
+    return list(groups.values())
+
+
 _MANY_TOPICS: Final = 3
+_MOST_NAMED: Final = 8
 _FEW: Final = 3
 """Messages or reports from which on a measurement says something."""
 
@@ -418,6 +432,13 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
 _THOUSAND: Final = 200
 
 
+def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
+    frames = sorted(frozenset[str]().union(*(topic.frames for topic in log.values())))
+    if evidence.uses_frames or len(frames) < 2 or not evidence.frames:
+        return None
+    return f"coordinates are in the frames {', '.join(map(repr, frames[:_MOST_NAMED]))} and taken as they are"
+
+
 def _by_place(evidence: TopicEvidence, log: Log) -> str | None:
     extractor = evidence.reader.extractor
     return BY_PLACE if extractor is not None and extractor.namer.is_by_place else None
@@ -631,6 +652,13 @@ ASSUMPTIONS: Final = (
         "sizes and speeds; 200 times those of all other topics contradicts",
         _one_unit,
         "`scale: 0.001` for the topic brings it into metres",
+    ),
+    Assumption(
+        "one_frame",
+        "Without `fixed_frame`, all coordinates are in one frame.",
+        "the frames that messages and objects name; two contradict",
+        _one_frame,
+        "`fixed_frame` brings them into one",
     ),
     Assumption("places", "Places in a list name objects.", "whether ids do", _by_place, "", True),
     Assumption(

@@ -342,6 +342,12 @@ class TopicEvidence:
         return self.reader.needs_frame and self.reader.extractor is not None
 
     @property
+    def frames(self) -> frozenset[str]:
+        """The frames of its objects that messages name."""
+        extractor = self.reader.extractor
+        return frozenset() if extractor is None else frozenset(extractor.noted_frames - {""})
+
+    @property
     def turn_path(self) -> str:
         """The field of the yaw; "" without one."""
         layout = self.planned.layout

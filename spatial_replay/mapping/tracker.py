@@ -9,7 +9,7 @@ The tracker holds the last state of every object and signal, so that a log can b
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -390,8 +390,6 @@ class Tracker:
                     self._signals[name, index] = series
             if reader.is_mapped and len(times_ns):
                 self._note_messages(reader.planned, times_ns, is_placed)
-            if reader.extractor is not None:
-                self.remarks.note_frames(reader.extractor.noted_frames)
             if self.plan.sampled_topic in (None, name):
                 sampled.append(times_ns)
             elif name in self.plan.fallback_topics:
@@ -793,7 +791,6 @@ class Remarks:
         self.missing, self.stale, self.replaced = _Counts(), _Counts(), _Counts()
         self.skipped: Counter[str] = Counter()
         self.stamps: dict[str, tuple[int, int]] = {}
-        self._frames: set[str] = set()
         self.samples = Pauses()
         self.messages: dict[str, Pauses] = defaultdict(Pauses)
         self.lasting: dict[str, str] = {}
@@ -842,11 +839,6 @@ class Remarks:
     def add(self, text: str) -> None:
         self._texts.append(text)
 
-    def note_frames(self, frames: Iterable[str]) -> None:
-        """Note frames whose coordinates are not transformed."""
-        if len(self._frames) < _MOST_NAMES:
-            self._frames.update(frame.removeprefix("/") for frame in frames if frame)
-
     def take(self) -> tuple[str, ...]:
         """Return all remarks, and forget them."""
         texts = [*self._texts, *self._missing_texts(), *self._stale_texts()]
@@ -859,13 +851,7 @@ class Remarks:
             texts.append(
                 Sentence(first, Instant(first_ns, 0), ": of those with the same time the last counts")
             )
-        if self._mapping.fixed_frame is None and len(self._frames) > 1:
-            listed = ", ".join(sorted(map(repr, self._frames)))
-            texts.append(
-                f"coordinates are in the frames {listed} and taken as they are;"
-                " `fixed_frame` in the mapping brings them into one"
-            )
-        for noted in (self._texts, self.missing, self.stale, self._frames, self.skipped, self.replaced):
+        for noted in (self._texts, self.missing, self.stale, self.skipped, self.replaced):
             noted.clear()
         return tuple(Sentence(f"{self._name}: ", text) for text in texts)
 

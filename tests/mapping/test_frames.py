@@ -111,7 +111,9 @@ def test_without_a_fixed_frame_coordinates_are_taken_as_they_are() -> None:
     feed = Feed().add("/p", 0, pose_stamped(1, 1, "camera")).add("/q", 0, pose_stamped(2, 2, "map"))
     made = make("topics: {/p: {}, /q: {}}", feed)
     assert (made.centre(0, "p"), made.centre(0, "q")) == ((1.0, 1.0), (2.0, 2.0))
-    assert "coordinates are in the frames 'camera', 'map' and taken as they are" in made.remarks[0]
+    (doubt,) = made.doubts
+    assert doubt.assumption == "one_frame"
+    assert "/p, /q: coordinates are in the frames 'camera', 'map' and taken as they are" in doubt.text
 
 
 def test_static_transforms_count_from_before_the_window() -> None:
@@ -596,4 +598,4 @@ def test_detections_are_placed_by_their_own_headers() -> None:
     # d has the time of its message, when the base had turned by half as much
     assert made.centre(0, "d") == pytest.approx((0.5 + cos(pi / 4), sin(pi / 4)))
     # without a fixed frame, all frames of the topic are named
-    assert "'base', 'map', 'mast'" in make("topics: {/d: {name: '{id}'}}", feed).remarks[0]
+    assert "'base', 'map', 'mast'" in make("topics: {/d: {name: '{id}'}}", feed).doubts[0].text
