@@ -12,7 +12,7 @@ from spatial_replay.monitor.stream import NEVER
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Gap
 from spatial_replay.monitor.witness.path import DecidingAtom, End, Measured, MissedResponse
-from spatial_replay.monitor.witness.threshold import Threshold
+from spatial_replay.monitor.witness.threshold import RESIDUE, Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.spec.format import format_formula, format_number
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Number, Scaled, iter_nodes, operator_of
@@ -203,8 +203,6 @@ def _order(node: int, values: Floats, final: Floats, settled_ns: Integers) -> tu
     return (1, _number(node, values, final), node) if at is None else (0, at, node)
 
 
-_RESIDUE = 1e-12
-"""A difference of so little, to what is compared, is the rounding error of its two numbers."""
 _ENDED = ", for the log has ended"
 _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
@@ -258,7 +256,10 @@ def sentences_of(
             sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
         if least is not None:
             sentences.append(_first_failure(flipping, first_ns))
-        if flipping.deciding is not None and flipping.obstacle != "infinity":
+        if flipping.closest is not None and flipping.closest_threshold is not None:
+            flip = _flip(flipping, flipping.closest[0], flipping.closest_threshold)
+            sentences.append(Sentence(flip))
+        elif flipping.deciding is not None and flipping.obstacle != "infinity":
             flip = _flip(flipping, flipping.deciding, flipping.threshold, is_open=is_open)
             sentences.append(Sentence(flip))
     if witness.open_end is not None:
@@ -369,7 +370,7 @@ def without_residue(number: float, atom: Formula) -> float:
     limits = [abs(part.value) for part in iter_parts(atom) if isinstance(part, Number)]
     limits = [each for each in limits if math.isfinite(each)]
     scale = max(limits, default=0.0) or 1.0
-    return 0.0 if abs(number * divisor_of(atom)) <= _RESIDUE * scale else number
+    return 0.0 if abs(number * divisor_of(atom)) <= RESIDUE * scale else number
 
 
 def _robustness(lower: float, upper: float, unit: str) -> str:
@@ -603,18 +604,27 @@ def _flip(
         would = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"
     elif threshold.verdict is Verdict.UNKNOWN:
         would = "It would not have been violated then"
-    number = format_number(threshold.flips_at)
-    side = "or more" if threshold.flips_at > threshold.value else "or less"
-    limit = f"exactly {number}" if threshold.is_exact else f"{number} {side}"
     if threshold.is_written:
-        limit = f"{limit} instead of {format_number(threshold.value)}"
-        is_idle = witness.missed is not None and witness.missed.is_condition
+        is_idle = deciding is witness.deciding and witness.missed is not None and witness.missed.is_condition
         why = ", as the condition would not hold there" if is_idle else ""
-        return f"{would} with {limit} {_place(deciding, threshold)}{why}."
+        return f"{would} with {_limit(threshold)} {_place(deciding, threshold)}{why}."
+    if threshold.replacement:
+        return f"{would} with `{threshold.replacement}` instead of `{deciding.text}`."
     unit = declared_unit(deciding.atom, witness.units, is_scaled=False)
-    margin = format_number(abs(threshold.flips_at)) + ("" if unit in ("", "1") else f" {unit}")
-    how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
-    return f"{would} if `{deciding.text}` {how} {margin}."
+    margin = with_unit(abs(threshold.flips_at), unit)
+    more = "more" if threshold.flips_at < 0.0 else "less"
+    return f"{would} in a log in which `{deciding.text}` holds by {margin} {more}."
+
+
+def _limit(threshold: Threshold) -> str:
+    """Return which numbers flip a verdict, instead of the one that is written."""
+    number, value = format_number(threshold.flips_at), format_number(threshold.value)
+    is_more = threshold.flips_at > threshold.value
+    if threshold.is_exact:
+        return f"exactly {number} instead of {value}"
+    if abs(threshold.flips_at - threshold.value) <= RESIDUE * max(abs(threshold.value), 1.0):
+        return f"any number {'above' if is_more else 'below'} {value}"
+    return f"{number} {'or more' if is_more else 'or less'} instead of {value}"
 
 
 def _place(deciding: DecidingAtom, threshold: Threshold) -> str:

@@ -13,7 +13,8 @@ from spatial_replay.monitor.result import RESULT_COLUMNS, NodeResult, SpecResult
 from spatial_replay.monitor.sentences import Cause, sentences_of
 from spatial_replay.monitor.vacuity import UntestedPart
 from spatial_replay.monitor.verdict import Verdict, online_verdict
-from spatial_replay.monitor.witness.path import DecidingAtom, Measured
+from spatial_replay.monitor.witness.path import DecidingAtom, Measured, MissedResponse
+from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
@@ -134,12 +135,28 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
         "explanation": list(sentences_of(witness, first_ns=first_ns)),
     }
     if witness.missed is not None:
-        value["missed"] = json_fields(witness.missed, "condition", "response", "time_ns")
+        value["missed"] = _missed(witness, witness.missed)
     if deciding is not None:
         value["atom"] = _atom(deciding)
     if threshold is not None:
-        value["threshold"] = {**json_fields(threshold), "constant": threshold.constant or None}
+        value["threshold"] = _threshold(threshold)
     return value
+
+
+def _missed(witness: Witness, missed: MissedResponse) -> dict[str, Any]:
+    """Return a response that was missed, with what came closest to it, if that is not what decides."""
+    atom, time_ns = witness.closest or (None, None)
+    threshold = witness.closest_threshold
+    return {
+        **json_fields(missed, "condition", "response", "time_ns"),
+        "closest": None if atom is None else {"time_ns": time_ns, "atom": _atom(atom)},
+        "threshold": None if threshold is None else _threshold(threshold),
+    }
+
+
+def _threshold(threshold: Threshold) -> dict[str, Any]:
+    named = {"constant": threshold.constant or None, "replacement": threshold.replacement or None}
+    return {**json_fields(threshold), **named}
 
 
 def _atom(deciding: DecidingAtom) -> dict[str, Any]:

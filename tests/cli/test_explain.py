@@ -289,3 +289,27 @@ def test_how_often_and_where_an_invariant_is_violated_is_listed(
     assert (last["atom"]["objects"], last["place"]) == (["robot", "ann"], [28.0, 0.5])
     _, text = said(capsys, *EXPLAIN, "--at", "7s", "--result", "apart", "--json")
     assert len(json.loads(text)[0]["violations"][0]["intervals"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("formula", "advice"),
+    [
+        ("G (load >= 1)", "satisfied with 0 or less instead of 1 in `load >= 1`"),
+        ("G (load >= 0)", "violated with any number above 0 in `load >= 0`"),
+        ("G (load <= 2)", "violated with any number below 2 in `load <= 2`"),
+        ("G (load >= -1)", "violated with 0.001 or more instead of -1 in `load >= -1`"),
+        ("G (load <= 1 -> F[1s, 1s] load <= 1)", "satisfied with 2 or more instead of 1 in `load <= 1`"),
+    ],
+)
+def test_a_number_that_flips_a_verdict_is_no_rounding_error_and_is_that_of_the_response(
+    folder: Path, capsys: pytest.CaptureFixture[str], formula: str, advice: str
+) -> None:
+    lines = [f'{{"time_ns": {10**9 * k}, "objects": [], "signals": {{"load": {2 * k}}}}}\n' for k in (0, 1)]
+    (folder / "run.jsonl").write_text("".join(lines))
+    _, text = said(capsys, "explain", "run.jsonl", "--spec", formula)
+    assert f"It would be {advice}." in text.splitlines()
+    _, text = said(capsys, "explain", "run.jsonl", "--spec", formula, "--json")
+    (explained,) = json.loads(text)
+    if "->" in formula:
+        assert explained["missed"]["closest"]["atom"]["measured"][0]["value"] == 2
+        assert explained["missed"]["threshold"]["flips_at"] == 2

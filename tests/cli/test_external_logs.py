@@ -277,7 +277,7 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
     assert "`meet` is violated, for the log has ended: robustness -1.514 m." in said
     assert "fails by 1.514 m at 1.809 s" in said
     assert "turtle1 and turtle2 are 1.514 m apart" in said
-    assert "were allowed to fail by 1.514 m." in said
+    assert "with `turtle1 dist turtle2 <= 1.514` instead of `turtle1 ovlp turtle2`." in said
     run(["report", "annotated.mcap", "-o", "run.html"])
     page = (folder / "run.html").read_text(encoding="utf-8")
     assert "robustness -1.514 m" in page

@@ -193,6 +193,19 @@ TEMPLATES = [
     "(a dist b >= {0}) <-> F (enlarge(a, {0}) ovlp goal)",
     "F (a leftof b and a ovlp goal)",
 ]
+WITHOUT_NUMBERS = [
+    "G (a ovlp b)",
+    "G not (a ovlp goal)",
+    "G (a enclosedin goal)",
+    "F not (b enclosedin goal)",
+    "G (a leftof b)",
+    "F (a rightof goal)",
+    "G not (a partbelow b)",
+    "G (a closer b than goal)",
+    "F (a partovlp goal)",
+    "G (a ovlp b -> a enclosedin goal)",
+    "G (a dist b <= 4 -> F[0, 1] a ovlp goal)",
+]
 HEADER = """\
 region goal = box(-2, -2, 3, 2)
 group pair = a, b
@@ -203,12 +216,16 @@ WRITTEN = re.compile(
     r"It would be (satisfied|violated) with (?:exactly )?(\S+)(?: or more| or less)? instead of (\S+)"
     r" (?:for `(\w+)`|in `.*`)"
 )
-MARGIN = re.compile(r"It would be (satisfied|violated) if `.*` (were allowed to fail|had to hold) by (\S+)\.")
+ANY = re.compile(
+    r"It would be (satisfied|violated) with any number (above|below) (\S+) (?:for `(\w+)`|in `.*`)"
+)
+REPLACED = re.compile(r"It would be (satisfied|violated) with `(.*)` instead of `.*`\.")
+MARGIN = re.compile(r"It would be (satisfied|violated) in a log in which `.*` holds by (\S+) (more|less)\.")
 
 
 @examples(80)
 @given(
-    template=st.sampled_from(TEMPLATES),
+    template=st.sampled_from(TEMPLATES) | st.sampled_from(WITHOUT_NUMBERS),
     number=st.sampled_from([0.5, 2.25, 7.125]),
     is_constant=st.booleans(),
     recording=recordings(),
@@ -224,20 +241,33 @@ def test_advice_of_an_explanation_leads_to_the_verdict_that_it_claims(
     for node, witness in witnesses.items():
         explained = result.explain(first_ns=0)
         said = " ".join(each for each in sentences_of(witness, first_ns=0) if each in explained)
-        written, margin = WRITTEN.search(said), MARGIN.search(said)
-        assert bool(written or margin) == (witness.threshold is not None)
-        if written:
-            claimed, new, old, constant = written.groups()
-            assert witness.threshold.flips_at == float(new)
+        written, beyond, replaced, margin = (
+            advice.search(said) for advice in (WRITTEN, ANY, REPLACED, MARGIN)
+        )
+        threshold = witness.closest_threshold or witness.threshold
+        assert bool(written or beyond or replaced or margin) == (threshold is not None)
+        if threshold is None:
+            continue
+        atom = (witness.closest[0] if witness.closest_threshold else witness.deciding).atom
+        if written or beyond:
+            if written:
+                claimed, new, old, constant = written.groups()
+                assert threshold.flips_at == float(new)
+            else:
+                claimed, side, old, constant = beyond.groups()
+                new = repr(float(old) + (1e-6 if side == "above" else -1e-6))
             if constant:
                 followed = parse_specification(text, constants={constant: float(new)})
             else:
-                followed = with_number(specification, witness.deciding.atom, old, new)
-        elif margin:
-            claimed, how, size = margin.groups()
-            followed = with_margin(specification, witness, float(size) * (1 if how == "had to hold" else -1))
-        if written or margin:
-            assert evaluate(followed, trace).result().nodes[node].verdict == claimed
+                followed = with_number(specification, atom, old, new)
+        elif replaced:
+            claimed, new = replaced.groups()
+            source, span = specification.source, atom.span
+            followed = parse_specification(source[: span.start] + new + source[span.end :])
+        else:
+            claimed, size, how = margin.groups()
+            followed = with_margin(specification, atom, float(size) * (1 if how == "less" else -1))
+        assert evaluate(followed, trace).result().nodes[node].verdict == claimed
 
 
 def with_number(specification, atom, old, new):
@@ -253,11 +283,11 @@ def with_number(specification, atom, old, new):
     )
 
 
-def with_margin(specification, witness, margin):
+def with_margin(specification, decided, margin):
     """The specification with an atom that has to hold by a margin."""
 
     def change(atom):
-        if atom.span != witness.deciding.atom.span:
+        if atom.span != decided.span:
             return atom
         return replace(atom, expression=Sum(atom.expression, Number(-margin)))
 

@@ -123,7 +123,7 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "`deliver` is violated, for the log has ended: robustness -7.76.",
         "What decides is `red enclosedin bin`, which fails by 7.76 at 4.000 s (its greatest within "
         "`deliver`): red sticks out of bin by 7.76.",
-        "It would be satisfied if `red enclosedin bin` were allowed to fail by 7.76.",
+        "It would be satisfied with `red enclosedin enlarge(bin, 7.76)` instead of `red enclosedin bin`.",
     ]
 
 

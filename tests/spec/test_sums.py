@@ -33,7 +33,7 @@ def trace(units: dict[str, str] | None = None) -> sr.Trace:
             (
                 "`load >= limit`, which fails by 2 kg at 4.000 s",
                 "load is 0 kg and limit is 2 kg",
-                "if `load >= limit` were allowed to fail by 2 kg",
+                "with `load >= limit - 2` instead of `load >= limit`",
             ),
         ),
         (

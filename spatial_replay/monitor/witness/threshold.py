@@ -7,8 +7,9 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context, Decimal
+from functools import partial
 from itertools import pairwise
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import DecidingAtom, End
+from spatial_replay.spec.format import format_atom
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -199,6 +201,9 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
                 yield from _signed_atoms(operand, frozenset(below))
 
 
+RESIDUE: Final = 1e-12
+"""A difference of so little, to what is compared, is the rounding error of its two numbers."""
+_PRECISION: Final = 60
 _FAR = 1e300
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
@@ -220,6 +225,7 @@ class Threshold:
         is_exact: whether numbers beyond `flips_at` need not flip it (`a dist b == c`).
         verdict: the verdict at `flips_at`.
         constant: the constant whose value the number is, if `flips_at` is a value of that; else "".
+        replacement: of an atom without a number, how it is written with one that flips the verdict; else "".
     """
 
     value: float
@@ -228,6 +234,7 @@ class Threshold:
     is_exact: bool
     verdict: Verdict
     constant: str = ""
+    replacement: str = ""
 
 
 Obstacle: TypeAlias = Literal["others", "unknown", "limits", "infinity"]
@@ -341,8 +348,23 @@ class _Search:
                     if self._is_flipped(verdict):
                         is_exact = dial.is_exact or len(self._directions) > 1
                         is_written = dial.kind != "margin"
-                        return Threshold(dial.value, candidate, is_written, is_exact, verdict, dial.constant)
+                        written = "" if is_written else self._replacement(candidate)
+                        return Threshold(
+                            dial.value, candidate, is_written, is_exact, verdict, dial.constant, written
+                        )
         return None
+
+    def _replacement(self, margin: float) -> str:
+        """Return the deciding atom with a number that makes it hold by a margin; "" if none does."""
+        atom = self._deciding.atom
+        for variant in _variants(atom, margin):
+            formula = self._changed(variant)
+            added = new_leaves(formula, self._order)
+            # heights, or rounding, may decide instead
+            if self._is_flipped(self._evaluated(formula, added, self._columns(added))):
+                changed = variant(atom)
+                return format_atom(changed.relation, changed.expression, changed.terms, changed.parameters)
+        return ""
 
     def obstacle(self) -> Obstacle:
         """Return why no number flips the verdict: from the one if the atom is moved arbitrarily far."""
@@ -495,13 +517,67 @@ def _radii_in(expression: Expression) -> list[float]:
     return [radius for part in iter_expressions(expression) for radius in _radii(part)]
 
 
+def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
+    """Yield ways to write an atom without a number so that it has to hold by a margin."""
+    match atom.relation, atom.expression:
+        case "ovlp", _:
+            yield partial(_as_distance, margin=margin)
+        case "sum", Sum(_, Negative()):
+            yield partial(_with_summand, margin=margin)
+    # a term that is larger by the margin, if that adds as much in every branch
+    radius, slope = abs(margin), -math.copysign(1.0, margin)
+    dial = Dial("radius", radius, is_exact=False)
+    for place in range(len(atom.terms)):
+        variant = partial(_with_enlarged, place=place, radius=radius)
+        if dial.slopes(variant(atom).expression) == {slope}:
+            yield variant
+
+
+def _as_distance(atom: Atom, margin: float) -> Atom:
+    """Return `a ovlp b` as `a dist b <= -margin`."""
+    expression = Dial("margin", 0.0, is_exact=False).turned(atom.expression, margin)
+    return replace(atom, relation="dist", parameters=("<=", -margin), expression=expression)
+
+
+def _with_summand(atom: Atom, margin: float) -> Atom:
+    """Return `x >= y` as `x >= y + margin`."""
+    if not isinstance(atom.expression, Sum) or not isinstance(atom.expression.second, Negative):
+        raise TypeError(f"{atom.text} is no comparison of computed numbers")
+    first, second = atom.expression.first, atom.expression.second.operand
+    if str(atom.parameters[0]).startswith(">"):
+        second = _plus(second, margin)
+    else:
+        first = _plus(first, -margin)
+    return replace(atom, expression=Sum(first, Negative(second)))
+
+
+def _plus(expression: Expression, number: float) -> Expression:
+    summand = Number(abs(number))
+    return Sum(expression, summand if number >= 0.0 else Negative(summand))
+
+
+def _with_enlarged(atom: Atom, place: int, radius: float) -> Atom:
+    """Return an atom with one of its terms enlarged."""
+    enlarged = Enlarged(atom.terms[place], radius)
+
+    def leaf(part: Number | Signal | Measurement) -> Expression:
+        if isinstance(part, SignedDistance | Protrusion | Projection):
+            return map_terms(part, lambda term: enlarged if term == enlarged.term else term)
+        return part
+
+    terms = (*atom.terms[:place], enlarged, *atom.terms[place + 1 :])
+    return replace(atom, expression=map_leaves(atom.expression, leaf), terms=terms)
+
+
 def _rounded(number: float, value: float) -> Iterator[float]:
     """Iterate over short numbers near one, and beyond it as seen from a value; the number itself is last."""
     exact, change = Decimal(number), Decimal(number) - Decimal(value)
     beyond = ROUND_CEILING if change > 0 else ROUND_FLOOR
-    last_digit = min(exact.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
+    # a rounding error has no digits of its own
+    leading = change if abs(number) <= RESIDUE * abs(value) else exact
+    last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):
         for rounding in (ROUND_HALF_EVEN, beyond):
-            digits = max(exact.adjusted() - place + 1, 1)
-            yield float(Context(prec=digits, rounding=rounding).create_decimal(exact))
+            rounded = exact.quantize(Decimal(1).scaleb(place), context=Context(_PRECISION, rounding))
+            yield float(rounded) + 0.0
     yield number

@@ -119,6 +119,7 @@ class Witness:
         units: those that the log declares, of signals by their names, of lengths by "".
         unit: the declared one of `lower` and `upper`, or "".
         while_present: of a formula that is unknown only because samples lack its objects; else None.
+        closest_threshold: the change of the number of `closest` that flips the verdict, or None.
     """
 
     name: str
@@ -139,6 +140,7 @@ class Witness:
     units: Mapping[str, str] = field(default_factory=dict, repr=False, hash=False)
     unit: str = ""
     while_present: WhilePresent | None = None
+    closest_threshold: Threshold | None = None
 
     @property
     def node(self) -> int:
@@ -198,10 +200,12 @@ def find_witness(
     while_present = None
     if verdict is Verdict.UNKNOWN and deciding is not None and deciding.unknown and not goes_on:
         while_present = _while_present(evidence, leaves, times_ns, node, found)
-    threshold = None
-    if deciding is not None and flips:
+
+    def flip(atom: DecidingAtom) -> Threshold | Obstacle | None:
         over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
-        threshold = threshold_of(evidence, *over, node, verdict, deciding, goes_on=open_ended)
+        return threshold_of(evidence, *over, node, verdict, atom, goes_on=open_ended)
+
+    threshold = flip(deciding) if deciding is not None and flips else None
     open_end = None
     if end is not End.OPEN and lower < upper and not goes_on:
         other_path = deciding_path(done, node, end.turned)
@@ -211,6 +215,7 @@ def find_witness(
     missed, closest, closest_path = _NOTHING_MISSED
     if verdict is Verdict.VIOLATED:
         missed, closest, closest_path = find_missed(evidence, done, found, evidence.scene)
+    response = flip(closest[0]) if closest is not None and flips else None
     return Witness(
         instance.name,
         instance.object,
@@ -230,6 +235,7 @@ def find_witness(
         evidence.units,
         declared_unit(evidence.bound(done.tree[node][0]), evidence.units),
         while_present,
+        response if isinstance(response, Threshold) else None,
     )
 
 
