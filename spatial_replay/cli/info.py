@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
+from spatial_replay.cli.evidence import evidence_lines
 from spatial_replay.cli.options import JsonCommand, LogPath, input_files, output_option, reading_options
 from spatial_replay.cli.output import MANY, WORST_FIRST
 from spatial_replay.cli.terminal import (
@@ -27,6 +28,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.verdict import counts_text
 from spatial_replay.text import counted, counted_from, escaped, json_fields, json_value, requirement_text
+from spatial_replay.trace.doubts import json_doubt
 
 if TYPE_CHECKING:
     from spatial_replay.logs.mcap.read import LogSummary
@@ -352,6 +354,10 @@ def _document(
             }
             for (topic, schema, encoding), messages in _topics(container).items()
         ]
+    if overview.facts:
+        document["evidence"] = [json_fields(facts) for facts in overview.facts]
+    if overview.doubts or overview.facts:
+        document["doubts"] = [json_doubt(doubt) for doubt in overview.doubts]
     if container is not None:
         document["verdicts"] = list(_verdicts(container, about))
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
@@ -407,6 +413,9 @@ def _lines(
         yield f"signals  {', '.join(overview.signals)}"
     if survey is not None:
         yield from _survey_lines(survey, mapped=bool(overview.samples))
+    if overview.facts:
+        yield "evidence"
+        yield from (f"  {line}" for line in evidence_lines(overview))
     if overview.container is not None:
         yield from _container_lines(overview.container, about, topics=survey is None)
 

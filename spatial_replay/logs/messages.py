@@ -23,6 +23,7 @@ from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, g
 from spatial_replay.logs.remote import LogFile, each_ahead
 from spatial_replay.text import Sentence, encodable
 from spatial_replay.trace.doubts import Doubt
+from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import LATEST_NS, Pauses, ReportsBack, Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -175,12 +176,14 @@ class Block:
         remarks: what is worth knowing although nothing was lost: how many observations are out of date, which
             transforms are missing.
         doubts: assumptions that the log contradicts.
+        facts: how each mapped topic was read, once all of it is.
     """
 
     trace: Trace
     messages: Messages = field(default_factory=Messages)
     remarks: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
+    facts: tuple[TopicFacts, ...] = ()
 
 
 def merge(streams: Sequence[Messages]) -> Messages:

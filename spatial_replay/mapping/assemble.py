@@ -29,12 +29,14 @@ from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
 from spatial_replay.mapping.assumptions import contradictions
 from spatial_replay.mapping.binding import Codes
+from spatial_replay.mapping.facts import facts_of
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.topic_reader import MISFITS, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart
 from spatial_replay.trace.doubts import Doubt
+from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
@@ -214,6 +216,11 @@ class _Assembling:
         """Return the assumptions that the log contradicts; none before `finish`."""
         doubts, self._doubts = tuple(self._doubts), []
         return doubts
+
+    @property
+    def facts(self) -> tuple[TopicFacts, ...]:
+        """How each mapped topic was read, once all of it is."""
+        return tuple(map(facts_of, self._tracker.evidence.values()))
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return counts of stale objects and missing transforms; none before `finish`, when they are

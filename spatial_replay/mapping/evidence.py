@@ -129,7 +129,8 @@ class Arrivals:
         self.log_varies = self.log_varies or bool((log_ns != self._first_log_ns).any())
         self.publish_varies = self.publish_varies or bool((publish_ns != self._first_publish_ns).any())
         since = np.append(self.last_ns, times_ns)
-        self.period_s.add(np.diff(since)[0 if self.messages else 1 :] / 1e9)
+        passed = slice(0 if self.messages else 1, None)
+        self.period_s.add(np.diff(since)[passed] / 1e9, times_ns[passed])
         self.log_period_s.add(np.diff(log_ns) / 1e9)
         if len(self.publishers) != 1 or (channels != self._publisher).any():
             self.publishers.update(np.unique(channels).tolist())

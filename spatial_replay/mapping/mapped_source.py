@@ -224,8 +224,9 @@ class _Blocks:
         self.remarks = []
         copied = self.copied.passed_on(messages, trace, last=last)
         doubts = self.assembler.take_doubts()
-        if len(trace) or len(copied) or faults or remarks or doubts:
-            yield Block(replace(trace, faults=faults), copied, remarks, doubts)
+        facts = self.assembler.facts if last else ()
+        if len(trace) or len(copied) or faults or remarks or doubts or facts:
+            yield Block(replace(trace, faults=faults), copied, remarks, doubts, facts)
 
 
 class _CopiedMessages:

@@ -24,7 +24,8 @@ from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence
-from spatial_replay.trace.doubts import Doubt
+from spatial_replay.trace.doubts import Doubt, distinct_doubts
+from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import Pauses, Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -310,6 +311,8 @@ class Overview:
         container: channels, metadata and attachments of an MCAP log; None for other formats.
         remarks: what is worth knowing although nothing was lost.
         axes: those of the source; its samples have ours.
+        doubts: assumptions that the log contradicts.
+        facts: how each mapped topic was read.
     """
 
     name: str
@@ -324,6 +327,8 @@ class Overview:
     container: LogSummary | None = None
     remarks: tuple[str, ...] = ()
     axes: Axes = OUR_AXES
+    doubts: tuple[Doubt, ...] = ()
+    facts: tuple[TopicFacts, ...] = ()
 
 
 def overview_of(source: Source, advance: Callable[[int], object] = lambda samples: None) -> Overview:
@@ -337,7 +342,8 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     """
     tally = _Tally()
     remarks: list[str] = []
-    doubts: list[Doubt] = []
+    doubts: dict[Doubt, None] = {}
+    facts: tuple[TopicFacts, ...] = ()
     container = summarise_mcap(source) if isinstance(source, McapSource) else None
     # an external log has no samples, and yet a container to list
     if container is None or container.has_objects:
@@ -347,7 +353,8 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
             for block in read.iter_blocks():
                 tally.add(block.trace)
                 remarks += block.remarks
-                doubts += block.doubts
+                doubts |= dict.fromkeys(block.doubts)
+                facts += block.facts
                 advance(len(block.trace))
         except UsageError as error:
             # a scenario without objects is not damaged; a mapping that does not fit is a mistake of the user
@@ -367,8 +374,10 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         # reading the samples and listing the container report the same damage
         faults=tuple(dict.fromkeys(faults)),
         container=container,
-        remarks=(*(doubt.remark(source.name) for doubt in dict.fromkeys(doubts)), *remarks),
+        remarks=(*(doubt.remark(source.name) for doubt in doubts), *remarks),
         axes=source.axes,
+        doubts=distinct_doubts(doubts, tally.start_ns or 0),
+        facts=facts,
     )
 
 

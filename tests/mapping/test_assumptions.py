@@ -92,3 +92,49 @@ def test_an_accepted_contradiction_is_a_remark_and_one_in_vain_is_said(
 
 def test_the_schema_of_mappings_names_every_assumption() -> None:
     assert schema_of("mapping", "mapping")["properties"]["accept"]["items"]["enum"] == list(NAMES)
+
+
+def test_info_shows_the_evidence_of_each_topic_with_what_contradicts_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, mapping = tmp_path / "run.mcap", tmp_path / "m.yaml"
+    kinds = (("/people", "People"), ("/bot", "Pose"))
+    channels = [(topic, "json", name, "jsonschema", b'{"type":"object"}') for topic, name in kinds]
+    messages = []
+    for number in range(20):
+        time_ns = (10 + number // 10) * SECOND + number * SECOND // 10
+        listed = [{"id": i, "kind": "person", "x": 0.1 * number, "y": float(i)} for i in range(3)]
+        messages.append(("/people", time_ns, json.dumps({"of": listed}).encode()))
+        pose = {"x": 0.2 * number, "y": 2.0, "yaw": 100.0}
+        messages.append(("/bot", time_ns, json.dumps(pose).encode()))
+    write_mcap(log, channels, messages)
+    mapping.write_text(
+        "unit: m\ntopics:\n"
+        "  /people: {objects: 'of[*]', name: 'p{id}', class: {field: kind}, position: [x, y],"
+        " shape: {disc: 0.3}}\n"
+        "  /bot: {position: [x, y], yaw: yaw, shape: {box: [1, 0.5]}, height: [0, 1.5]}\n"
+    )
+    command = ["info", str(log), "--mapping", str(mapping)]
+    assert run_program(command) == 0
+    evidence = capsys.readouterr().out.split("evidence\n")[1]
+    bot, people = evidence.split("  /people: ")
+    # the pause is named with its end
+    assert bot.startswith(
+        "  /bot: 20 messages from 0.000 s to 2.900 s, every 0.1 s, at most 1.1 s apart, until 2."
+    )
+    assert "    DOUBTFUL    radians: its angles reach 100 and are read as radians" in bot
+    for line in (
+        "names       `p{id}`, 3 names, up to 3 at once: p0, p1, p2",
+        "classes     person",
+        "sizes       longer side always 0.6 m; shorter always 0.6 m",
+        "places      x 0 to 1.9, y 0 to 2",
+        "speed       median 1 m/s, at most 1 m/s at ",
+    ):
+        assert line in people
+    assert "heights     0 to 1.5 m" in bot
+    assert run_program([*command, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [(doubt["assumption"], doubt["topic"]) for doubt in document["doubts"]] == [("radians", "/bot")]
+    facts = {topic["topic"]: topic for topic in document["evidence"]}
+    assert facts["/bot"]["period_s"]["greatest"] == pytest.approx(1.1)
+    assert (facts["/people"]["names"], facts["/people"]["most_at_once"]) == (["p0", "p1", "p2"], 3)

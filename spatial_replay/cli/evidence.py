@@ -1,0 +1,96 @@
+"""The evidence of how each topic of a log was read, as lines that a person checks at a glance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Final
+
+from spatial_replay.text import counted, counted_from, escaped, listed, number_text, time_text, with_unit
+
+if TYPE_CHECKING:
+    from spatial_replay.sources.overview import Overview
+    from spatial_replay.trace.facts import Distribution, TopicFacts
+
+_AXES: Final = ("x", "y", "z")
+_LONG_PAUSE: Final = 2.0
+"""Periods from which on the longest pause is named with its time."""
+
+
+def evidence_lines(overview: Overview) -> Iterator[str]:
+    """Yield a block of lines for each mapped topic of a log, those that contradict an assumption first."""
+    first_ns, unit = overview.start_ns or 0, overview.axes.units.get("", "")
+    contradictions = {facts.topic: list(_contradictions(overview, facts.topic)) for facts in overview.facts}
+    for facts in sorted(overview.facts, key=lambda facts: not contradictions[facts.topic]):
+        yield escaped(f"{facts.topic}: {_arrivals(facts, first_ns)}")
+        for label, text in (*contradictions[facts.topic], *_rows(facts, unit, first_ns)):
+            if text:
+                yield escaped(f"  {label:<12}{text}")
+
+
+def _contradictions(overview: Overview, topic: str) -> Iterator[tuple[str, str]]:
+    """Yield the doubts about a topic, and the remarks on it, each with a mark."""
+    for doubt in overview.doubts:
+        if doubt.topic == topic:
+            mark = "accepted" if doubt.is_accepted else "DOUBTFUL"
+            yield mark, f"{doubt.assumption}: {doubt.text.removeprefix(f'{topic}: ')}"
+    beginning = f"{overview.name}: {topic}: "
+    for remark in counted_from(overview.remarks, overview.start_ns or 0):
+        if remark.startswith(beginning):
+            yield "REMARK", remark.removeprefix(beginning)
+
+
+def _arrivals(facts: TopicFacts, first_ns: int) -> str:
+    messages, period = counted(facts.messages, "message"), facts.period_s
+    if facts.first_ns is None or facts.last_ns is None or period is None:
+        return messages
+    span = f"from {time_text(facts.first_ns, first_ns)} to {time_text(facts.last_ns, first_ns)}"
+    is_pause = period.greatest > _LONG_PAUSE * period.median and period.greatest_ns is not None
+    until = f", until {time_text(period.greatest_ns or 0, first_ns)}" if is_pause else ""
+    most = f"at most {number_text(period.greatest)} s apart{until}"
+    return f"{messages} {span}, every {number_text(period.median)} s, {most}"
+
+
+def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, str]]:
+    """Yield a label and a text for each kind of facts; the text is "" where there are none."""
+    if facts.lateness_s is not None:
+        yield "lateness", f"{_range(facts.lateness_s, 's')} after the stamps"
+    yield "publishers", counted(facts.publishers, "channel") if facts.publishers > 1 else ""
+    yield "frames", listed([frame or "''" for frame in facts.frames])
+    yield "signals", listed(facts.signals)
+    if not facts.objects:
+        return
+    count = counted(len(facts.names), "name")
+    pattern = f"`{facts.name}`, " if facts.name else ""
+    yield "names", f"{pattern}{count}, up to {facts.most_at_once} at once: {listed(facts.names)}"
+    changes = f"; {counted(facts.class_changes, 'change')} of class" if facts.class_changes else ""
+    yield "classes", listed([name or "none" for name in facts.classes]) + changes
+    if facts.size is not None and facts.shorter_side is not None:
+        yield "sizes", f"longer side {_range(facts.size, unit)}; shorter {_range(facts.shorter_side, unit)}"
+    spans = zip(_AXES, facts.low, facts.high, strict=False)
+    yield (
+        "places",
+        ", ".join(f"{axis} {number_text(low)} to {number_text(high)}" for axis, low, high in spans),
+    )
+    if facts.speed is not None:
+        yield "speed", _motion(facts.speed, f"{unit}/s" if unit else "a second", first_ns)
+    if facts.turn_rate is not None:
+        least, median, greatest = map(math.degrees, facts.turn_rate[:3])
+        turn_rate = facts.turn_rate._replace(least=least, median=median, greatest=greatest)
+        yield "turning", _motion(turn_rate, "deg/s", first_ns)
+    if facts.bottom is not None and facts.top is not None:
+        yield "heights", f"{number_text(facts.bottom.least)} to {with_unit(facts.top.greatest, unit)}"
+    if facts.uncertainty is not None:
+        yield "uncertainty", _range(facts.uncertainty, unit)
+
+
+def _range(numbers: Distribution, unit: str) -> str:
+    least, greatest = number_text(numbers.least), with_unit(numbers.greatest, unit)
+    if least == number_text(numbers.greatest):
+        return f"always {greatest}"
+    return f"{least} to {greatest} (median {number_text(numbers.median)})"
+
+
+def _motion(numbers: Distribution, unit: str, first_ns: int) -> str:
+    when = "" if numbers.greatest_ns is None else f" at {time_text(numbers.greatest_ns, first_ns)}"
+    return f"median {with_unit(numbers.median, unit)}, at most {with_unit(numbers.greatest, unit)}{when}"
