@@ -20,7 +20,7 @@ from spatial_replay.mapping.binding import BY_PLACE
 from spatial_replay.mapping.evidence import TopicEvidence
 from spatial_replay.mapping.mapping_file import UNITS_NS, LogMapping
 from spatial_replay.text import Instant, Sentence, counted, number_text
-from spatial_replay.trace.doubts import Doubt
+from spatial_replay.trace.doubts import MANY_TURNS, Doubt
 
 Log: TypeAlias = Mapping[str, TopicEvidence]
 Check: TypeAlias = Callable[[TopicEvidence, Log], str | None]
@@ -218,18 +218,15 @@ _LENGTH_ERROR: Final = 0.05
 def _radians(evidence: TopicEvidence, log: Log) -> str | None:
     layout, turn = evidence.planned.layout, evidence.turn
     most = max(turn.greatest, -turn.least)
-    if layout is None or abs(layout.angle_scale) != 1.0 or not most > _MANY_TURNS:
+    if layout is None or abs(layout.angle_scale) != 1.0 or not most > MANY_TURNS:
         return None
     return f"its angles reach {number_text(most)} and are read as radians"
-
-
-_MANY_TURNS: Final = 8 * pi
 
 
 def _some_turns(evidence: TopicEvidence, log: Log) -> str | None:
     layout, turn = evidence.planned.layout, evidence.turn
     most = max(turn.greatest, -turn.least)
-    if layout is None or abs(layout.angle_scale) != 1.0 or not 2 * pi + _ROUNDING < most <= _MANY_TURNS:
+    if layout is None or abs(layout.angle_scale) != 1.0 or not 2 * pi + _ROUNDING < most <= MANY_TURNS:
         return None
     return f"its angles reach {number_text(most)} and are read as radians"
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from math import pi
+from typing import Any, Final
 
 from spatial_replay.text import Sentence, counted_from
+
+MANY_TURNS: Final = 8 * pi
+"""Angles in radians beyond four turns are taken for degrees."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -273,6 +273,13 @@ def test_a_csv_line_that_is_not_an_object_costs_its_sample(csv, bad, reported):
     assert reported in fault
 
 
+@pytest.mark.parametrize(("yaw", "doubtful"), [("90", {"car"}), ("-12.5", set())])
+def test_a_csv_in_degrees_is_doubtful(csv, yaw, doubtful):
+    path = csv(HEADER, f"0,car,vehicle,1,2,{yaw},4,2", f"9,car,vehicle,1,3,{yaw},4,2")
+    doubts = [doubt for block in open_source(path).iter_blocks() for doubt in block.doubts]
+    assert {name for doubt in doubts for name in doubt.objects} == doubtful
+
+
 def test_a_csv_number_may_be_unknown(csv):
     assert read_trace(csv(HEADER, "0,car,vehicle,,2,0,4,2")).unreadable_count == 1
     assert read_trace(csv(HEADER, "0,car,vehicle,1,2,nan,4,2")).unreadable_count == 1
