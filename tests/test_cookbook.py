@@ -80,7 +80,7 @@ CASES = {
         run({"robot": at([(0, 0)] * 2), "ann": at([(2, 0), (0.4, 0)], "person")}),
     ),
     "held": (run({"cube": at([OUT, IN, IN, IN, OUT])}), run({"cube": at([OUT, IN, IN, OUT, IN])})),
-    "stays": (run({"cube": at([IN, OUT, IN, IN])}), run({"cube": at([IN, IN, IN, OUT])})),
+    "stays": (run({"cube": at([OUT, IN, IN, IN])}), run({"cube": at([IN, IN, OUT, IN, IN])})),
     "gentle": (
         run(signals={"force": [5, 20, 20, 5, 5, 20]}, period_ns=SECOND // 5),
         run(signals={"force": [5, 20, 20, 20, 20, 5]}, period_ns=SECOND // 5),

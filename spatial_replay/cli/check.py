@@ -182,6 +182,7 @@ def check(
     """
     # imported here so that --help stays fast
     from spatial_replay.sanity import doctor as examine
+    from spatial_replay.spec.checks import last_sample_warnings
 
     if dfa is None:
         options = {"--result": of is not None, "--hz": hz is not None}
@@ -202,7 +203,12 @@ def check(
         _check_automaton_options(parsed, of, dfa, inputs)
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
     findings = examine(parsed, examples=False).findings
-    diagnostics = [*parsed.warnings, *compared.diagnostics, *(finding.diagnostic for finding in findings)]
+    diagnostics = [
+        *parsed.warnings,
+        *last_sample_warnings(parsed),
+        *compared.diagnostics,
+        *(finding.diagnostic for finding in findings),
+    ]
     show_diagnostics(diagnostics)
     show_findings(form, path, diagnostics)
     if any(diagnostic.severity == "error" for diagnostic in diagnostics):

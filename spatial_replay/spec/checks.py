@@ -28,6 +28,7 @@ from spatial_replay.spec.formula import (
     Term,
     TrackedName,
     operands_of,
+    operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.resolve import Namespace, kind_of
@@ -149,6 +150,34 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
                     yield source.diagnostic("warning", node.span, message, hint)
                 continue
             stack.extend(operands_of(node))
+
+
+def last_sample_warnings(specification: Specification) -> Iterator[Diagnostic]:
+    """Yield a warning for each `F G p` and `G F p`: over a finite log both ask for its last sample alone."""
+    source = SourceText.of(specification.source, specification.filename)
+    warned: set[Span] = set()
+    for spec in specification.results:
+        for outer in iter_formulas(spec.formula):
+            inner = operands_of(outer)[0] if _is_unbounded(outer) else outer
+            pair = f"{operator_of(outer)} {operator_of(inner)}"
+            if pair not in ("F G", "G F") or not _is_unbounded(inner) or outer.span in warned:
+                continue
+            warned.add(outer.span)
+            message = f"`{pair} p` asks for the last sample of a log alone"
+            yield source.diagnostic("warning", outer.span, message, _LASTING)
+
+
+_LASTING = (
+    "write F ((G[0s, 2s] p) and (F[2s, inf] true)) for two seconds on end, or"
+    " F ((G p) and (F[2s, inf] true)) for at least the last two"
+)
+
+
+def _is_unbounded(formula: Formula) -> bool:
+    """Return whether a formula is an operator over all samples from the present one on."""
+    if not isinstance(formula, Temporal) or formula.operator not in ("F", "G"):
+        return False
+    return formula.bound is None or (formula.bound.lower, formula.bound.upper) == (0, None)
 
 
 def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:

@@ -364,3 +364,24 @@ def test_a_formula_stands_in_place_of_a_file_and_a_mapping_does_not(
     mapping.write_text("topics: {}\n")
     assert run(["replay", str(log), "--spec", str(mapping)]) == 2
     assert "own.yaml is YAML, not a specification; give a mapping by --mapping" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("formula", "pair"),
+    [
+        ("F G (load >= 1)", "F G"),
+        ("G[0, inf] (F load >= 1)", "G F"),
+        ("F ((G[0s, 2s] load >= 1) and (F[2s, inf] true))", ""),
+        ("F ((G load >= 1) and (F[2s, inf] true))", ""),
+        ("F[0s, 9s] G load >= 1", ""),
+        ("G F[0s, 9s] load >= 1", ""),
+    ],
+)
+def test_formulas_about_the_last_sample_alone_are_warned_of(
+    formula: str, pair: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["check", formula]) == 0
+    said = capsys.readouterr().err
+    assert ("asks for the last sample of a log alone" in said) == bool(pair)
+    if pair:
+        assert f"`{pair} p` asks" in said and "write F ((G[0s, 2s] p) and (F[2s, inf] true))" in said
