@@ -11,12 +11,15 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import isfinite
+from itertools import compress
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from spatial_replay.bags.decoders import Topic
+from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Channel, has_our_type
 from spatial_replay.mapping.binding import BY_PLACE, Codes, Namer
 from spatial_replay.mapping.field_paths import (
@@ -31,7 +34,7 @@ from spatial_replay.mapping.field_paths import (
     name_from_topic,
     walk,
 )
-from spatial_replay.mapping.mapping_file import NO_TOPIC, TopicMapping
+from spatial_replay.mapping.mapping_file import NO_TOPIC, TopicMapping, parse_mapping
 from spatial_replay.mapping.message_types import (
     BUILT_IN,
     GEODETIC,
@@ -41,7 +44,7 @@ from spatial_replay.mapping.message_types import (
     short_type,
 )
 from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in, takes_turns
-from spatial_replay.mapping.topic_reader import doubts_of
+from spatial_replay.mapping.topic_reader import ReadingPlan, TopicReader, doubts_of
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
 from spatial_replay.trace.trace import FOREVER
@@ -125,7 +128,8 @@ def suggest_topics(
     Args:
         examples: some decoded messages of each topic, by its name.
     """
-    return tuple(_suggestion(topic, examples.get(topic.name, ())) for topic in topics)
+    pairs = [(topic, examples.get(topic.name, ())) for topic in topics]
+    return tuple(_with_trial(_suggestion(topic, of_topic), of_topic) for topic, of_topic in pairs)
 
 
 def suggest_mapping(
@@ -136,8 +140,7 @@ def suggest_mapping(
 ) -> str:
     """Return the text of a mapping file, with comments.
 
-    It is valid if some topic holds objects or signals, except where objects are in several frames that no
-    transforms join: then a reader has to choose one.
+    It is valid if some topic holds objects or signals.
 
     Args:
         log: the log's name.
@@ -145,20 +148,20 @@ def suggest_mapping(
         first_ns: log time of the first message of each topic, by its name.
     """
     suggestions = suggest_topics(topics, examples)
-    usable = [suggestion for suggestion in suggestions if len(_text(suggestion.topic.name)) <= _LONGEST_KEY]
-    mapped = [
+    usable = [
         suggestion
-        for suggestion in usable
-        if suggestion.entry and not suggestion.is_transforms and not suggestion.aside
+        for suggestion in suggestions
+        if len(_text(suggestion.topic.name)) <= _LONGEST_KEY and not suggestion.aside
     ]
-    transforms = [suggestion for suggestion in suggestions if suggestion.is_transforms]
+    mapped = [suggestion for suggestion in usable if suggestion.entry and not suggestion.is_transforms]
     axes: _Axes = next(
         (axes for axes in _AXES if any(suggestion.axes == axes for suggestion in mapped)), "plane"
     )
     mapped = [suggestion for suggestion in mapped if suggestion.axes == axes]
-    active = _with_distinct_names(
-        mapped or [suggestion for suggestion in usable if suggestion.entry and suggestion.is_transforms]
-    )
+    mapped = mapped or [suggestion for suggestion in usable if suggestion.entry and suggestion.is_transforms]
+    transforms = [suggestion.topic.name for suggestion in suggestions if suggestion.is_transforms]
+    frame_lines, apart = _choose_frame(mapped, [m for name in transforms for m in examples.get(name, ())])
+    active = _with_distinct_names([suggestion for suggestion in mapped if suggestion.topic.name not in apart])
     if any(suggestion.frames for suggestion in active):
         active = [
             _with_frame_remark(suggestion) if examples.get(suggestion.topic.name) else suggestion
@@ -167,9 +170,14 @@ def suggest_mapping(
     signals = [] if active else [suggestion for suggestion in usable if suggestion.signals]
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
     if not active:
-        lines.append(f"# Nothing looks like an object{': these are signals' if signals else ''}.")
+        refused = any(suggestion.aside for suggestion in suggestions)
+        lines.append(
+            "# Nothing can be read as an object; the reasons are below."
+            if refused
+            else f"# Nothing looks like an object{': these are signals' if signals else ''}."
+        )
     lines += [
-        *_frame_lines(active, transforms, examples),
+        *frame_lines,
         *_axes_lines(axes if active else "plane"),
         *_origin_lines(active, examples),
         *(f"# {_comment(doubt)}" for doubt in doubts_of(topics)),
@@ -182,6 +190,7 @@ def suggest_mapping(
     entries = {suggestion.topic.name: "\n".join(_entry_lines(suggestion)) for suggestion in active or signals}
     entries_that_fit = _first_that_fit(list(entries.items()), _LARGEST_SUGGESTION - len("\n".join(lines)))
     rest = [suggestion for suggestion in suggestions if suggestion.topic.name not in dict(entries_that_fit)]
+    rest = [replace(rest_of, aside=apart.get(rest_of.topic.name, rest_of.aside)) for rest_of in rest]
     unused = {suggestion.topic.name: _unused_line(suggestion, axes) for suggestion in rest}
     left = _LARGEST_SUGGESTION - len("\n".join([*lines, *dict(entries_that_fit).values()]))
     unused_that_fit = _first_that_fit(list(unused.items()), left)
@@ -230,27 +239,76 @@ def _with_own_name(suggestion: TopicSuggestion) -> TopicSuggestion:
     return replace(suggestion, fields=dict(ordered))
 
 
+def _with_trial(suggestion: TopicSuggestion, examples: Sequence[object]) -> TopicSuggestion:
+    """Return a suggestion after reading messages by it; it is aside where that fails."""
+    topic = suggestion.topic
+    entry = suggestion.entry or suggestion.signals
+    if not entry or not examples or suggestion.is_transforms:
+        return suggestion
+    layout = suggestion.layout
+    is_geodetic = layout is not None and GEODETIC in layout.position
+    if is_geodetic and _first_fix(suggestion, examples) is None:
+        return replace(suggestion, aside="no message looked at has a fix in degrees, to count metres from")
+    reasons: list[str] = []
+    origin = "origin: [0, 0]\n" if is_geodetic else ""
+    try:
+        mapping = parse_mapping(f"{origin}topics:\n  {_text(topic.name)}: {entry}")
+        (planned,) = ReadingPlan.of(mapping, [topic]).planned
+        reader = TopicReader(
+            planned,
+            mapping,
+            lambda topic: lambda message: message,
+            Codes(),
+            Codes(),
+            decodes_early=False,
+            report=lambda topic, time_ns, reason: reasons.append(reason),
+        )
+        good = reader.read(np.arange(len(examples)), examples).good
+        reader.finish()
+    except UsageError as error:
+        return replace(suggestion, aside=_comment(str(error).partition(f"{topic.name}: ")[2] or str(error)))
+    if not good.any():
+        return replace(suggestion, aside=_comment(reasons[0]))
+    if not reasons:
+        return suggestion
+    if layout is not None:
+        suggestion = replace(
+            suggestion, frames=frozenset(_iter_frames(layout, list(compress(examples, good))))
+        )
+    remark = f"{len(reasons)} of {len(examples)} messages looked at cannot be read: {_comment(reasons[0])}"
+    return replace(suggestion, remarks=(*suggestion.remarks, remark))
+
+
 def _origin_lines(
     active: Sequence[TopicSuggestion], examples: Mapping[str, Sequence[object]]
 ) -> Iterator[str]:
     """Yield the line about where local metres are counted from: the first fix."""
     for suggestion in active:
-        if (layout := suggestion.layout) is None or GEODETIC not in layout.position:
-            continue
-        for _, fix in _iter_objects(layout, examples.get(suggestion.topic.name, ())):
-            place = _place_of_fix(fix)
-            if place is not None:
-                yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
-                yield f"origin: [{place[0]!r}, {place[1]!r}]"
-                return
+        place = _first_fix(suggestion, examples.get(suggestion.topic.name, ()))
+        if place is not None:
+            yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
+            yield f"origin: [{place[0]!r}, {place[1]!r}]"
+            return
+
+
+def _first_fix(suggestion: TopicSuggestion, examples: Sequence[object]) -> tuple[float, float] | None:
+    """Return latitude and longitude of the first fix in degrees; None without one."""
+    layout = suggestion.layout
+    if layout is None or GEODETIC not in layout.position:
+        return None
+    places = (_place_of_fix(fix) for _, fix in _iter_objects(layout, examples))
+    return next((place for place in places if place is not None), None)
 
 
 def _place_of_fix(fix: object) -> tuple[float, float] | None:
     """Return latitude and longitude; None without a fix, also where zeros stand for its lack."""
-    latitude, longitude = (float(walk(FieldPath.of(name), fix)) for name in GEODETIC)  # type: ignore[arg-type]
     status = FieldPath.of("status.status")
-    is_fix = not leads_somewhere(status, fix) or float(walk(status, fix)) >= 0  # type: ignore[arg-type]
-    is_place = isfinite(latitude) and isfinite(longitude) and (latitude, longitude) != (0.0, 0.0)
+    try:
+        latitude, longitude = (float(walk(FieldPath.of(name), fix)) for name in GEODETIC)  # type: ignore[arg-type]
+        is_fix = not leads_somewhere(status, fix) or float(walk(status, fix)) >= 0  # type: ignore[arg-type]
+    except (FieldError, TypeError, ValueError):
+        return None
+    is_place = abs(latitude) <= 90 and abs(longitude) <= 360 and (latitude, longitude) != (0.0, 0.0)
     return (latitude, longitude) if is_fix and is_place else None
 
 
@@ -463,25 +521,44 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
     return by_id + sizeless + indexed + others
 
 
-def _frame_lines(
-    active: Sequence[TopicSuggestion],
-    transforms: Sequence[TopicSuggestion],
-    examples: Mapping[str, Sequence[object]],
-) -> Iterator[str]:
-    """Yield the lines about the fixed frame, which coordinates in more than one frame need."""
-    frames = sorted(frozenset().union(*(suggestion.frames for suggestion in active)))
-    messages = (message for suggestion in transforms for message in examples.get(suggestion.topic.name, ()))
-    edges = sorted({edge for message in messages for edge in _edges(message)})
+def _choose_frame(
+    mapped: Sequence[TopicSuggestion], transforms: Sequence[object]
+) -> tuple[list[str], dict[str, str]]:
+    """Choose the frame of the scene, in which most topics can be placed.
+
+    Args:
+        transforms: messages with transforms.
+
+    Returns:
+        The lines about it, and for each topic in other frames only, why it is apart.
+    """
+    frames = sorted(frozenset().union(*(suggestion.frames for suggestion in mapped)))
+    edges = sorted({edge for message in transforms for edge in _edges(message)})
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
-    if len(frames) > 1:
-        yield f"# coordinates are in the frames {_comment(', '.join(frames))}"
-        fixed = next((root for root in roots if _below(root, edges).issuperset(frames)), None)
-        if fixed is None:
-            yield "# no transforms join these: choose one; leave out topics in others or give them a `frame`"
-        yield f"fixed_frame: {_text(fixed) if fixed else ''}".rstrip()
-    elif edges:
-        yield "# without a fixed frame, coordinates are taken as they are"
-        yield f"# fixed_frame: {_text((roots or frames or ['map'])[0])}"
+    if len(frames) < 2:
+        fixed = _text((roots or frames or ["map"])[0])
+        lines = ["# without a fixed frame, coordinates are taken as they are", f"# fixed_frame: {fixed}"]
+        return (lines if edges else []), {}
+    joined = {root: _below(root, edges).intersection(frames) for root in (*roots, *frames)}
+
+    def rank(root: str) -> tuple[int, int]:
+        topics = [s.topic for s in mapped if joined[root] & s.frames]
+        return len(topics), sum(topic.count or 0 for topic in topics)
+
+    fixed = max(joined, key=rank)
+    others = sorted(set(frames) - joined[fixed])
+    apart = {
+        suggestion.topic.name: f"in {_comment(', '.join(sorted(suggestion.frames)))}, apart from {fixed}"
+        for suggestion in mapped
+        if suggestion.frames and not joined[fixed] & suggestion.frames
+    }
+    lines = [f"# coordinates are in the frames {_comment(', '.join(frames))}"]
+    if others:
+        lines.append(
+            f"# no transforms join {_comment(', '.join(others))} with {fixed}: what is in these is unknown or"
+            " left out; `frame` of a topic overrides its frame"
+        )
+    return [*lines, f"fixed_frame: {_text(fixed)}"], apart
 
 
 def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
