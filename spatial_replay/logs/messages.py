@@ -21,10 +21,11 @@ from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, concatenated, equal_places, select
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.logs.remote import LogFile, each_ahead
-from spatial_replay.text import Sentence, encodable, number_text
-from spatial_replay.trace.doubts import MANY_TURNS, Doubt
+from spatial_replay.text import Sentence, encodable
+from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import LATEST_NS, Pauses, ReportsBack, Sample, Trace, within
+from spatial_replay.trace.track_evidence import TrackEvidence
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 if TYPE_CHECKING:
@@ -657,21 +658,16 @@ class TrackSource(FileSource):
         faults = FaultList()
         any_sample = False
         first_fault: str | None = None
-        widest_turn, turned = 0.0, set[str]()
+        evidence = TrackEvidence()
         for trace in self.iter_traces(self.path, faults, concave=self.reading.concave):
             any_sample = any_sample or len(trace) > 0
             lost = faults.take()
             first_fault = first_fault or next(iter(lost), None)
             window = self.axes.convert_trace(within(trace, start_ns, end_ns))
-            turns = np.abs(trace.yaw)
-            if (turns > MANY_TURNS).any():
-                widest_turn = max(widest_turn, float(np.fmax.reduce(turns)))
-                turned.update(trace.names)
+            evidence.add(trace)
             yield Block(replace(window, faults=lost))
-        if turned:
-            reach = f"its angles reach {number_text(widest_turn)} and are read as radians"
-            text = Sentence(f"{reach}; write them in radians")
-            yield Block(Trace.empty(), doubts=(Doubt("radians", "", text, frozenset(turned)),))
+        if doubts := tuple(evidence.doubts()):
+            yield Block(Trace.empty(), doubts=doubts)
         rest = faults.take(last=True)
         if not any_sample:
             reason = first_fault or next(iter(rest), f"{self.name} is empty")

@@ -20,7 +20,7 @@ from spatial_replay.mapping.binding import BY_PLACE
 from spatial_replay.mapping.evidence import TopicEvidence
 from spatial_replay.mapping.mapping_file import UNITS_NS, LogMapping
 from spatial_replay.text import Instant, Sentence, counted, number_text
-from spatial_replay.trace.doubts import MANY_TURNS, Doubt
+from spatial_replay.trace.doubts import MANY_TURNS, SHORTEST_PERIOD_NS, Doubt
 
 Log: TypeAlias = Mapping[str, TopicEvidence]
 Check: TypeAlias = Callable[[TopicEvidence, Log], str | None]
@@ -119,7 +119,7 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     for unit, ns in list(UNITS_NS.items())[1:]:
         year = _year(arrivals.first_ns * ns)
-        if year is not None and period_ns < _SHORTEST_PERIOD_NS < period_ns * ns:
+        if year is not None and period_ns < SHORTEST_PERIOD_NS < period_ns * ns:
             return (
                 f"its times look like {unit}: {arrivals.first_ns} is {year} in {unit} and January 1970 in ns;"
                 f" messages would come every {period_ns:.3g} ns"
@@ -127,7 +127,6 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
     return None
 
 
-_SHORTEST_PERIOD_NS: Final = 200_000
 _FIRST_YEAR, _LAST_YEAR = 2005, 2100
 
 
@@ -140,11 +139,12 @@ def _year(time_ns: int) -> int | None:
 
 
 def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
-    arrivals = evidence.arrivals
-    is_constant = evidence.planned.clock == "log" and not arrivals.log_varies
-    if not is_constant or arrivals.messages < _FEW or not arrivals.publish_varies:
+    arrivals, clock = evidence.arrivals, evidence.planned.clock
+    varies = {"log": arrivals.log_varies, "publish": arrivals.publish_varies}
+    others = [name for name, is_varying in varies.items() if is_varying and name != clock]
+    if varies.get(clock, True) or arrivals.messages < _FEW or not others:
         return None
-    return f"its {arrivals.messages:,} messages have one log time, and different publish times"
+    return f"its {arrivals.messages:,} messages have one {clock} time, and different {others[0]} times"
 
 
 def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
@@ -309,16 +309,21 @@ def _precision(evidence: TopicEvidence, log: Log) -> str | None:
     if not (evidence.is_single and evidence.has_fraction and np.isfinite(most)):
         return None
     step = float(np.spacing(np.float32(most)))
+    is_geodetic = evidence.planned.is_geodetic
+    if is_geodetic:
+        step *= _METRES_A_DEGREE
     sizes = [other.size.median for other in log.values() if other.size.median > 0]
     if step < _COARSE * min(sizes, default=np.inf):
         return None
+    place = f"{most:.0f} degrees" if is_geodetic else f"{most:.0f}"
     return (
-        f"its coordinates are float32, whose step at {most:.0f} is {number_text(step)}; the smallest objects"
-        f" are {number_text(min(sizes))} long"
+        f"its coordinates are float32, whose step at {place} is {number_text(step)}{' m' * is_geodetic}; the"
+        f" smallest objects are {number_text(min(sizes))} long"
     )
 
 
 _COARSE: Final = 0.05
+_METRES_A_DEGREE: Final = 111_320.0
 
 
 def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
@@ -500,10 +505,10 @@ ASSUMPTIONS: Final = (
     ),
     Assumption(
         "log_times_set",
-        "Messages have log times.",
-        "log times and publish times; all log times are equal, and publish times differ",
+        "Messages have times on the clock that counts.",
+        "log times and publish times; all times of this clock are equal, and the others differ",
         _times_never_set,
-        "`clock: publish` takes publish times",
+        "`clock: publish` takes publish times, `clock: log` those of recording",
         is_about_signals=True,
     ),
     Assumption(

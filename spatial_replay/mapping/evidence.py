@@ -466,8 +466,9 @@ class TopicEvidence:
             low, high = np.fmin.reduce(places, axis=0), np.fmax.reduce(places, axis=0)
         axes = slice(places.shape[1])
         self.low[axes], self.high[axes] = np.fmin(self.low[axes], low), np.fmax(self.high[axes], high)
-        # single precision matters far from the origin only
-        if self.is_single and np.fmax.reduce(np.abs([*low, *high])) > _FAR:
+        # single precision matters for degrees, and far from the origin
+        is_far = self.planned.is_geodetic or np.fmax.reduce(np.abs([*low, *high])) > _FAR
+        if self.is_single and is_far:
             plane = places[:, :2]
             is_finite = np.isfinite(plane)
             self.is_single = bool((plane.astype(np.float32) == plane)[is_finite].all())

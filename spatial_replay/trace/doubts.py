@@ -13,6 +13,9 @@ from spatial_replay.text import Sentence, counted_from
 MANY_TURNS: Final = 8 * pi
 """Angles in radians beyond four turns are taken for degrees."""
 
+SHORTEST_PERIOD_NS: Final = 200_000
+"""No robot is recorded at a higher rate: shorter intervals are times in another unit."""
+
 
 @dataclass(frozen=True, slots=True)
 class Doubt:

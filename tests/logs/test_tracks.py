@@ -280,6 +280,13 @@ def test_a_csv_in_degrees_is_doubtful(csv, yaw, doubtful):
     assert {name for doubt in doubts for name in doubt.objects} == doubtful
 
 
+@pytest.mark.parametrize(("step", "doubtful"), [(100_000, ["log_time_unit"]), (1_000_000, [])])
+def test_a_csv_with_times_in_microseconds_is_doubtful(csv, step, doubtful):
+    path = csv(HEADER, *(f"{tick * step},car,vehicle,{tick},2,0,4,2" for tick in range(20)))
+    blocks = open_source(path).iter_blocks()
+    assert [doubt.assumption for block in blocks for doubt in block.doubts] == doubtful
+
+
 def test_a_csv_number_may_be_unknown(csv):
     assert read_trace(csv(HEADER, "0,car,vehicle,,2,0,4,2")).unreadable_count == 1
     assert read_trace(csv(HEADER, "0,car,vehicle,1,2,nan,4,2")).unreadable_count == 1
