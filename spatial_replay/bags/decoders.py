@@ -96,6 +96,7 @@ _FIELD = re.compile(
     r"(?P<brackets>\[(?P<limit>(?:<=)?[0-9]{1,10})?\])?[ \t]+(?P<name>[A-Za-z][A-Za-z0-9_]*)"
     r"[ \t]*(?P<rest>.*)"
 )
+_ANNOTATIONS = re.compile(r"^\s*(?:@[A-Za-z_]\w*(?:\s*\([^()]*\))?\s*)+", re.ASCII)
 _SEPARATOR = re.compile(r"^={20,}[ \t]*\r?$", re.MULTILINE)
 _HEAD = re.compile(r"\s*(?:MSG|IDL): *(?P<name>\S+)[ \t]*\r?(?:\n|\Z)")
 _BUILT_IN = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
@@ -173,8 +174,9 @@ def checked_type_name(name: str) -> str:
 
 def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
     for number, line in enumerate(body.splitlines(), 1):
-        bare = line.partition("#")[0]
-        if not bare.strip() or bare.lstrip().startswith("@"):
+        # an annotation may stand on the line of its field; no encoding of ROS depends on it so far
+        bare = _ANNOTATIONS.sub("", line.partition("#")[0])
+        if not bare.strip():
             continue
         found = _FIELD.fullmatch(bare)
         if found is None:

@@ -55,6 +55,22 @@ def test_a_definition_is_read_with_the_types_it_uses() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    "note", ["@optional ", "@optional\n", "@key @optional ", '@unit("m") ', "@key # why\n"]
+)
+def test_an_annotation_leaves_its_field(note: str) -> None:
+    plain = definitions_from_msg("float64 x\nuint8 quality\nuint8 mode", "a/B")
+    assert definitions_from_msg(f"float64 x\n{note}uint8 quality\n@key uint8 mode", "a/B") == plain
+
+
+@pytest.mark.parametrize("note", ["@key ", "@optional ", '@unit(value="m") '])
+def test_an_annotation_in_idl_leaves_its_field(note: str) -> None:
+    payload = b"\x00\x01\x00\x00" + bytes(8) + b"\x07\x00\x00\x00"
+    text = f"module a {{ module msg {{ struct B {{ double x; {note}long id; }}; }}; }};"
+    decoded: Any = ros_decoder("a/msg/B", "cdr", Schema("a/msg/B", "ros2idl", text.encode()))(payload)
+    assert decoded.id == 7
+
+
 def test_lines_may_end_as_on_windows() -> None:
     assert definitions_from_msg(TAGS.replace("\n", "\r\n"), "own_msgs/Tags") == definitions_from_msg(
         TAGS, "own_msgs/Tags"
