@@ -62,12 +62,17 @@ class ShapeMapping:
 
 @dataclass(frozen=True, slots=True)
 class ClassMapping:
-    """Maps a field to a class: `table[str(value)]`, or `other` for values that are not in the table."""
+    """Maps a field to a class: `table[str(value)]`, or `other` for values that are not in the table.
+
+    Attributes:
+        changes: whether an object that changes its class keeps the first, or becomes another object.
+    """
 
     field: str
     table: Table[str, str | None] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
     other: str | None = None
     has_other: bool = False
+    changes: Literal["remark", "split", "first"] = "remark"
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,7 +425,11 @@ def _class(value: Any) -> str | ClassMapping | None:
     if not isinstance(value, dict):
         return None if value is None else str(value)
     return ClassMapping(
-        value["field"], MappingProxyType(dict(value.get("names", {}))), value.get("else"), "else" in value
+        value["field"],
+        MappingProxyType(dict(value.get("names", {}))),
+        value.get("else"),
+        "else" in value,
+        value.get("changes", "remark"),
     )
 
 

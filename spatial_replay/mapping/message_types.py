@@ -75,6 +75,7 @@ class MessageLayout:
     class_table: Table[str, str | None] = field(default_factory=lambda: _NO_CLASSES, hash=False)
     class_other: str | None = None
     class_has_other: bool = False
+    class_changes: Literal["remark", "split", "first"] = "remark"
     covariance: str = ""
     frame: Alternatives = ("$.header.frame_id",)
     frame_name: str | None = None
@@ -252,6 +253,8 @@ def name_pattern(layout: MessageLayout, mapping: TopicMapping) -> str:
     literals = [re.escape(part) for part in parts[::2]]
     template = literals[0] + "".join(field + text for field, text in zip(fields, literals[1:], strict=True))
     only, without = ("|".join(map(translate, patterns)) for patterns in (mapping.only, mapping.without))
+    if layout.class_changes == "split":
+        template += "(_.+)?"
     return (f"(?={only})" if only else "") + (f"(?!{without})" if without else "") + template
 
 
@@ -336,4 +339,5 @@ def _class_changes(class_name: str | ClassMapping | None) -> dict[str, object]:
         "class_table": class_name.table,
         "class_other": class_name.other,
         "class_has_other": class_name.has_other,
+        "class_changes": class_name.changes,
     }

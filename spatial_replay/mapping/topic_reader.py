@@ -445,7 +445,8 @@ class Extractor:
         self.turned, self.unturned = 0, 0
         """Poses with an orientation, and those whose quaternion is zeros."""
         self.layout = layout
-        self._classes = classes
+        self._names, self._classes = names, classes
+        self._first_classes: dict[int, int] = {}
         self.namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
         self._needs_frame = needs_frame
         self._path = FieldPath.of(layout.objects) if layout.objects else None
@@ -538,7 +539,28 @@ class Extractor:
     def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:
         """Join the chunks of a batch; see `detections_from_chunks`."""
         detections = detections_from_chunks(self.layout, self._binding, chunks, good)
-        return detections if self.layout.scale == 1.0 else detections.scaled(self.layout.scale)
+        if self.layout.class_changes != "remark":
+            detections = self._with_one_class(detections)
+        is_scaled = self.layout.scale != 1.0 and self.layout.origin is None
+        return detections.scaled(self.layout.scale) if is_scaled else detections
+
+    def _with_one_class(self, detections: Detections) -> Detections:
+        """Return objects that keep their first class, or are other objects with another one."""
+        names, classes = detections.name.tolist(), detections.class_code.tolist()
+        first = [
+            self._first_classes.setdefault(name, code) for name, code in zip(names, classes, strict=True)
+        ]
+        if first == classes:
+            return detections
+        if self.layout.class_changes == "first":
+            return replace(detections, class_code=np.array(first, np.int64))
+        split = [
+            name
+            if code == first_code
+            else self._names[f"{self._names.by_code[name]}_{self._classes.by_code[code]}"]
+            for name, code, first_code in zip(names, classes, first, strict=True)
+        ]
+        return replace(detections, name=np.array(split, np.int64))
 
     def _fill(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
@@ -567,6 +589,9 @@ class Extractor:
             self._forget_unset(binding, chunk.numbers, values)
             if self.layout.invalid:
                 chunk.numbers[np.isin(chunk.numbers, self.layout.invalid)] = nan
+            if self.layout.origin is not None:
+                # such as degrees times 10,000,000; sizes beside them are in metres
+                chunk.numbers[:, list(binding.position[:2])] *= self.layout.scale
             if binding.orientation:
                 is_turned = chunk.numbers[:, list(binding.orientation)].any(axis=1)
                 self.turned += len(values)

@@ -229,3 +229,36 @@ def test_an_optional_number_that_protobuf_did_not_set_is_unknown() -> None:
     assert made.trace.signals["number"][0] == 0.0
     # the default of the enum is its first number, 1
     assert np.isnan([made.trace.signals[name] for name in ("number", "label")])[:, 1].all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "states", "classes"),
+    [
+        ("remark", {"o1": "++++"}, {"o1": "walker, bike, bike, walker"}),
+        ("first", {"o1": "++++"}, {"o1": "walker, walker, walker, walker"}),
+        ("split", {"o1": "+--+", "o1_bike": "-++-"}, {"o1": "walker, walker", "o1_bike": "bike, bike"}),
+    ],
+)
+def test_an_object_that_changes_its_class_is_one_or_two(
+    changes: str, states: dict[str, str], classes: dict[str, str]
+) -> None:
+    contents = [
+        {"objects": [{"id": 1, "label": label, "x": 0.0, "y": 0.0}]}
+        for label in ("walker", "bike", "bike", "walker")
+    ]
+    keys = f"objects: 'objects[*]', name: 'o{{id}}', class: {{field: label, changes: {changes}}}"
+    made = read(keys, *contents)
+    assert {name: made.states(name) for name in made.trace.names} == states
+    samples = list(made.trace)
+    for name, listed in classes.items():
+        assert ", ".join(str(s.objects[name].class_name) for s in samples if name in s.objects) == listed
+    assert bool(made.remarks) == (changes == "remark")
+
+
+def test_a_scale_beside_an_origin_is_that_of_degrees() -> None:
+    content = {"lat": 520_000_000, "lon": 50_010_000, "radius": 2.0}
+    keys = "position: [lat, lon], shape: {disc: radius}, scale: 1e-7"
+    made = read(keys, content, mapping="origin: [52, 5]")
+    (sample,) = made.trace
+    assert made.centre(0, "t") == pytest.approx((68.7, 0.0), abs=0.1)
+    assert sample.objects["t"].footprint.parts[0].radius == 2.0
