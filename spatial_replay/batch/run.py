@@ -726,6 +726,10 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
     meanings = {id(wanted.file): dict(wanted.file.meanings) for wanted in asked}
     requirements = zip(columns["requirement"].to_pylist(), asked, strict=True)
     columns |= {
+        "verdict": [
+            wanted.case.expectation.verdict_of(row["verdict"], _lower(row))
+            for row, wanted in zip(judged, asked, strict=True)
+        ],
         "case": [wanted.case.name for wanted in asked],
         "log": [wanted.log.name for wanted in asked],
         "file": [wanted.file.name for wanted in asked],
@@ -751,5 +755,9 @@ def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozense
     """Return why a row does not pass, in a few words; None if it does."""
     if row["verdict"] is None:
         return cast("str | None", row["error"])
-    lower = nan if row["lower"] is None else row["lower"]
-    return expectation.failure(cast(ResultRow, SimpleNamespace(**{**row, "lower": lower})), fail_on)
+    return expectation.failure(cast(ResultRow, SimpleNamespace(**{**row, "lower": _lower(row)})), fail_on)
+
+
+def _lower(row: Mapping[str, Any]) -> float:
+    """Return the least robustness of a row that is possible; NaN if that is not known."""
+    return nan if row["lower"] is None else cast(float, row["lower"])

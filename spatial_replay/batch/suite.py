@@ -128,6 +128,13 @@ class Expectation:
             return f"robustness of at least {self.at_least:.6g}{unknown}"
         return f"{self.verdict}{unknown}"
 
+    def verdict_of(self, verdict: str | None, lower: float) -> str | None:
+        """Return the verdict of a result: one that misses its limit by the tolerance at most is satisfied."""
+        is_wanted = self.verdict is Verdict.SATISFIED and self.at_least is None and self.tolerance > 0.0
+        if is_wanted and verdict == Verdict.VIOLATED and lower >= -self.tolerance:
+            return str(Verdict.SATISFIED)
+        return verdict
+
     def failure(self, outcome: ResultRow, fail_on: AbstractSet[str] = frozenset()) -> str | None:
         """Return why a result with a verdict does not pass, in a few words; None if it does.
 

@@ -198,7 +198,9 @@ def test_an_allowance_for_rounding_is_a_key_of_suites(fleet: Path) -> None:
     suite = "specs: exact.spatial\ncases: [{name: all, logs: logs/run-0.jsonl%s}]"
     for key, code in (("", 1), (", tolerance: 1e-9", 0), (", tolerance: 1e-12", 1)):
         Path("suite.yaml").write_text(suite % key)
-        assert batch("suite.yaml").code == code
+        said = batch("suite.yaml")
+        assert said.code == code
+        assert f"1 result: 1 {'violated' if code else 'satisfied'}" in said.out
 
 
 def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -> None:
