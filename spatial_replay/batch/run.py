@@ -49,7 +49,7 @@ from spatial_replay.logs.remote import (
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.mapping.yaml_document import MOST_FAULTS
 from spatial_replay.monitor.stream import Choice
-from spatial_replay.sources.open_log import bag_files_at
+from spatial_replay.sources.open_log import LOG_ENDINGS, bag_files_at
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_formula, format_specification
 from spatial_replay.spec.formula import NamedSpec, Specification
@@ -154,8 +154,6 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
             )
 
 
-_ENDINGS: Final = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
-"""Name endings of logs in a folder; any other file has to be named."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 _TOGETHER: Final = 16
@@ -242,7 +240,7 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
             # a ROS 2 bag is one log, where its metadata is in the order
             if each == folder + BAG_METADATA:
                 yield FoundLog(folder, folder)
-        elif not is_folder or each.lower().endswith(_ENDINGS):
+        elif not is_folder or each.lower().endswith(LOG_ENDINGS):
             yield FoundLog(each, each)
 
 
@@ -258,7 +256,7 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         here = _found(Path(parent), folder)
         for name in sorted(names):
-            if name.lower().endswith(_ENDINGS) and not name.startswith("."):
+            if name.lower().endswith(LOG_ENDINGS) and not name.startswith("."):
                 # as texts: paths would take most of the time
                 shown = name if here.name == "." else f"{here.name}/{name}"
                 yield FoundLog(encodable(shown), f"{here.path}/{name}")
@@ -278,7 +276,7 @@ def _nothing(text: str, folder: Path) -> str:
         return f"{text}: no log matches this pattern; check it, and the folder it starts from"
     # unlike a path's own, this test takes names that no file can have
     if os.path.isdir(folder / text):  # noqa: PTH112
-        return f"{text}: no log in this folder; logs end in {', '.join(_ENDINGS)}"
+        return f"{text}: no log in this folder; logs end in {', '.join(LOG_ENDINGS)}"
     return f"{text}: no such file; check the path"
 
 

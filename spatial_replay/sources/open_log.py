@@ -48,6 +48,8 @@ from spatial_replay.trace.units import OUR_AXES, Axes
 
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
+LOG_ENDINGS = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
+"""Endings of the names of logs."""
 _HEAD = 4096
 """Bytes by which a file's format is recognised."""
 
@@ -62,9 +64,10 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         reading: how to read it; see `ReadOptions`.
 
     Raises:
-        UsageError: no path was given, or an option that means nothing to this format.
+        UsageError: no path was given, an option that means nothing to this format, or a file in none of the
+            known formats.
         MissingFileError: there is no such file, or it cannot be opened.
-        LogError: the file is in none of the known formats.
+        LogError: the file has the name of a log, and is none.
         RemoteError: an address does not answer.
     """
     given: object = path
@@ -88,10 +91,12 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         )
     if path.name.endswith(".spatial"):
         raise UsageError(f"{path.name} is a specification, not a log; give it by --spec, behind the log")
-    raise LogError(
+    message = (
         f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}; "
         "a video becomes a log by `record video`"
     )
+    # one that is called a log is a damaged one
+    raise LogError(message) if path.name.lower().endswith(LOG_ENDINGS) else UsageError(message)
 
 
 def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **reading: Unpack[Reading]) -> Trace:

@@ -191,8 +191,11 @@ def test_a_file_without_a_sample_is_an_error(tmp_path, jsonl):
         open_source(tmp_path)
     other = tmp_path / "picture.png"
     other.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    with pytest.raises(LogError, match=r"not a log in a known format.*`record video`"):
+    with pytest.raises(UsageError, match=r"not a log in a known format.*`record video`"):
         open_source(other)
+    # what is called a log is a damaged one
+    with pytest.raises(LogError, match="not a log in a known format"):
+        open_source(other.rename(tmp_path / "picture.mcap"))
     with pytest.raises(LogError, match=r"holds no sample: run\.jsonl:1"):
         read_trace(jsonl('{"a": 1}'))
     crossing = cup(polygon=[[0, 0], [2, 2], [2, 0], [0, 1]])
