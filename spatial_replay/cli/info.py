@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -466,13 +466,28 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     for name, data in container.metadata:
         if name != VERDICTS:
             yield f"metadata {name}"
-            yield from _table(data.items())
+            pairs = [(key, _shortened(value)) for key, value in list(data.items())[:_MOST_ENTRIES]]
+            yield from _table(pairs)
+            if len(data) > _MOST_ENTRIES:
+                yield f"  … and {len(data) - _MOST_ENTRIES:,} more; --json prints all"
     if container.attachments:
         yield "attachments"
         yield from _table(
             (attachment.name, attachment.media_type, counted(attachment.size, "byte"))
             for attachment in container.attachments
         )
+
+
+_MOST_ENTRIES: Final = 20
+"""Entries of a metadata record that texts list."""
+_LONGEST_ENTRY: Final = 120
+
+
+def _shortened(text: str) -> str:
+    """Return the beginning of a metadata value, and how long it is if that is not all."""
+    if len(text) <= _LONGEST_ENTRY:
+        return text
+    return f"{text[:_LONGEST_ENTRY]}… ({len(text):,} characters; --json prints all)"
 
 
 def _clock(time_ns: int) -> str:

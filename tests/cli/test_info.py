@@ -9,6 +9,7 @@ from io import BytesIO
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 from replay.runs import SPECIFICATION, PiecewiseSource
 from replay.runs import run as recorded_run
@@ -40,6 +41,24 @@ def test_samples_objects_and_signals_are_listed(log: Path, capsys: pytest.Captur
     assert "(2.500 s)" in said
     assert "cube" in said
     assert "battery" in said
+
+
+def test_long_metadata_is_cut_in_text_and_whole_in_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    layout, path = "x" * 5000, tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("theirs", {"layout": layout, **{f"key {n}": "short" for n in range(99)}})
+        writer.finish()
+    assert run(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert f"layout  {'x' * 120}… (5,000 characters; --json prints all)\n" in said
+    assert (said.count("short"), "  … and 80 more; --json prints all\n" in said) == (19, True)
+    assert run(["info", str(path), "--json"]) == 0
+    (record,) = json.loads(capsys.readouterr().out)["metadata"]
+    assert (record["data"]["layout"], len(record["data"])) == (layout, 100)
 
 
 def test_many_verdicts_of_a_log_are_counted_and_the_worst_come_first(
