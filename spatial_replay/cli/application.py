@@ -93,8 +93,9 @@ FAMILIES = {
 FORMER_OPTIONS = {
     "--plugin": "allow the module in pyproject.toml: [tool.spatial-replay] plugins = [MODULE]",
     "--profile": "write `use spatial_spec` in the first line of the specification",
+    "--result": "explain takes it: spatial-replay explain LOG --spec SPEC --result NAME",
 }
-"""Options of earlier versions, with the new form."""
+"""Options of earlier versions, or of other commands, with the form that works."""
 
 
 class LazyCommands(click.Group):

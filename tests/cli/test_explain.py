@@ -313,3 +313,10 @@ def test_a_number_that_flips_a_verdict_is_no_rounding_error_and_is_that_of_the_r
     if "->" in formula:
         assert explained["missed"]["closest"]["atom"]["measured"][0]["value"] == 2
         assert explained["missed"]["threshold"]["flips_at"] == 2
+
+
+def test_an_option_of_explain_alone_is_named_by_other_commands(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_in_process([*REPLAY, "--result", "reach"]) == 2
+    assert "no option --result; explain takes it: spatial-replay explain LOG" in capsys.readouterr().err
