@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
 from spatial_replay.batch.suite import DOUBTFUL, UNTESTED
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, nearest_hint, requirement_text
+from spatial_replay.text import counted, listed, nearest_hint, requirement_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -280,12 +280,50 @@ def rows_where(table: pa.Table, condition: str) -> pa.Table:
     try:
         parsed = ast.parse(condition.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
+        if _SINGLE_EQUALS.search(condition):
+            doubled = _SINGLE_EQUALS.sub("==", condition)[:200]
+            raise UsageError(f"--where compares with ==; write {doubled!r}") from None
         raise UsageError(_no_condition(condition)) from None
     try:
         return table.filter(_Condition(table.column_names, condition, ds.field).of(parsed))
     except pa.ArrowException as error:
         reason = str(error).splitlines()[0]
         raise UsageError(f"--where {condition!r} compares different kinds of values: {reason}") from None
+
+
+_SINGLE_EQUALS: Final = re.compile(r"(?<![=!<>])=(?!=)")
+_MOST_VALUES: Final = 5
+"""Values of a column that a message lists."""
+
+
+def absent_values(table: pa.Table, condition: str) -> Iterator[str]:
+    """Yield a sentence for each text that a condition compares a column with, and no row has.
+
+    Args:
+        condition: one that `rows_where` takes.
+    """
+    import pyarrow.compute as pc
+
+    for node in ast.walk(ast.parse(condition.strip(), mode="eval")):
+        match node:
+            case ast.Compare(
+                left=ast.Name(id=name), ops=[ast.Eq()], comparators=[ast.Constant(value=str(text))]
+            ):
+                pass
+            case ast.Compare(left=ast.Name(id=name), ops=[ast.Eq()], comparators=[ast.Name(id=text)]) if (
+                text != "none" and text not in table.column_names
+            ):
+                pass
+            case _:
+                continue
+        values = pc.drop_null(pc.unique(table.column(name))).to_pylist()
+        if text in values:
+            continue
+        if any(text in str(value) for value in values):
+            remedy = f"write '\"{text}\" in {name}' for a part of it"
+        else:
+            remedy = nearest_hint(text, map(str, values)) or f"there are {listed(values, _MOST_VALUES)}"
+        yield f"--where: no {name} is {text!r}; {remedy}"
 
 
 _COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = MappingProxyType(

@@ -536,7 +536,7 @@ def results(
       spatial-replay results main.results branch.results --tolerance 0.02m
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.run_table import rows_where, summary_text
+    from spatial_replay.batch.run_table import absent_values, rows_where, summary_text
     from spatial_replay.batch.store import ResultsFolder
 
     if other is not None:
@@ -545,7 +545,10 @@ def results(
     refuse_values({"--tolerance": tolerance}, "applies to two runs; give the results of the later one, too")
     table = ResultsFolder.open(folder).read_run()
     if where is not None:
-        table = rows_where(table, where)
+        rows = rows_where(table, where)
+        if not len(rows):
+            warn(*absent_values(table, where))
+        table = rows
     if json_file is not None:
         write_json_lines(table, json_file, ())
     if json_file == "-":

@@ -860,9 +860,22 @@ def test_results_are_summed_up_and_searched(fleet: Path) -> None:
         ("__import__('os').system('true')", "is not a condition"),
         ("robustness < 'a'", "compares different kinds"),
         ("verdict ==", "is not a condition"),
+        ("failure = unknown", "--where compares with ==; write 'failure == unknown'"),
+        ("spec = apart and robustness <= 0", "write 'spec == apart and robustness <= 0'"),
     ]:
         done = command("results", "results", "--where", wrong)
         assert (done.code, message in done.err) == (2, True), done.err
+    for empty, hint in [
+        (
+            "failure == violated",
+            """no failure is 'violated'; write '"violated" in failure' for a part of it""",
+        ),
+        ("verdict == voilated", "no verdict is 'voilated'; did you mean 'violated'?"),
+        ("spec == qq", "no spec is 'qq'; there are apart, arrives"),
+    ]:
+        done = command("results", "results", "--where", empty)
+        assert (done.code, hint in done.err) == (0, True), done.err
+    assert "warning" not in command("results", "results", "--where", "spec == apart and robustness > 9").err
     assert command("results", "logs").code == 2
 
 
