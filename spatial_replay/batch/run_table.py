@@ -207,10 +207,10 @@ def flaky_results(table: pa.Table) -> list[FlakyResult]:
     """Return the flaky results among repeated runs: logs whose names differ in a number after "#" only."""
     failures: dict[Key, list[bool]] = defaultdict(list)
     for key, failure in zip(keys_of(table), table.column("failure").to_pylist(), strict=True):
-        case, log, *others = key
+        case, log, file, spec, object_name = key
         name = _RUN.sub("", log)
         if name != log:
-            failures[(case, name, *others)].append(failure is not None)
+            failures[case, name, file, spec, object_name].append(failure is not None)
     return [
         FlakyResult(*key, sum(failed), len(failed))
         for key, failed in failures.items()
