@@ -43,6 +43,7 @@ from spatial_replay.spec.tokens import span_of, tokenize
 from spatial_replay.spec.walks import (
     base_of,
     changed_leaf,
+    iter_atoms,
     iter_terms,
     map_leaves,
     rewritten,
@@ -220,9 +221,12 @@ class TextVersions:
         file, other = (self.new, self.old) if is_undone else (self.old, self.new)
         profile = other.profile if any(word == "USE" for word, _ in keys) else file.profile
         with suppress(SpecificationError, UsageError):
-            return with_numbers(
-                parse_specification(text, filename=file.filename, profile=profile), self._units
-            )
+            version = parse_specification(text, filename=file.filename, profile=profile)
+            atoms = (atom for spec in version.specs for atom in iter_atoms(spec.formula))
+            signals = {name for atom in atoms for name in signals_in(atom.expression)}
+            # a constant that only the other text declares is no signal
+            if not any(word == "CONST" and name in signals for word, name in self._keys):
+                return with_numbers(version, self._units)
         return None
 
 
