@@ -248,21 +248,40 @@ _A_TURN: Final = 360.5
 def _heading(evidence: TopicEvidence, log: Log) -> str | None:
     """Compare where objects head with where they go, for each reading of their angle."""
     motions, layout = evidence.motions, evidence.planned.layout
-    if layout is None or motions.steps < _FEW_STEPS or evidence.has_given_heading:
+    if layout is None or motions.steps < _FEW_STEPS or evidence.has_given_heading or _radians(evidence, log):
         return None
     courses = motions.courses
     read = courses.pop("read")
     if abs(read) > _STEADY and abs(phase(read)) < _ASKEW:
         return None
-    fits = {name: mean for name, mean in courses.items() if abs(mean) > _STEADY and abs(phase(mean)) < _ALONG}
-    name = max(fits, key=lambda name: fits[name].real, default=None)
+    fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _STEADY and abs(phase(mean)) < _ALONG}
+    keys = max(fits, key=lambda keys: fits[keys].real, default=None)
     # on one straight way, a robot may go sideways; only the name of the field says more
     is_straight = abs(motions.course) > _STEADY
-    if name is None or (is_straight and not ("north" in name and evidence.is_called_heading)):
+    if keys is None or (is_straight and not ("north" in keys and evidence.is_called_heading)):
         return None
     off = f"{degrees(phase(read)):.0f} degrees" if abs(read) > _STEADY else "by changing angles"
-    fitting = f"they move along it if {evidence.turn_path} is an angle in {name}"
-    return f"its objects move {off} off their yaw; {fitting}"
+    return (
+        f"its objects move {off} off their yaw, and along it with"
+        f" `yaw: {{field: {evidence.turn_path}, {keys}}}`"
+    )
+
+
+def _compass(evidence: TopicEvidence, log: Log) -> str | None:
+    """Say from where an angle beside fixes counts, where no motion does."""
+    yaw = None if evidence.planned.mapping is None else evidence.planned.mapping.yaw
+    courses = evidence.motions.courses
+    goes_along = abs(courses["read"]) > _STEADY and abs(phase(courses["read"])) < _ASKEW
+    if yaw is None or not yaw.is_plain or not evidence.planned.is_geodetic:
+        return None
+    if goes_along or _heading(evidence, log):
+        return None
+    unit = "deg" if yaw.scale != 1.0 else "rad"
+    compass = f"{{field: {yaw.field}, unit: {unit}, zero: north, clockwise: true}}"
+    return (
+        f"{yaw.field} counts from the east, counter-clockwise; a heading from the north, clockwise, is"
+        f" `yaw: {compass}`"
+    )
 
 
 _FEW_STEPS: Final = 5
@@ -271,12 +290,28 @@ _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
 
 def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
     layout = evidence.planned.layout
-    if layout is None or layout.origin is not None or not evidence.is_called_degrees:
+    if layout is None or layout.origin is not None:
+        return None
+    if evidence.angle_path:
+        return f"{evidence.angle_path} is an angle by its name, and is taken as a coordinate"
+    if not evidence.is_called_degrees:
         return None
     if not (abs(evidence.low[:2]).max() <= 360 and abs(evidence.high[:2]).max() <= 360):
         return None
     low, high = (", ".join(map(number_text, corner[:2].tolist())) for corner in (evidence.low, evidence.high))
     return f"its latitudes and longitudes, from {low} to {high}, are taken as metres"
+
+
+def _upward(evidence: TopicEvidence, log: Log) -> str | None:
+    low, high = evidence.low, evidence.high
+    layout = evidence.planned.layout
+    if layout is None or layout.solids or layout.origin is not None:
+        return None
+    is_flat = np.isfinite([*low, *high]).all() and low[1] == high[1]
+    if not is_flat or evidence.motions.speed.count < _FEW_LEAPS or high[2] - low[2] <= evidence.size.greatest:
+        return None
+    depth = number_text(float(high[2] - low[2]))
+    return f"y is {number_text(float(low[1]))} throughout and z varies by {depth}, as where y points upwards"
 
 
 def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
@@ -477,6 +512,16 @@ def _unturned(evidence: TopicEvidence, log: Log) -> str | None:
 
 def _leap(evidence: TopicEvidence, log: Log) -> str | None:
     motions = evidence.motions
+    moment = motions.return_moment
+    usual_step = motions.speed.median * evidence.arrivals.period_s.median
+    is_far = moment is not None and moment.amount > _FAST_LEAP * usual_step
+    if moment is not None and is_far and motions.returns >= _FEW and _one_object(evidence, log) is None:
+        return Sentence(
+            f"{moment.name} leaps by {number_text(moment.amount)} at ",
+            Instant(moment.time_ns, 0),
+            f" and back, and so in {motions.returns:,} of {counted(motions.triples, 'report')}, as with a"
+            " number that stands for not available",
+        )
     jump, usual = motions.jump, motions.speed.quantile(0.9)
     if jump is None or motions.speed.count < _FEW_LEAPS or not evidence.size.greatest > 0:
         return None
@@ -567,14 +612,30 @@ ASSUMPTIONS: Final = (
         "An angle counts from x, counter-clockwise.",
         "where objects move, against their angle in each reading",
         _heading,
-        "`yaw: {field: PATH, unit: deg, zero: north, clockwise: true}` reads compass headings",
+        "",
+    ),
+    Assumption(
+        "compass",
+        "An angle beside latitudes counts from the east, counter-clockwise.",
+        "where objects move; without motion it is remarked",
+        _compass,
+        "",
+        is_remark=True,
     ),
     Assumption(
         "metres",
         "Positions are lengths.",
         "names of fields and the range of coordinates; latitudes and longitudes contradict",
         _degrees_as_metres,
-        "`origin: [LATITUDE, LONGITUDE]` brings them into metres",
+        "`origin: [LATITUDE, LONGITUDE]` brings latitudes and longitudes into metres",
+    ),
+    Assumption(
+        "upward",
+        "z points upwards.",
+        "the extent along each axis; a constant y beside z that varies by more than an object is remarked",
+        _upward,
+        "`position: [x, z]` takes the ground plane",
+        is_remark=True,
     ),
     Assumption(
         "latitude",
@@ -680,7 +741,7 @@ ASSUMPTIONS: Final = (
         "Objects move steadily.",
         "the longest step; five sizes at 20 times the usual speed is remarked",
         _leap,
-        "a `name` with an id may tell objects apart, `max_gap` marks pauses",
+        "`invalid` names numbers without a value, a `name` with an id tells objects apart",
         is_remark=True,
     ),
 )

@@ -7,7 +7,6 @@ the values. `assumptions` compares the measurements with what a mapping assumes.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from math import inf, nan, pi
 from typing import Final, NamedTuple
 
@@ -22,6 +21,9 @@ from spatial_replay.mapping.topic_reader import PlannedTopic, TopicReader
 
 _HEADING: Final = re.compile(r"heading|course|bearing|azimuth|cog$", re.I)
 """Names of fields that hold angles from north, clockwise."""
+
+_ANGLE: Final = re.compile(r"(^|[._])(bearing|azimuth|heading|theta|phi|yaw|angle)$", re.I)
+"""Names of fields that hold angles."""
 
 _MOST_VALUES: Final = 4_096
 """Values that a `Spread` holds for its median."""
@@ -163,13 +165,15 @@ class Arrivals:
 _NAME, _MESSAGE, _SECONDS, _X, _Y, _YAW, _TURN, _SIZE, _CLASS, _IS_NEW = range(10)
 """Columns of the reports of objects that are measured together."""
 
-HEADINGS: Final[dict[str, Callable[[Floats], Floats]]] = {
-    "deg": lambda turn: turn * (pi / 180),
-    "rad": lambda turn: turn,
-    "deg from north, clockwise": lambda turn: pi / 2 - turn * (pi / 180),
-    "rad from north, clockwise": lambda turn: pi / 2 - turn,
+HEADINGS: Final[dict[str, tuple[float, float]]] = {
+    "unit: rad": (0.0, 1.0),
+    "unit: deg": (0.0, pi / 180),
+    "unit: rad, zero: north, clockwise: true": (pi / 2, -1.0),
+    "unit: deg, zero: north, clockwise: true": (pi / 2, -pi / 180),
+    "unit: rad, zero: east, clockwise: true": (0.0, -1.0),
+    "unit: deg, zero: east, clockwise: true": (0.0, -pi / 180),
 }
-"""Readings of a number as an angle, as the mapping says it; the result is in radians from x."""
+"""Readings of a number as a yaw, in the keys of a mapping: the yaw at 0, and that of one unit, in radians."""
 
 
 class Motions:
@@ -254,7 +258,8 @@ class Motions:
         course = np.arctan2(step[moves, 1], step[moves, 0])
         yaw, number = earlier[moves, _YAW], earlier[moves, _TURN]
         sign = -1.0 if turns_back else 1.0
-        angles = [yaw, *(yaw + sign * (read(number) - zero - scale * number) for read in HEADINGS.values())]
+        readings = (base - zero + (unit - scale) * number for base, unit in HEADINGS.values())
+        angles = [yaw, *(yaw + sign * reading for reading in readings)]
         offsets = [np.exp(1j * (course - angle)).sum() for angle in angles]
         self._courses += np.array([*offsets, np.exp(1j * course).sum()])
         self._steps += int(np.count_nonzero(moves))
@@ -370,6 +375,13 @@ class TopicEvidence:
         """Whether positions are fields with the names of latitude and longitude."""
         layout = self.planned.layout
         return layout is not None and any(geodetic_order(paths) is not None for paths in layout.position[:1])
+
+    @property
+    def angle_path(self) -> str:
+        """The field of a coordinate that has the name of an angle; "" for none."""
+        position = None if self.planned.mapping is None else self.planned.mapping.position
+        paths = position if isinstance(position, tuple) else ()
+        return next((path for path in paths if _ANGLE.search(path)), "")
 
     @property
     def object_names(self) -> frozenset[str]:

@@ -221,7 +221,6 @@ class ReadingPlan:
             remarks=(
                 *_slow_sampling(sampled, [known[topic] for topic in mapped if topic in known], known),
                 *doubts_of(topics, has_frames=needs_frames, has_stamps=mapping.clock == "header"),
-                *_headings_from_east(planned),
             ),
         )
 
@@ -332,19 +331,6 @@ def _slow_sampling(
         f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
         f" `sample: {{topic: {most.name}}}` takes one at each of these",
     )
-
-
-def _headings_from_east(planned: Sequence[PlannedTopic]) -> Iterator[str]:
-    """Yield remarks on headings beside fixes: most of these are those of a compass."""
-    for topic in planned:
-        yaw = None if topic.mapping is None else topic.mapping.yaw
-        if yaw is not None and yaw.is_plain and topic.layout is not None and topic.layout.origin is not None:
-            unit = "deg" if yaw.scale != 1.0 else "rad"
-            compass = f"{{field: {yaw.field}, unit: {unit}, zero: north, clockwise: true}}"
-            yield (
-                f"{topic.name}: {yaw.field} counts from the east, counter-clockwise; a heading from the"
-                f" north, clockwise, is `yaw: {compass}`"
-            )
 
 
 def doubts_of(
