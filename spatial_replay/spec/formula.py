@@ -533,6 +533,13 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
             return Boolean("and", (one, other))
         case "WX":
             return _not(Temporal("X", (_not(first),)))
+        # over a window that begins later, F takes less than half of the time of U
+        case "U" if first == Truth(True):
+            return Temporal("F", (last,), bound)
+        case "S" if first == Truth(True):
+            return Temporal("O", (last,), bound)
+        case "R" if first == Truth(False):
+            return Temporal("G", (last,), bound)
         case "R":
             return _not(Temporal("U", (_not(first), _not(last)), bound))
         case "W" if bound is None:

@@ -40,12 +40,12 @@ from laws.strategies_monitor import (
     widened,
     windows_of,
 )
-from spatial_replay import Monitor, Verdict, evaluate
+from spatial_replay import Monitor, Verdict, evaluate, parse_specification
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.stream import EvaluationStream, find_instances
 from spatial_replay.monitor.verdict import final_verdict, online_verdict
-from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth, iter_nodes
+from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth, expand, iter_nodes
 from spatial_replay.trace.trace import FOREVER
 
 VALUE, NOW, LOWER, UPPER = range(4)
@@ -289,6 +289,22 @@ def test_a_monitor_equals_an_evaluation_sample_by_sample(data, specification, re
 
 
 # ------------------------------------------------------------------------------------------- equivalences
+
+
+@few
+@given(
+    spellings=st.sampled_from([("F", "true U"), ("O", "true S"), ("G", "false R")]),
+    window=st.sampled_from(["", "[0, 2]", "[1, 3]", "[1, inf]", "[100ms, 300ms]"]),
+    outer=st.sampled_from(["{}", "G ({})", "F[0, 2] ({})", "G[1, 2] ((a ovlp b) -> ({}))", "H ({})"]),
+    run=recordings(),
+)
+def test_an_until_of_true_is_evaluated_as_finally(spellings, window, outer, run):
+    texts = [outer.format(f"{operator}{window} (a dist b <= 1)") for operator in spellings]
+    short, long = (evaluate(parse_specification(text), run.trace()).result() for text in texts)
+    assert short.series[0].tobytes() == long.series[0].tobytes()
+    assert short.final[0].tobytes() == long.final[0].tobytes()
+    if outer == "{}":
+        assert expand(long.formula) == replace(short.formula, name=None)
 
 
 @examples(60)
