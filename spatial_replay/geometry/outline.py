@@ -248,7 +248,7 @@ def convex_hull(vertices: Floats) -> Floats:
     return np.asarray(get_coordinates(MultiPoint(vertices).convex_hull), dtype=np.float64)
 
 
-def convex_pieces(vertices: Floats) -> list[Floats]:
+def convex_pieces(vertices: Floats, holes: Sequence[Floats] = ()) -> list[Floats]:
     """Split a polygon into few convex polygons with disjoint interiors.
 
     Triangulates (Delaunay), then merges neighbours across the longest edges first while the result stays
@@ -256,10 +256,12 @@ def convex_pieces(vertices: Floats) -> list[Floats]:
 
     Args:
         vertices: (n, 2) float64, corners in either order, no two equal in a row.
+        holes: the corners of what is cut out, in the same form.
 
     Raises:
         GeometryError: a boundary that crosses or touches itself, more than `MOST_CORNERS` corners.
     """
+    outline, vertices = vertices, np.concatenate([vertices, *holes])
     if len(vertices) > MOST_CORNERS:
         raise GeometryError(
             f"a polygon that is not convex has {len(vertices):,} corners, and at most {MOST_CORNERS:,} are"
@@ -267,7 +269,7 @@ def convex_pieces(vertices: Floats) -> list[Floats]:
         )
     from shapely import Polygon, constrained_delaunay_triangles, get_coordinates
 
-    polygon = Polygon(vertices)
+    polygon = Polygon(outline, holes)
     if not polygon.is_valid:
         raise GeometryError(_describe_crossing(polygon))
     corners = [(x, y) for x, y in vertices.tolist()]

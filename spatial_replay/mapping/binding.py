@@ -48,6 +48,7 @@ from spatial_replay.mapping.field_paths import (
 )
 from spatial_replay.mapping.mapping_file import Measure, Stamp
 from spatial_replay.mapping.message_types import Alternatives, MessageLayout
+from spatial_replay.mapping.outlines import path_of_rings
 from spatial_replay.trace.trace import LATEST_NS
 
 BY_PLACE = "only the places in the list distinguish objects without an id: objects swap where these change"
@@ -311,6 +312,7 @@ class Binding:
         sizes: columns of length, width and maybe height, if the message has them.
         shape_sizes, height: from the mapping, each a number (float) or a column (int).
         uncertainty: a number, a column, or None.
+        has_rings: whether `polygon` returns what holds rings, instead of corners.
         class_names: the names of the numbers of a protobuf enum.
         unset: columns of numbers that a protobuf sender may not set, with their paths and defaults.
         frame: reads the frame's name, and whether from the message instead of the object; None for the fixed
@@ -330,6 +332,7 @@ class Binding:
     height: tuple[float | int, ...]
     uncertainty: float | int | None
     polygon: Get | None
+    has_rings: bool
     covariance: Get | None
     class_gets: tuple[Get, ...]
     class_names: Table[object, str]
@@ -493,7 +496,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     sizes = _first(layout.sizes, columns.add_all) or ()
     shape_sizes = tuple(map(columns.measure, layout.shape.sizes)) if layout.shape else ()
     height = tuple(map(columns.measure, layout.height)) if layout.height else ()
-    polygon = _polygon(layout, columns)
+    polygon, has_rings = _polygon(layout, columns)
     class_paths = [FieldPath.of(path) for path in layout.class_field]
     if len(class_paths) == 1:
         # alternatives may all be missing, a single path of the mapping must not
@@ -516,6 +519,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         height=height,
         uncertainty=uncertainty,
         polygon=polygon,
+        has_rings=has_rings,
         covariance=covariance,
         class_gets=tuple(getter(path, example) for path in class_paths),
         class_names=_enum_of(class_paths, example),
@@ -628,22 +632,25 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolv
     return None
 
 
-def _polygon(layout: MessageLayout, columns: _Columns) -> Get | None:
+def _polygon(layout: MessageLayout, columns: _Columns) -> tuple[Get | None, bool]:
+    """Return the getter of an outline, and whether it returns rings instead of corners."""
     example = columns.example
     if len(layout.polygon) > 1:
         columns.add_all(layout.polygon)
-        return tuple_getter(list(map(FieldPath.of, layout.polygon)), example)
+        return tuple_getter(list(map(FieldPath.of, layout.polygon)), example), False
     text = layout.polygon[0] if layout.polygon else layout.shape.outline if layout.shape else ""
     if not text:
-        return None
+        return None, False
     path = FieldPath.of(text)
+    if (rings := path_of_rings(path, example)) is not None:
+        return (getter(rings, example) if rings.steps else lambda thing: thing), True
     value = walk(path, example)
     if "points" in field_names(value):
         # geometry_msgs/Polygon
         path, value = below(path, "points"), get_field(value, "points")
     if not is_list(value):
         raise FieldError(f"{path.text}: expected a list of corners, got {type_name(value)}")
-    return getter(path, example)
+    return getter(path, example), False
 
 
 def _uncertainty(layout: MessageLayout, columns: _Columns) -> tuple[float | int | None, Get | None]:

@@ -26,7 +26,7 @@ from spatial_replay.geometry.arrays import (
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.outline import convex_hull
 from spatial_replay.mapping.binding import Binding
-from spatial_replay.mapping.field_paths import FieldPath, Style, field_names, style_of, tuple_getter
+from spatial_replay.mapping.field_paths import Style
 from spatial_replay.mapping.mapping_file import ShapeMapping
 from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.transforms import (
@@ -420,7 +420,8 @@ class DetectionChunk:
         deleted, message: messages as indices into `places`.
         numbers: (R, W) every number that the binding reads from an object.
         noted_stamps: places of messages in their batch, and their stamps: one of many where no frames matter.
-        corner_counts, corners: of polygons: (R,) counts, and all corners (V, 3).
+        outline_counts: of polygons: (R,) how many make up an object.
+        corner_counts, corners: the counts of each of these, and all corners (V, 3).
     """
 
     places: Integers
@@ -436,6 +437,7 @@ class DetectionChunk:
     lifetimes: list[int] = field(default_factory=list)
     locked: list[bool] = field(default_factory=list)
     solids: list[list[Solid]] = field(default_factory=list)
+    outline_counts: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     corner_counts: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     corners: Floats = field(default_factory=lambda: np.empty((0, 3)))
     skipped: int = 0
@@ -470,7 +472,9 @@ def detections_from_chunks(
             own = None
             if layout.shape is not None:
                 own = _placed_shape(layout.shape, poses), poses.rotation
-            solids = _polygons(counts, np.concatenate([chunk.corners for chunk in chunks]), own)
+            corners = np.concatenate([chunk.corners for chunk in chunks])
+            outline_counts = np.concatenate([chunk.outline_counts for chunk in chunks])
+            solids = _polygons(outline_counts, counts, corners, own)
         else:
             solids = _shapes(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
@@ -512,7 +516,7 @@ def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
     count = len(numbers)
     position = np.zeros((count, 3))
     if layout.origin is not None:
-        position[:, :2] = _local_metres(numbers[:, list(binding.position)], layout.origin)
+        position[:, :2] = local_metres(numbers[:, list(binding.position)], layout.origin)
     else:
         for axis, column in enumerate(binding.position):
             position[:, axis] = numbers[:, column]
@@ -529,7 +533,7 @@ _EQUATOR_M, _ECCENTRICITY_SQUARED = 6_378_137.0, 6.694379990141316e-3
 """The ellipsoid of WGS 84."""
 
 
-def _local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
+def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     """Return metres east and north of an origin, in the plane that touches the ellipsoid there, (R, 2).
 
     Args:
@@ -637,85 +641,22 @@ def _placed_shape(shape: ShapeMapping, poses: Poses) -> Floats:
     return np.asarray(poses.position + poses.rotation[:, :, :2] @ np.array(shape.offset))
 
 
-def _polygons(counts: Integers, points: Floats, own: tuple[Floats, Floats] | None) -> Solids:
+def _polygons(
+    outline_counts: Integers, counts: Integers, points: Floats, own: tuple[Floats, Floats] | None
+) -> Solids:
     """Return polygons with corners in the frame of their message, or in the objects' own.
 
     Args:
+        outline_counts: (R,) how many of the polygons make up an object.
         own: positions (R, 3), rotations (R, 3, 3) of the objects' own frames; None for that of the message.
     """
     count = len(counts)
-    owner, kind = np.arange(count), np.full(count, POLYGON, np.int8)
-    position, rotation = own or (np.zeros((count, 3)), no_rotations(count))
+    owner, kind = np.repeat(np.arange(len(outline_counts)), outline_counts), np.full(count, POLYGON, np.int8)
+    position, rotation = np.zeros((count, 3)), no_rotations(count)
+    if own is not None:
+        position, rotation = own[0][owner], own[1][owner]
     size = np.full((count, 3), np.nan)
     return Solids(owner, kind, position, rotation, size, starts_from_counts(counts), points)
-
-
-_LEAST_CORNERS = 3
-
-
-def outlines_from_lists(
-    lists: list[Any], *, is_bounds: bool, have_size: bool = False
-) -> tuple[Integers, Floats, int]:
-    """Return the counts (R,) and the corners (V, 3) of outlines, and how many have too few corners.
-
-    These have one corner, NaN, so that their objects are unknown.
-
-    Args:
-        is_bounds: whether each list has two opposite corners of a box, which become four.
-        have_size: whether bounds have width and height instead of the second corner.
-    """
-    counts, points = points_from_lists(lists)
-    if is_bounds:
-        few = counts != 2
-        starts = starts_from_counts(counts)[:-1][~few]
-        ends = np.stack([points[starts], points[starts + 1]]) if len(starts) else np.empty((2, 0, 3))
-        if have_size:
-            # a negative size makes the object unknown, as one of a shape does
-            ends[1] = ends[0] + np.where(ends[1] < 0, np.nan, ends[1])
-        (left, low, _), (right, high, _) = ends.min(axis=0).T, ends.max(axis=0).T
-        xs, ys = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
-        boxes = np.stack([xs, ys, np.zeros_like(xs)], axis=2).reshape(-1, 3)
-        counts, points = np.where(few, 0, 4), boxes
-    else:
-        few = counts < _LEAST_CORNERS
-    if not few.any():
-        return counts, points, 0
-    kept = np.repeat(~few, counts)
-    at = starts_from_counts(np.where(few, 0, counts))[:-1][few]
-    points = np.insert(points[kept], at, np.nan, axis=0)
-    return np.where(few, 1, counts), points, int(np.count_nonzero(few))
-
-
-def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
-    """Return the counts (R,) and the corners (V, 3) of lists of points, of pairs, or of x, y, x, y …."""
-    example = next((each[0] for each in lists if len(each)), None)
-    flat = list(chain.from_iterable(lists))
-    counts = np.array([len(each) for each in lists], np.int64)
-    names = field_names(example)
-    if "x" in names and "y" in names:
-        axes = "xyz" if "z" in names else "xy"
-        get = tuple_getter([FieldPath.of(axis) for axis in axes], example)
-        rows = rows_from_tuples(map(get, flat), len(flat), len(axes), style_of(example))
-        return counts, rows if len(axes) == 3 else np.column_stack([rows, np.zeros(len(flat))])
-    if example is None or hasattr(example, "__len__"):
-        pairs = _array([(point[0], point[1]) for point in flat], 2)
-        return counts, np.column_stack([pairs, np.zeros(len(pairs))])
-    if (counts % 2).any():
-        raise ValueError("a polygon has an odd number of coordinates; give x and y of each corner in turn")
-    pairs = np.array(flat, np.float64).reshape(-1, 2)
-    return counts // 2, np.column_stack([pairs, np.zeros(len(pairs))])
-
-
-def rows_from_tuples(tuples: Iterable[Sequence[Any]], count: int, width: int, style: Style) -> Floats:
-    """Return the numbers (count, width) in tuples, NaN for the null of JSON."""
-    if style == "keys":
-        return np.array(list(tuples), np.float64).reshape(count, width)
-    rows = list(tuples)
-    try:
-        # faster, but it does not take None, for an element that a list lacks
-        return np.fromiter(chain.from_iterable(rows), np.float64, count * width).reshape(count, width)
-    except TypeError:
-        return np.array(rows, np.float64).reshape(count, width)
 
 
 def _array(rows: list[Any], width: int) -> Floats:

@@ -52,6 +52,8 @@ class MessageLayout:
         solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
         origin: where positions that are latitudes and longitudes are counted from; None for metres.
+        is_geojson: whether corners are longitudes and latitudes, and features stand in a text.
+        corner_origin: where corners that are longitudes and latitudes are counted from.
         scale: units of the log per unit of positions, sizes, heights and uncertainties.
         invalid: numbers that say that a value is not available.
     """
@@ -87,8 +89,15 @@ class MessageLayout:
     uncertainty: Uncertainty | None = None
     is_generic: bool = False
     origin: tuple[float, float] | None = None
+    is_geojson: bool = False
+    corner_origin: tuple[float, float] | None = None
     scale: float = 1.0
     invalid: tuple[float, ...] = ()
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether positions or corners are degrees, counted from the mapping's origin."""
+        return self.origin is not None or self.corner_origin is not None
 
 
 _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
@@ -203,13 +212,24 @@ BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
         "foxglove/FrameTransform": _FRAME_TRANSFORM,
         "sensor_msgs/NavSatFix": _FIX,
         "foxglove/LocationFix": replace(_FIX, stamp=(Stamp("$.timestamp"),)),
+        "foxglove/GeoJSON": MessageLayout(
+            objects="features[*]",
+            complete=True,
+            name="{id|properties.name|index}",
+            polygon=("geometry",),
+            frame=(),
+            stamp=(),
+            is_geojson=True,
+        ),
         "foxglove/FrameTransforms": replace(_FRAME_TRANSFORM, objects="transforms[*]"),
     }
 )
 
 TRANSFORM_TYPES = frozenset(kind for kind, layout in BUILT_IN.items() if layout.name == "{child_frame_id}")
 
-GEODETIC_TYPES = frozenset(kind for kind, layout in BUILT_IN.items() if GEODETIC in layout.position)
+GEODETIC_TYPES = frozenset(
+    kind for kind, layout in BUILT_IN.items() if GEODETIC in layout.position or layout.is_geojson
+)
 
 _POINTS = ("pose.pose.position", "pose.position", "position", "base.position", "pose", "center", "centre")
 

@@ -42,9 +42,7 @@ from spatial_replay.mapping.detections import (
     covariances,
     detections_from_chunks,
     lenient_getter,
-    outlines_from_lists,
-    points_from_lists,
-    rows_from_tuples,
+    local_metres,
     solids_of_entity,
     solids_of_marker,
     solids_of_perceived_object,
@@ -90,6 +88,13 @@ from spatial_replay.mapping.message_types import (
     layout_of_topic,
     short_type,
 )
+from spatial_replay.mapping.outlines import (
+    features_in,
+    outlines_from_lists,
+    outlines_from_rings,
+    points_from_lists,
+    rows_from_tuples,
+)
 from spatial_replay.mapping.transforms import HISTORY_NS, LEAST_STEP_NS, TransformReader
 from spatial_replay.text import counted, names_from_unit, nearest_hint, text_number
 from spatial_replay.trace.trace import LATEST_NS, LONG_PAUSE
@@ -130,7 +135,7 @@ class PlannedTopic:
     @property
     def is_geodetic(self) -> bool:
         """Whether positions are latitudes and longitudes, counted from the mapping's origin."""
-        return self.layout is not None and self.layout.origin is not None
+        return self.layout is not None and self.layout.is_geodetic
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +285,7 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
             kind in GEODETIC_TYPES
             and entry.reads_objects
             and entry.position is None
+            and entry.polygon is None
             and mapping.origin is None
         ):
             faults.append(
@@ -366,6 +372,8 @@ def _planned(
         paths = geodetic_order(layout.position[0])
         if paths is not None:
             layout = replace(layout, origin=mapping.origin, position=(paths,))
+    if layout is not None and layout.polygon and layout.polygon[-1].rpartition(".")[2] in _GEOMETRIES:
+        layout = replace(layout, corner_origin=mapping.origin)
     stays = topic.latched or (layout is not None and layout.stays)
     default = FOREVER_NS if stays else DEFAULT_MAX_AGE_NS
     given = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
@@ -385,6 +393,9 @@ def _planned(
         is_lasting=is_static or (layout is not None and max_age_ns >= FOREVER_NS),
     )
 
+
+_GEOMETRIES = frozenset({"geometry", "coordinates"})
+"""Fields of GeoJSON, whose corners are longitudes and latitudes (RFC 7946)."""
 
 _SOLIDS_OF = {"marker": solids_of_marker, "scene": solids_of_entity, "primitive": solids_of_perceived_object}
 
@@ -527,8 +538,10 @@ class Extractor:
         detections = detections_from_chunks(self.layout, self._binding, chunks, good)
         if self.layout.class_changes != "remark":
             detections = self._with_one_class(detections)
-        is_scaled = self.layout.scale != 1.0 and self.layout.origin is None
-        return detections.scaled(self.layout.scale) if is_scaled else detections
+        is_in_degrees = self.layout.origin is not None or self.layout.corner_origin is not None
+        return (
+            detections if is_in_degrees or self.layout.scale == 1.0 else detections.scaled(self.layout.scale)
+        )
 
     def _with_one_class(self, detections: Detections) -> Detections:
         """Return objects that keep their first class, or are other objects with another one."""
@@ -564,10 +577,18 @@ class Extractor:
             corners = [binding.polygon(each) for each in objects.values]
             if self.layout.is_bounds and not self.layout.bounds_have_size:
                 self._count_corners(corners)
-            outlines = outlines_from_lists(
-                corners, is_bounds=self.layout.is_bounds, have_size=self.layout.bounds_have_size
-            )
-            chunk.corner_counts, chunk.corners, cornerless = outlines
+            if binding.has_rings:
+                chunk.outline_counts, chunk.corner_counts, chunk.corners, cornerless = outlines_from_rings(
+                    corners
+                )
+            else:
+                chunk.corner_counts, chunk.corners, cornerless = outlines_from_lists(
+                    corners, is_bounds=self.layout.is_bounds, have_size=self.layout.bounds_have_size
+                )
+                chunk.outline_counts = np.ones(len(corners), np.int64)
+            if self.layout.corner_origin is not None:
+                fixes = chunk.corners[:, 1::-1] * self.layout.scale
+                chunk.corners[:, :2] = local_metres(fixes, self.layout.corner_origin)
         values = objects.values
         if binding.numbers is not None:
             rows = map(binding.numbers, values)
@@ -809,6 +830,8 @@ class TopicReader:
         decode = self._decode
         if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
             self._decode = lambda payload: sparse(decode(payload))
+        elif reads and planned.layout is not None and planned.layout.is_geojson:
+            self._decode = lambda payload: features_in(decode(payload))
         elif reads and planned.is_protobuf_json:
             objects = planned.layout.objects if planned.layout is not None else ""
             self._decode = lambda payload: from_protobuf_json(decode(payload), objects)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from google.protobuf.json_format import MessageToDict
 from google.protobuf.struct_pb2 import Struct
 
 from mapping.feeding import SECOND, Feed, Made, make
-from spatial_replay import UsageError
+from spatial_replay import Footprint, UsageError
+from spatial_replay.geometry.measure import contact
 
 
 def read(keys: str, *contents: Any, mapping: str = "", name: str = "a/Thing") -> Made:
@@ -262,3 +264,48 @@ def test_a_scale_beside_an_origin_is_that_of_degrees() -> None:
     (sample,) = made.trace
     assert made.centre(0, "t") == pytest.approx((68.7, 0.0), abs=0.1)
     assert sample.objects["t"].footprint.parts[0].radius == 2.0
+
+
+def square(left: float, right: float) -> list[list[float]]:
+    """Return a ring, closed as GeoJSON has it."""
+    return [[left, left], [right, left], [right, right], [left, right], [left, left]]
+
+
+RINGS = [square(0, 10), square(3, 7)]
+
+
+def as_points(ring: list[list[float]]) -> dict[str, Any]:
+    return {"points": [{"x": x, "y": y} for x, y in ring[:-1]]}
+
+
+@pytest.mark.parametrize(
+    ("keys", "fields"),
+    [
+        ("polygon: geometry.coordinates", {"geometry": {"type": "Polygon", "coordinates": RINGS}}),
+        ("polygon: geometry", {"geometry": {"type": "MultiPolygon", "coordinates": [RINGS]}}),
+        ("polygon: rings", {"rings": RINGS}),
+        ("polygon: outer.points", {"outer": as_points(RINGS[0]), "inner": [as_points(RINGS[1])]}),
+        ("shape: {polygon: area.outer}, position: at", {"area": {"outer": RINGS[0], "inner": [RINGS[1]]}}),
+    ],
+)
+def test_polygons_keep_their_holes(keys: str, fields: dict[str, Any]) -> None:
+    content = {"things": [{"id": "a", "at": {"x": 0, "y": 0}, **fields}]}
+    (sample,) = read(f"objects: 'things[*]', name: '{{id}}', {keys}", content).trace
+    zone, inside = sample.objects["a"].footprint, Footprint.box(4.8, 4.8, 5.2, 5.2)
+    assert contact(zone, inside).distance == pytest.approx(1.8)
+    assert contact(zone, Footprint.box(1, 1, 2, 2)).distance < 0
+
+
+def test_geojson_of_foxglove_is_read_in_metres() -> None:
+    def feature(name: str, kind: str, coordinates: Any) -> dict[str, Any]:
+        geometry = {"type": kind, "coordinates": coordinates}
+        return {"type": "Feature", "properties": {"name": name}, "geometry": geometry}
+
+    corners = [[5.0, 52.0], [5.001, 52.0], [5.001, 52.001], [5.0, 52.001], [5.0, 52.0]]
+    features = [feature("field", "Polygon", [corners]), feature("post", "Point", [5.0, 52.0])]
+    content = {"geojson": json.dumps({"type": "FeatureCollection", "features": features})}
+    with pytest.raises(UsageError, match="foxglove/GeoJSON holds degrees"):
+        read("", content, name="foxglove.GeoJSON")
+    made = read("", content, mapping="origin: [52, 5]", name="foxglove.GeoJSON")
+    assert made.footprint_row(0, "field").max(axis=0) == pytest.approx((68.68, 111.27), abs=0.1)
+    assert made.states("post") == "?"

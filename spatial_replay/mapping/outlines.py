@@ -1,0 +1,196 @@
+"""Outlines in messages: lists of corners, or rings with holes, in; corners in columns out.
+
+Rings are those of GeoJSON (RFC 7946: an outer ring, then holes, in a list; a `MultiPolygon` lists polygons),
+or of a message with the fields `outer` and `inner`, such as polygon_msgs/ComplexPolygon2D.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from spatial_replay.errors import GeometryError
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
+from spatial_replay.geometry.outline import convex_pieces
+from spatial_replay.mapping.field_paths import (
+    ContentError,
+    FieldPath,
+    Style,
+    field_names,
+    get_field,
+    is_list,
+    leads_somewhere,
+    style_of,
+    tuple_getter,
+    walk,
+)
+
+_LEAST_CORNERS = 3
+_OUTER, _INNER = "outer", "inner"
+
+
+def outlines_from_lists(
+    lists: list[Any], *, is_bounds: bool, have_size: bool = False
+) -> tuple[Integers, Floats, int]:
+    """Return the counts (R,) and the corners (V, 3) of outlines, and how many have too few corners.
+
+    These have one corner, NaN, so that their objects are unknown.
+
+    Args:
+        is_bounds: whether each list has two opposite corners of a box, which become four.
+        have_size: whether bounds have width and height instead of the second corner.
+    """
+    counts, points = points_from_lists(lists)
+    if is_bounds:
+        few = counts != 2
+        starts = starts_from_counts(counts)[:-1][~few]
+        ends = np.stack([points[starts], points[starts + 1]]) if len(starts) else np.empty((2, 0, 3))
+        if have_size:
+            # a negative size makes the object unknown, as one of a shape does
+            ends[1] = ends[0] + np.where(ends[1] < 0, np.nan, ends[1])
+        (left, low, _), (right, high, _) = ends.min(axis=0).T, ends.max(axis=0).T
+        xs, ys = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
+        boxes = np.stack([xs, ys, np.zeros_like(xs)], axis=2).reshape(-1, 3)
+        counts, points = np.where(few, 0, 4), boxes
+    else:
+        few = counts < _LEAST_CORNERS
+    if not few.any():
+        return counts, points, 0
+    kept = np.repeat(~few, counts)
+    at = starts_from_counts(np.where(few, 0, counts))[:-1][few]
+    points = np.insert(points[kept], at, np.nan, axis=0)
+    return np.where(few, 1, counts), points, int(np.count_nonzero(few))
+
+
+def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
+    """Return the counts (R,) and the corners (V, 3) of lists of points, of pairs, or of x, y, x, y …."""
+    example = next((each[0] for each in lists if len(each)), None)
+    flat = list(chain.from_iterable(lists))
+    counts = np.array([len(each) for each in lists], np.int64)
+    names = field_names(example)
+    if "x" in names and "y" in names:
+        axes = "xyz" if "z" in names else "xy"
+        get = tuple_getter([FieldPath.of(axis) for axis in axes], example)
+        rows = rows_from_tuples(map(get, flat), len(flat), len(axes), style_of(example))
+        return counts, rows if len(axes) == 3 else np.column_stack([rows, np.zeros(len(flat))])
+    if example is None or hasattr(example, "__len__"):
+        pairs = np.array([(point[0], point[1]) for point in flat], np.float64).reshape(-1, 2)
+        return counts, np.column_stack([pairs, np.zeros(len(pairs))])
+    if (counts % 2).any():
+        raise ValueError("a polygon has an odd number of coordinates; give x and y of each corner in turn")
+    pairs = np.array(flat, np.float64).reshape(-1, 2)
+    return counts // 2, np.column_stack([pairs, np.zeros(len(pairs))])
+
+
+def rows_from_tuples(tuples: Iterable[Sequence[Any]], count: int, width: int, style: Style) -> Floats:
+    """Return the numbers (count, width) in tuples, NaN for the null of JSON."""
+    if style == "keys":
+        return np.array(list(tuples), np.float64).reshape(count, width)
+    rows = list(tuples)
+    try:
+        # faster, but it does not take None, for an element that a list lacks
+        return np.fromiter(chain.from_iterable(rows), np.float64, count * width).reshape(count, width)
+    except TypeError:
+        return np.array(rows, np.float64).reshape(count, width)
+
+
+def features_in(message: object) -> dict[str, object]:
+    """Return the features of a foxglove.GeoJSON, whose only field is a text.
+
+    Raises:
+        ContentError: the text is no GeoJSON.
+    """
+    text = get_field(message, "geojson")
+    try:
+        value = json.loads(str(text))
+    except (ValueError, RecursionError) as error:
+        raise ContentError(f"geojson: it is not JSON: {error}") from None
+    kind = value.get("type") if isinstance(value, dict) else None
+    if kind == "FeatureCollection":
+        return value  # type: ignore[no-any-return]
+    if kind is None:
+        raise ContentError("geojson: it has no type, such as FeatureCollection")
+    feature = value if kind == "Feature" else {"type": "Feature", "geometry": value, "properties": {}}
+    return {"features": [feature]}
+
+
+def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
+    """Return the path of what holds the rings that a path leads to; None if it leads to corners.
+
+    Fields beside the path say whether there are rings: `type` by `coordinates`, `inner` by `outer`.
+    """
+    for length, step in enumerate(path.steps):
+        owner_path = FieldPath(path.text, path.steps[:length])
+        names = field_names(walk(owner_path, example))
+        if (step == _OUTER and _INNER in names) or (step == "coordinates" and "type" in names):
+            return owner_path
+    value = walk(path, example) if leads_somewhere(path, example) else None
+    names = field_names(value)
+    has_rings = _INNER in names or "coordinates" in names or _depth(value) > 2
+    return path if has_rings else None
+
+
+def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Floats, int]:
+    """Return the number of outlines (R,) of each object, their corners' counts and the corners (V, 3).
+
+    A polygon without a hole is one outline, one with holes some convex ones. The last result counts objects
+    without a polygon, which have one corner, NaN, so that they are unknown.
+
+    Raises:
+        ContentError: rings cross or touch themselves or each other.
+    """
+    outlines: list[Floats] = []
+    outline_counts, empty = [], 0
+    for holder in holders:
+        pieces = [piece for rings in _polygons_in(holder) for piece in _pieces(rings)]
+        empty += not pieces
+        outlines += pieces or [np.full((1, 3), np.nan)]
+        outline_counts.append(max(1, len(pieces)))
+    corner_counts = np.array([len(outline) for outline in outlines], np.int64)
+    corners = np.concatenate(outlines) if outlines else np.empty((0, 3))
+    return np.array(outline_counts, np.int64), corner_counts, corners, empty
+
+
+def _polygons_in(holder: Any) -> list[Any]:
+    """Return the polygons of an object, each a list of rings."""
+    names = field_names(holder)
+    if _OUTER in names:
+        rings = [get_field(holder, _OUTER), *get_field(holder, _INNER)]  # type: ignore[misc]
+        return [[get_field(ring, "points") if "points" in field_names(ring) else ring for ring in rings]]
+    if "type" in names:
+        coordinates = get_field(holder, "coordinates") if "coordinates" in names else ()
+        # points and lines are no bodies
+        kinds: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
+        return list(kinds.get(get_field(holder, "type"), ()))
+    return list(holder) if _depth(holder) > 3 else [holder]
+
+
+def _depth(value: Any) -> int:
+    """Return how many lists are nested in each other."""
+    return 1 + _depth(value[0]) if is_list(value) and len(value) else int(is_list(value))
+
+
+def _pieces(rings: Sequence[Any]) -> list[Floats]:
+    """Return the outlines (n, 3) of a polygon; none if its outer ring has too few corners."""
+    outer, *holes = (_ring(ring) for ring in rings) if len(rings) else (np.empty((0, 3)),)
+    if len(outer) < _LEAST_CORNERS:
+        return []
+    holes = [hole for hole in holes if len(hole) >= _LEAST_CORNERS]
+    if not holes:
+        return [outer]
+    try:
+        pieces = convex_pieces(outer[:, :2], [hole[:, :2] for hole in holes])
+    except GeometryError as error:
+        raise ContentError(str(error)) from None
+    return [np.column_stack([piece, np.full(len(piece), outer[0, 2])]) for piece in pieces]
+
+
+def _ring(corners: Any) -> Floats:
+    """Return the corners (n, 3) of a ring, without a last one that closes it."""
+    _, points = points_from_lists([corners])
+    is_closed = len(points) > 1 and (points[0] == points[-1]).all()
+    return points[:-1] if is_closed else points
