@@ -258,6 +258,11 @@ def geodetic_order(paths: Alternatives) -> Alternatives | None:
     return (latitude[0], longitude[0]) if latitude and longitude else None
 
 
+def geodetic_paths(layout: MessageLayout) -> Alternatives | None:
+    """Return the paths of latitude and longitude of a layout; None for coordinates in metres."""
+    return next(filter(None, map(geodetic_order, layout.position[:1])), None)
+
+
 def short_type(name: str) -> str:
     """Return `pkg/Name` for a type as written by ROS 1, ROS 2, protobuf or Foxglove's JSON schemas."""
     words = re.split(r"[/.]|::", name)
@@ -322,7 +327,7 @@ def _pose_changes(mapping: TopicMapping) -> dict[str, object]:
     if mapping.position is not None:
         paths = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         changes |= {"position": (paths,), "polygon": (), "solids": ""}
-        if paths == GEODETIC:
+        if geodetic_order(paths) is not None:
             changes["frame"] = ()
     if mapping.orientation is not None:
         changes |= {"orientation": (mapping.orientation,), "yaw": ()}

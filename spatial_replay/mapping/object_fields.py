@@ -24,13 +24,13 @@ from spatial_replay.mapping.field_paths import (
     sparse,
     walk,
 )
-from spatial_replay.mapping.message_types import GEODETIC
+from spatial_replay.mapping.message_types import geodetic_order
 
 _DEEPEST = 4
 """Levels of nested fields to search."""
 _POSITIONS = ("position", "center", "centre", "translation", "location", "point")
-_TURNS = ("orientation", "rotation", "quaternion")
-_YAWS = ("yaw", "theta", "heading", "angle")
+_TURNS = ("orientation", "rotation", "quaternion", "q", "quat")
+_YAWS = ("yaw", "theta", "heading", "angle", "course", "cog")
 _SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
 _OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
 _BOUNDS = ("xyxy", "bounds", "bbox_xyxy", "box_xyxy", "xywh", "bbox_xywh", "bbox", "box", "bounding_box")
@@ -92,6 +92,7 @@ class Guess:
     Attributes:
         objects: of the list of objects, or None for a single one.
         position: of a point, or of x and y.
+        has_order: whether the orientation is a list, in either order.
         bounds: of two opposite corners of a box, as a list or as four numbers.
         bounds_have_size: whether the last two of these numbers are width and height.
         is_own: whether the outline is in the object's own frame, at its pose.
@@ -106,6 +107,7 @@ class Guess:
     objects: str | None = None
     position: str | tuple[str, ...] | None = None
     orientation: str | None = None
+    has_order: bool = False
     yaw: str | None = None
     polygon: str | None = None
     is_own: bool = False
@@ -118,6 +120,12 @@ class Guess:
     has_zeros_left_out: bool = False
     others: tuple[str, ...] = ()
     is_plan: bool = False
+
+    @property
+    def has_compass(self) -> bool:
+        """Whether the yaw is a heading beside latitude and longitude, and so counts from north."""
+        is_geodetic = isinstance(self.position, tuple) and geodetic_order(self.position) is not None
+        return is_geodetic and self.yaw is not None and _words(self.yaw)[-1] in ("heading", "course", "cog")
 
     @property
     def score(self) -> int:
@@ -176,7 +184,7 @@ def _best(messages: Sequence[object]) -> Guess | None:
     best = max(guesses, key=lambda guess: (guess.score, guess.is_own))
     if best.names == (INDEX,):
         return best
-    if best.position == GEODETIC:
+    if isinstance(best.position, tuple) and geodetic_order(best.position):
         # the frame of a fix is that of its receiver
         best = replace(best, names=(*best.names, "frame_id"))
     names = tuple(name for name in best.names if _distinguishes(name, best, messages))
@@ -331,6 +339,7 @@ def _object_in(value: object) -> Guess | None:
     return Guess(
         position=position if is_posed else None,
         orientation=turn if is_posed else None,
+        has_order=is_posed and turn is not None and is_list(fields[turn]),
         yaw=_first(fields, _YAWS, _is_number) if is_posed and not turn else None,
         polygon=polygon,
         is_own=is_own,
@@ -397,7 +406,11 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
     """Return the paths of a position and an orientation, of one pose if there is one."""
-    turns = [path for path in _paths_by_name(fields, _TURNS) if _has(fields[path], "xyzw")]
+    turns = [
+        path
+        for path in _paths_by_name(fields, _TURNS)
+        if _has(fields[path], "xyzw") or _numbers(fields[path], 4)
+    ]
     places = [
         path
         # such as `position`, else `agvPosition`
@@ -413,8 +426,8 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
     position: str | tuple[str, ...] | None = places[0] if places else None
     if position is None and all(_is_number(fields.get(name)) for name in "xy"):
         position = None if _is_number(fields.get("w")) else ("x", "y")
-    if position is None and all(_is_number(fields.get(name)) for name in GEODETIC):
-        position = GEODETIC
+    if position is None:
+        position = geodetic_order(tuple(path for path, value in fields.items() if _is_number(value)))
     return position, turns[0] if turns else None
 
 

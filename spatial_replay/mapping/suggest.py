@@ -5,18 +5,14 @@ A topic of a known type needs no fields. In other messages, `object_fields` find
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import compress
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Literal, TypeAlias
-
-import numpy as np
 
 from spatial_replay.bags.decoders import Topic
 from spatial_replay.errors import UsageError
@@ -34,17 +30,18 @@ from spatial_replay.mapping.field_paths import (
     name_from_topic,
     walk,
 )
-from spatial_replay.mapping.mapping_file import NO_TOPIC, TopicMapping, parse_mapping
+from spatial_replay.mapping.mapping_file import NO_TOPIC, TopicMapping
 from spatial_replay.mapping.message_types import (
     BUILT_IN,
-    GEODETIC,
     TRANSFORM_TYPES,
     MessageLayout,
+    geodetic_paths,
     layout_of_topic,
     short_type,
 )
 from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in, takes_turns
-from spatial_replay.mapping.topic_reader import ReadingPlan, TopicReader, doubts_of
+from spatial_replay.mapping.topic_reader import doubts_of
+from spatial_replay.mapping.trial import FROM_NORTH, choose_entry, flow_text, readable_messages, yaml_text
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
 from spatial_replay.trace.trace import FOREVER
@@ -54,10 +51,9 @@ EXAMPLES = 20
 
 _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
-_NO_TIMES: Mapping[str, int] = MappingProxyType({})
+_NO_TIMES: Mapping[str, Sequence[int]] = MappingProxyType({})
 _MOST_SIGNALS = 12
 _TEXTS = frozenset({"name", "label"})
-_PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
 """Topics about programs rather than objects, by the last part of their names."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
@@ -109,34 +105,44 @@ class TopicSuggestion:
     @property
     def entry(self) -> str:
         """The entry in YAML's flow style; empty if nothing looks like an object."""
-        return "" if self.fields is None else _flow(self.fields)
+        return "" if self.fields is None else flow_text(self.fields)
 
     @property
     def signals(self) -> str:
         """An entry that takes the numbers as signals; empty without any."""
         prefix = _topic_words(self.topic.name)
         names = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
-        signals = _flow({_text(name): _text(path) for name, path in names.items()})
+        signals = flow_text({yaml_text(name): yaml_text(path) for name, path in names.items()})
         return f"{{signals: {signals}}}" if names else ""
 
 
 def suggest_topics(
-    topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]
+    topics: Sequence[Topic],
+    examples: Mapping[str, Sequence[object]],
+    times_ns: Mapping[str, Sequence[int]] = _NO_TIMES,
 ) -> tuple[TopicSuggestion, ...]:
     """Suggest an entry for each topic.
 
     Args:
         examples: some decoded messages of each topic, by its name.
+        times_ns: when each of these was recorded; by default, each second.
     """
-    pairs = [(topic, examples.get(topic.name, ())) for topic in topics]
-    return tuple(_with_trial(_suggestion(topic, of_topic), of_topic) for topic, of_topic in pairs)
+    return tuple(
+        _with_trial(
+            _suggestion(topic, messages),
+            messages,
+            times_ns.get(topic.name) or [second * 10**9 for second in range(len(messages))],
+        )
+        for topic in topics
+        for messages in [examples.get(topic.name, ())]
+    )
 
 
 def suggest_mapping(
     log: str,
     topics: Sequence[Topic],
     examples: Mapping[str, Sequence[object]],
-    first_ns: Mapping[str, int] = _NO_TIMES,
+    times_ns: Mapping[str, Sequence[int]] = _NO_TIMES,
 ) -> str:
     """Return the text of a mapping file, with comments.
 
@@ -145,13 +151,14 @@ def suggest_mapping(
     Args:
         log: the log's name.
         examples: some decoded messages of each topic, by its name.
-        first_ns: log time of the first message of each topic, by its name.
+        times_ns: when each of these was recorded, in their order.
     """
-    suggestions = suggest_topics(topics, examples)
+    suggestions = suggest_topics(topics, examples, times_ns)
+    first_ns = {name: times[0] for name, times in times_ns.items() if times}
     usable = [
         suggestion
         for suggestion in suggestions
-        if len(_text(suggestion.topic.name)) <= _LONGEST_KEY and not suggestion.aside
+        if len(yaml_text(suggestion.topic.name)) <= _LONGEST_KEY and not suggestion.aside
     ]
     mapped = [suggestion for suggestion in usable if suggestion.entry and not suggestion.is_transforms]
     axes: _Axes = next(
@@ -204,7 +211,7 @@ def suggest_mapping(
 
 def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
     yield from (f"  # {text}" for text in (_description(suggestion.topic), *suggestion.remarks))
-    yield f"  {_text(suggestion.topic.name)}: {suggestion.entry or suggestion.signals}"
+    yield f"  {yaml_text(suggestion.topic.name)}: {suggestion.entry or suggestion.signals}"
 
 
 def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
@@ -233,50 +240,41 @@ def _with_frame_remark(suggestion: TopicSuggestion) -> TopicSuggestion:
 def _with_own_name(suggestion: TopicSuggestion) -> TopicSuggestion:
     prefix = _topic_words(suggestion.topic.name)
     name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
-    fields = {**(suggestion.fields or {}), "name": _text(name)}
+    fields = {**(suggestion.fields or {}), "name": yaml_text(name)}
     # of a list, its path comes first
     ordered = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
     return replace(suggestion, fields=dict(ordered))
 
 
-def _with_trial(suggestion: TopicSuggestion, examples: Sequence[object]) -> TopicSuggestion:
+def _with_trial(
+    suggestion: TopicSuggestion, examples: Sequence[object], times_ns: Sequence[int]
+) -> TopicSuggestion:
     """Return a suggestion after reading messages by it; it is aside where that fails."""
-    topic = suggestion.topic
+    topic, layout = suggestion.topic, suggestion.layout
     entry = suggestion.entry or suggestion.signals
     if not entry or not examples or suggestion.is_transforms:
         return suggestion
-    layout = suggestion.layout
-    is_geodetic = layout is not None and GEODETIC in layout.position
-    if is_geodetic and _first_fix(suggestion, examples) is None:
-        return replace(suggestion, aside="no message looked at has a fix in degrees, to count metres from")
-    reasons: list[str] = []
-    origin = "origin: [0, 0]\n" if is_geodetic else ""
+    origin = ""
+    if layout is not None and geodetic_paths(layout) is not None:
+        place = _first_fix(layout, examples)
+        if place is None:
+            return replace(
+                suggestion, aside="no message looked at has a fix in degrees, to count metres from"
+            )
+        origin = f"origin: [{place[0]!r}, {place[1]!r}]\n"
     try:
-        mapping = parse_mapping(f"{origin}topics:\n  {_text(topic.name)}: {entry}")
-        (planned,) = ReadingPlan.of(mapping, [topic]).planned
-        reader = TopicReader(
-            planned,
-            mapping,
-            lambda topic: lambda message: message,
-            Codes(),
-            Codes(),
-            decodes_early=False,
-            report=lambda topic, time_ns, reason: reasons.append(reason),
-        )
-        good = reader.read(np.arange(len(examples)), examples).good
-        reader.finish()
+        readable, reasons = readable_messages(topic, entry, examples, origin)
     except UsageError as error:
         return replace(suggestion, aside=_comment(str(error).partition(f"{topic.name}: ")[2] or str(error)))
-    if not good.any():
-        return replace(suggestion, aside=_comment(reasons[0]))
-    if not reasons:
+    if reasons:
+        first = f"cannot be read: {_comment(reasons[0])}"
+        remark = f"{len(reasons)} of {len(examples)} messages looked at {first}"
+        frames = suggestion.frames if layout is None else frozenset(_iter_frames(layout, readable))
+        suggestion = replace(suggestion, remarks=(*suggestion.remarks, remark), frames=frames)
+    if suggestion.fields is None:
         return suggestion
-    if layout is not None:
-        suggestion = replace(
-            suggestion, frames=frozenset(_iter_frames(layout, list(compress(examples, good))))
-        )
-    remark = f"{len(reasons)} of {len(examples)} messages looked at cannot be read: {_comment(reasons[0])}"
-    return replace(suggestion, remarks=(*suggestion.remarks, remark))
+    fields, remarks = choose_entry(topic, suggestion.fields, examples, times_ns, origin)
+    return replace(suggestion, fields=fields, remarks=(*suggestion.remarks, *map(_comment, remarks)))
 
 
 def _origin_lines(
@@ -284,30 +282,34 @@ def _origin_lines(
 ) -> Iterator[str]:
     """Yield the line about where local metres are counted from: the first fix."""
     for suggestion in active:
-        place = _first_fix(suggestion, examples.get(suggestion.topic.name, ()))
+        layout = suggestion.layout
+        place = None if layout is None else _first_fix(layout, examples.get(suggestion.topic.name, ()))
         if place is not None:
             yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
             yield f"origin: [{place[0]!r}, {place[1]!r}]"
             return
 
 
-def _first_fix(suggestion: TopicSuggestion, examples: Sequence[object]) -> tuple[float, float] | None:
-    """Return latitude and longitude of the first fix in degrees; None without one."""
-    layout = suggestion.layout
-    if layout is None or GEODETIC not in layout.position:
+def _first_fix(layout: MessageLayout, examples: Sequence[object]) -> tuple[float, float] | None:
+    """Return latitude and longitude of the first fix, in degrees; None without one."""
+    paths = geodetic_paths(layout)
+    if paths is None:
         return None
-    places = (_place_of_fix(fix) for _, fix in _iter_objects(layout, examples))
+    places = (_place_of_fix(fix, paths) for _, fix in _iter_objects(layout, examples))
     return next((place for place in places if place is not None), None)
 
 
-def _place_of_fix(fix: object) -> tuple[float, float] | None:
+def _place_of_fix(fix: object, paths: Sequence[str]) -> tuple[float, float] | None:
     """Return latitude and longitude; None without a fix, also where zeros stand for its lack."""
     status = FieldPath.of("status.status")
     try:
-        latitude, longitude = (float(walk(FieldPath.of(name), fix)) for name in GEODETIC)  # type: ignore[arg-type]
+        latitude, longitude = (float(walk(FieldPath.of(path), fix)) for path in paths)  # type: ignore[arg-type]
         is_fix = not leads_somewhere(status, fix) or float(walk(status, fix)) >= 0  # type: ignore[arg-type]
     except (FieldError, TypeError, ValueError):
         return None
+    if 90 < abs(latitude) <= 90e7 and abs(longitude) <= 360e7:
+        # whole numbers, as of MAVLink
+        latitude, longitude = round(latitude * 1e-7, 7), round(longitude * 1e-7, 7)
     is_place = abs(latitude) <= 90 and abs(longitude) <= 360 and (latitude, longitude) != (0.0, 0.0)
     return (latitude, longitude) if is_fix and is_place else None
 
@@ -338,7 +340,7 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
         if reading.name == "{topic}" and takes_turns(_children(examples)):
             # such as the odometry of several robots on one topic
             name = "{child_frame_id}"
-            fields = {"name": _text(name), **fields}
+            fields = {"name": yaml_text(name), **fields}
         remarks = () if has_outline else _SIZELESS
         if _is_by_place(topic, reading, examples):
             remarks = (*remarks, BY_PLACE)
@@ -424,7 +426,9 @@ def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     children = {child for message in examples for _, child in _edges(message)}
     mounted = sorted(child for child in children if _SENSORS.search(child))
     left_out = (
-        {"except": f"[{', '.join(map(_text, mounted))}]"} if mounted and len(mounted) < len(children) else {}
+        {"except": f"[{', '.join(map(yaml_text, mounted))}]"}
+        if mounted and len(mounted) < len(children)
+        else {}
     )
     frames = frozenset(parent for message in examples for parent, _ in _edges(message))
     return TopicSuggestion(
@@ -458,6 +462,7 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
         ("class", guess.class_name),
         ("position", guess.position),
         ("orientation", guess.orientation),
+        ("order", "xyzw" if guess.has_order else None),
         ("yaw", guess.yaw),
         ("polygon", None if guess.is_own else guess.polygon),
         ("bounds", guess.bounds),
@@ -465,13 +470,11 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
     fields = {key: _value(key, value) for key, value in parts if value is not None}
     if guess.bounds_have_size:
         fields["bounds"] = f"{{field: {fields['bounds']}, form: xywh}}"
+    if guess.has_compass:
+        fields["yaw"] = f"{{field: {fields['yaw']}, {FROM_NORTH}}}"
     if guess.has_zeros_left_out:
         fields["missing"] = "0"
     return fields if {"polygon", "bounds"} & fields.keys() else {**fields, "shape": _shape(guess)}
-
-
-def _flow(fields: Mapping[str, str]) -> str:
-    return "{" + ", ".join(f"{key}: {value}" for key, value in fields.items()) + "}"
 
 
 def _topic_words(topic: str) -> str:
@@ -486,13 +489,13 @@ def _signal_name(path: str) -> str:
 
 def _value(key: str, value: str | tuple[str, ...]) -> str:
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_text, value))}]"
-    return f"{{field: {_text(value)}}}" if key == "class" else _text(value)
+        return f"[{', '.join(map(yaml_text, value))}]"
+    return f"{{field: {yaml_text(value)}}}" if key == "class" else yaml_text(value)
 
 
 def _shape(guess: Guess) -> str:
     if guess.polygon is not None:
-        return f"{{polygon: {_text(guess.polygon)}}}"
+        return f"{{polygon: {yaml_text(guess.polygon)}}}"
     if not guess.size:
         return f"{{disc: {_RADIUS}}}"
     return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
@@ -518,6 +521,8 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
     if isinstance(guess.bounds, str) and "xy" not in guess.bounds:
         sizeless = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
     indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
+    if guess.has_compass:
+        by_id = (*by_id, f"{guess.yaw} beside latitude and longitude counts from north, clockwise")
     return by_id + sizeless + indexed + others
 
 
@@ -536,7 +541,7 @@ def _choose_frame(
     edges = sorted({edge for message in transforms for edge in _edges(message)})
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
     if len(frames) < 2:
-        fixed = _text((roots or frames or ["map"])[0])
+        fixed = yaml_text((roots or frames or ["map"])[0])
         lines = ["# without a fixed frame, coordinates are taken as they are", f"# fixed_frame: {fixed}"]
         return (lines if edges else []), {}
     joined = {root: _below(root, edges).intersection(frames) for root in (*roots, *frames)}
@@ -558,7 +563,7 @@ def _choose_frame(
             f"# no transforms join {_comment(', '.join(others))} with {fixed}: what is in these is unknown or"
             " left out; `frame` of a topic overrides its frame"
         )
-    return [*lines, f"fixed_frame: {_text(fixed)}"], apart
+    return [*lines, f"fixed_frame: {yaml_text(fixed)}"], apart
 
 
 def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
@@ -587,7 +592,7 @@ def _edges(message: object) -> Iterator[tuple[str, str]]:
 def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Iterator[str]:
     yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
     if active:
-        topic = _text(_topic_to_sample(active, first_ns).name)
+        topic = yaml_text(_topic_to_sample(active, first_ns).name)
         yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
         yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
 
@@ -606,7 +611,7 @@ def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, i
 
 
 def _unused_line(suggestion: TopicSuggestion, axes: _Axes) -> str:
-    topic, what = _text(suggestion.topic.name), _description(suggestion.topic)
+    topic, what = yaml_text(suggestion.topic.name), _description(suggestion.topic)
     aside = suggestion.aside
     if suggestion.entry and suggestion.axes != axes and not suggestion.is_transforms:
         aside = aside or f"{_AXES[suggestion.axes]}: for a mapping of its own with y down"
@@ -626,8 +631,3 @@ def _comment(text: str) -> str:
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())[
         :200
     ]
-
-
-def _text(text: str) -> str:
-    """Return a text as a YAML scalar."""
-    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=True)

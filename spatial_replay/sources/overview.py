@@ -119,7 +119,7 @@ def survey(
             advance(_STEP)
         if not whole and not counter.missing:
             break
-    mappable = suggest_topics(topics, counter.examples)
+    mappable = suggest_topics(topics, counter.examples, counter.times_ns)
     faults = FaultList()
     reader.move_faults(faults)
     return Survey(
@@ -128,7 +128,7 @@ def survey(
         start_ns=counter.start_ns,
         end_ns=counter.end_ns,
         topics=tuple(TopicSurvey(e.topic, counter.counts[e.topic.name], e.entry) for e in mappable),
-        mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
+        mapping=suggest_mapping(reader.name, topics, counter.examples, counter.times_ns),
         faults=faults.take(last=True),
         remarks=(*reader.take_remarks(), *counter.take_remarks()),
     )
@@ -233,9 +233,9 @@ class _Counter:
     def __init__(self, reader: MessageReader, topics: Sequence[Topic]) -> None:
         self.start_ns: int | None = None
         self.end_ns: int | None = None
-        self.first_ns: dict[str, int] = {}
         self.counts = {topic.name: 0 for topic in topics}
         self.examples: dict[str, list[object]] = {}
+        self.times_ns: dict[str, list[int]] = {}
         self._remarks: list[str] = []
         self._undecodable: dict[str, tuple[int, Sentence]] = {}
         self._decoders: dict[str, Decoder] = {}
@@ -245,7 +245,7 @@ class _Counter:
                 if topic.unreadable is not None:
                     raise LogError(topic.unreadable)
                 self._decoders[topic.name] = reader.decoder(topic)
-                self.examples[topic.name] = []
+                self.examples[topic.name], self.times_ns[topic.name] = [], []
             except LogError as error:
                 self._remarks.append(str(error))
         self._declared = {topic.name: topic.count for topic in topics}
@@ -255,7 +255,6 @@ class _Counter:
         time_ns, topic = message.log_time_ns, message.topic
         self.start_ns = time_ns if self.start_ns is None else min(self.start_ns, time_ns)
         self.end_ns = time_ns if self.end_ns is None else max(self.end_ns, time_ns)
-        self.first_ns.setdefault(topic, time_ns)
         self.counts[topic] += 1
         if self.counts[topic] in _LOOKED_AT and topic in self.examples:
             self._look(message)
@@ -269,6 +268,7 @@ class _Counter:
             return
         try:
             self.examples[topic].append(self._decoders[topic](message.payload))
+            self.times_ns[topic].append(message.log_time_ns)
         except LogError as error:
             start = f"topic {topic!r}: "
             what = f"{start}{str(error).removeprefix(start)}, at "

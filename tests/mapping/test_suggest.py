@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from math import cos, pi, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from spatial_replay.mapping.suggest import suggest_mapping
 from spatial_replay.sources import open_source
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
+COMPASS = Angle("heading", scale=-pi / 180, zero=pi / 2, is_plain=False)
 TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 STAMP = {"sec": 0, "nanosec": 0}
 
@@ -106,6 +108,49 @@ def test_boxes_by_two_corners_are_suggested() -> None:
     _, mapping = suggested(cup={"boxes": [{"label": "cup", "xyxy": [1, 2, 3, 6]}]})
     (topic,) = mapping.topics
     assert (topic.objects, topic.name, topic.bounds) == ("boxes[*]", "{label}", "xyxy")
+
+
+def test_the_order_of_quaternions_is_that_in_which_objects_stand_upright() -> None:
+    turns = [(cos(angle), 0.0, 0.0, sin(angle)) for angle in (0.1, 0.7, 1.3, 2.0)]
+    for order, shift in (("wxyz", 0), ("xyzw", 1)):
+        messages = [
+            {"position": [second, 0.0, 0.0], "q": [*turn[shift:], *turn[:shift]]}
+            for second, turn in enumerate(turns)
+        ]
+        text, topic = suggested_for(messages)
+        assert (topic.position, topic.orientation, topic.order) == ("position", "q", order)
+        assert ("0 of 4 objects stand upright" in text) == (order == "wxyz")
+
+
+def test_angles_are_read_as_objects_move() -> None:
+    def yaw(name: str, *values: float, **more: Any) -> Angle | None:
+        # a way around a circle, in degrees from x
+        messages = [
+            {"x": 9 * cos(radians(turn)), "y": 9 * sin(radians(turn)), name: value, **more}
+            for turn, value in zip(range(0, 360, 10), values, strict=True)
+        ]
+        return suggested_for(messages)[1].yaw
+
+    courses = [turn + 95 for turn in range(0, 360, 10)]
+    assert yaw("yaw", *map(radians, courses)) == Angle("yaw")
+    assert yaw("yaw", *courses) == Angle("yaw", scale=pi / 180)
+    compass = [(90 - course) % 360 for course in courses]
+    assert yaw("heading", *compass) == COMPASS
+    fixes = [{"latitude": 52.0 + 1e-5 * k, "longitude": 5.0, "heading": 511.0} for k in range(4)]
+    fixes += [{**fix, "heading": 90.0} for fix in fixes]
+    text, topic = suggested_for(fixes)
+    assert (topic.yaw, topic.invalid) == (COMPASS, (511.0,))
+    assert "invalid: [511], since otherwise its yaw reaches 511 degrees" in text
+
+
+def test_lists_of_changes_are_not_complete() -> None:
+    def part(second: int) -> dict[str, Any]:
+        ids = (1, 2) if second % 2 else (3, 4)
+        return {"targets": [{"id": number, "x": number * 5.0, "y": 0.1 * second} for number in ids]}
+
+    assert suggested_for([part(second) for second in range(20)])[1].complete is False
+    whole = [{"targets": part(0)["targets"] + part(1)["targets"]} for _ in range(20)]
+    assert suggested_for(whole)[1].complete is None
 
 
 def test_boxes_by_four_numbers_are_read_as_their_values_allow() -> None:
@@ -428,7 +473,7 @@ def test_topics_that_cannot_be_read_as_suggested_are_comments_with_the_reason() 
     topics = [Topic("/boat", "own/Boat", "json"), Topic("/box", "vision_msgs/msg/Detection2DArray", "json")]
     center = {"center": {"x": 1, "y": 1}}
     examples: dict[str, list[object]] = {
-        "/boat": [{"latitude": 520000000, "longitude": 50000000}],
+        "/boat": [{"latitude": 0.0, "longitude": 0.0}],
         "/box": [{"detections": [{"id": "a", "bbox": center}]}],
     }
     text = suggest_mapping("run", topics, examples)
@@ -557,7 +602,7 @@ def test_topic_names_are_quoted_if_need_be() -> None:
 
 def test_the_last_topic_to_start_is_sampled() -> None:
     topics = [Topic(name, "geometry_msgs/msg/PoseStamped", "cdr", 100) for name in ("/a", "/b", "/late")]
-    begins = {"/a": 10, "/b": 20, "/late": 10**10}
+    begins = {"/a": [10], "/b": [20], "/late": [10**10]}
     assert parse_mapping(suggest_mapping("run", topics, {}, begins)).sampling.topic == "/b"
     assert parse_mapping(suggest_mapping("run", topics, {})).sampling.topic == "/a"
 
