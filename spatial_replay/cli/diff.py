@@ -110,7 +110,7 @@ def diff(
         show(*difference.lines())
         if output is not None:
             show(f"wrote {output}")
-    warn(*difference.faults)
+    warn(*difference.faults, *difference.doubts)
     show_diagnostics(difference.missing)
     code = ExitCode.SATISFIED if difference.is_empty else ExitCode.VIOLATED
     return most_severe([code, ExitCode.DAMAGED]) if difference.faults else code

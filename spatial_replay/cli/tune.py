@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,14 +20,14 @@ from spatial_replay.cli.options import (
     output_option,
     reading_options,
 )
-from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_file, show_json
+from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_file, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, is_address, local_copy
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
     from spatial_replay.logs.read_options import Reading
-    from spatial_replay.tuning.margins import Value
+    from spatial_replay.tuning.margins import LabelledRun, Value
     from spatial_replay.tuning.tuned import TunedConstant, Tuning
 
 
@@ -154,6 +154,7 @@ def tune(
     with progress("logs", 2 * len(good + bad)) as advance:
         runs = load_runs(good, bad, lambda path: read_trace(path, **reading), advance)
         tuning = tune_runs(file, runs, ranges, each=objects_by_parameter(choices), seed=seed, advance=advance)
+    _warn_of_doubts(runs)
     changed: tuple[str, ...] = ()
     if write and tuning.is_found:
         changed = write_constants(local_copy(spec), plain_values(tuning.specification))
@@ -170,6 +171,11 @@ def tune(
         if output is not None:
             show(f"wrote {output}")
     return ExitCode.SATISFIED if tuning.is_found else ExitCode.VIOLATED
+
+
+def _warn_of_doubts(runs: Sequence[LabelledRun]) -> None:
+    """Warn of assumptions that logs contradict, which limits would be fitted to."""
+    warn(*(doubt.remark(run.name) for run in runs for doubt in run.trace.doubts))
 
 
 def _lines(tuning: Tuning) -> Iterator[str]:
@@ -256,6 +262,7 @@ def learn(
     with progress("logs", 2 * len(good + bad)) as advance:
         runs = load_runs(good, bad, lambda path: read_trace(path, **reading), advance)
         learned = learn_runs(runs, lines=lines or DEFAULT_LINES, advance=advance)
+    _warn_of_doubts(runs)
     if output is not None and learned.text:
         with replacing(output, inputs) as stream:
             stream.write(learned.text.encode())

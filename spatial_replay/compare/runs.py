@@ -726,6 +726,7 @@ class LogDiff(Printed, Displayed):
         decision: the first decision that differs; None if none does, or the runs were not planned.
         has_equal_samples: whether all samples are equal.
         faults: what was lost while reading.
+        doubts: remarks on assumptions that a log contradicts.
         missing: a warning for each name in the specifications that a log never has.
         traces: the samples.
     """
@@ -743,6 +744,7 @@ class LogDiff(Printed, Displayed):
     decision: DecisionDiff | None
     has_equal_samples: bool
     faults: tuple[str, ...]
+    doubts: tuple[str, ...]
     traces: tuple[Trace, Trace]
     missing: tuple[Diagnostic, ...]
 
@@ -864,6 +866,11 @@ def diff_sources(
         compare_decisions(sources),
         not objects and a == b,
         tuple(text for read in checked for text in counted_from(read.trace.faults, read.zero_ns)),
+        tuple(
+            remark
+            for source, read in zip(sources, checked, strict=True)
+            for remark in counted_from((d.remark(source.name) for d in read.trace.doubts), read.zero_ns)
+        ),
         (a, b),
         tuple(dict.fromkeys(remark for read in checked for remark in read.missing)),
     )

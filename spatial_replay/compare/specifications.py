@@ -335,6 +335,7 @@ class SpecificationDiff(Printed, Displayed):
         removed, added: names of results that only the old, or only the new one has.
         first_ns: the time that sentences count from.
         faults: what was lost while reading.
+        doubts: remarks on assumptions that a log contradicts.
         missing: a warning for each name in the specifications that the log never has.
     """
 
@@ -347,6 +348,7 @@ class SpecificationDiff(Printed, Displayed):
     removed: tuple[str, ...]
     added: tuple[str, ...]
     faults: tuple[str, ...]
+    doubts: tuple[str, ...]
     missing: tuple[Diagnostic, ...]
 
     @property
@@ -472,6 +474,7 @@ def diff_over_source(
         removed,
         added,
         counted_from(trace.faults, zero_ns),
+        counted_from((doubt.remark(source.name) for doubt in trace.doubts), zero_ns),
         missing,
     )
 

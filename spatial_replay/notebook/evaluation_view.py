@@ -312,8 +312,11 @@ def data_frame(value: Any) -> Any:
 def _of_evaluation(evaluation: Evaluation) -> Any:
     """Return a row for each result."""
     pandas = _pandas()
-    rows = [[getattr(result, name) for name in RESULT_COLUMNS] for result in evaluation.results]
-    frame = pandas.DataFrame(rows, columns=list(RESULT_COLUMNS))
+    rows = [
+        [*(getattr(result, name) for name in RESULT_COLUMNS), [doubt.assumption for doubt in result.doubts]]
+        for result in evaluation.results
+    ]
+    frame = pandas.DataFrame(rows, columns=[*RESULT_COLUMNS, "doubts"])
     # times are whole numbers, or missing
     return frame.astype({"verdict": str} | dict.fromkeys(RESULT_TIMES, "Int64"))
 
@@ -385,7 +388,8 @@ def _results_table(results: Sequence[SpecResult]) -> Html:
     for result in results:
         robustness = _robustness_text(result.robustness, result.lower, result.upper, result.unit)
         name, verdict = element("b", result.title), verdict_mark(result.verdict)
-        tested = element("span", result.tested, title=" ".join(result.remarks))
+        marks = ", ".join([result.tested, *["doubtful"] * bool(result.doubts)])
+        tested = element("span", marks, title=" ".join(result.remarks))
         rows.append((name, verdict, robustness, _first_satisfied_text(result), tested))
     return table(["result", "verdict", "robustness", "first satisfied", "tested"], rows)
 

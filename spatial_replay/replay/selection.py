@@ -394,8 +394,8 @@ class Selection:
 
     def iter_traces(self, ends: RunEnds | None = None) -> Iterator[Trace]:
         """Read the samples of `read_blocks`."""
-        for _, trace in read_ahead(self.read_blocks(messages=False, ends=ends)):
-            yield trace
+        for block, trace in read_ahead(self.read_blocks(messages=False, ends=ends)):
+            yield replace(trace, doubts=block.doubts) if block.doubts else trace
 
     def trace(
         self, advance: Callable[[int], None] = lambda samples: None, ends: RunEnds | None = None

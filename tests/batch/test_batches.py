@@ -1115,6 +1115,7 @@ def test_a_verdict_that_rests_on_a_doubt_passes_nowhere_unless_it_is_allowed(fle
     Path("alone.spatial").write_text(
         'group others = class "cart"\nspec alone = G (exists c in others: c dist c <= 0)'
     )
+    Path("near.spatial").write_text("const near = 0.5 in [0, 2]\nspec apart = G (cart dist person >= near)")
     said = "/tracks: person jumps 30 m in 10 ms"
     spec = ("walk.mcap", "--spec", "gate.spatial")
     for run in ("replay", "batch"):
@@ -1131,7 +1132,13 @@ def test_a_verdict_that_rests_on_a_doubt_passes_nowhere_unless_it_is_allowed(fle
         assert (accepted.code, f"accepted: {said}" in accepted.err) == (0, True)
     assert (command("report", *spec, "-o", "walk.html").code, command("explain", *spec).code) == (4, 4)
     assert f"The verdict is doubtful: {said}." in Path("walk.html").read_text()
-    for reading in (("info", "walk.mcap"), ("check", "gate.spatial", "--log", "walk.mcap")):
+    for reading in (
+        ("info", "walk.mcap"),
+        ("check", "gate.spatial", "--log", "walk.mcap"),
+        ("diff", "walk.mcap", "logs/run-0.jsonl", "--spec", "gate.spatial"),
+        ("tune", "--spec", "near.spatial", "--good", "walk.mcap"),
+        ("learn", "walk.mcap", "accepted.mcap"),
+    ):
         assert f"walk.mcap: doubtful: {said}" in command(*reading).err
 
 

@@ -89,6 +89,8 @@ def test_results_rest_on_the_doubts_about_their_objects_classes_and_signals(abou
     assert document["log"]["remarks"][0].startswith(f"memory: {word}: /tracks: walker jumps at 1.000 s")
     evaluated = evaluate(parse_specification(SPECIFICATION), run(doubt), each=EACH)
     assert {result.title for result in evaluated if result.doubts} == results
+    frame = evaluated.to_pandas()
+    assert [bool(names) for names in frame["doubts"]] == [result.title in results for result in evaluated]
 
 
 def test_a_log_in_memory_has_the_doubts_of_a_replay():
