@@ -1137,7 +1137,7 @@ def test_a_verdict_that_rests_on_a_doubt_passes_nowhere_unless_it_is_allowed(fle
         ("check", "gate.spatial", "--log", "walk.mcap"),
         ("diff", "walk.mcap", "logs/run-0.jsonl", "--spec", "gate.spatial"),
         ("tune", "--spec", "near.spatial", "--good", "walk.mcap"),
-        ("learn", "walk.mcap", "accepted.mcap"),
+        ("learn", "walk.mcap", "logs/run-0.jsonl"),
     ):
         assert f"walk.mcap: doubtful: {said}" in command(*reading).err
 
