@@ -49,6 +49,10 @@ _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tr
 _NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
 """Fields such as `class_id` and `frame_id` are the same for several objects."""
 _CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
+_GEOMETRIES = ("Polygon", "MultiPolygon", "Feature")
+"""Types of GeoJSON with an outline, which are no classes."""
+_PLANES = ("level_name", "level", "floor", "floor_name", "storey", "map_name", "map_id", "map")
+"""Fields with the name of the floor, or of the map, that an object is on."""
 _PARTS = frozenset(
     {
         *(*_POSITIONS, *_TURNS, *_YAWS, *_SIZES, *_OUTLINES, *_NAMES, *_CLASSES),
@@ -99,6 +103,9 @@ class Guess:
         size: of length, width and maybe height; or of a radius.
         names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
         is_in_pixels: whether coordinates look like pixels.
+        is_sizeless: whether the numbers of the size are 0 in all objects.
+        other_outline: of the corners of objects whose size is 0, beside others with a size.
+        plane: of the name of the floor or map that an object is on, if these differ.
         has_zeros_left_out: whether some objects lack coordinates that others have.
         others: of further lists whose elements look like objects.
         is_plan: whether the places are those to go to.
@@ -117,6 +124,9 @@ class Guess:
     names: tuple[str, ...] = ()
     class_name: str | None = None
     is_in_pixels: bool = False
+    is_sizeless: bool = False
+    other_outline: str | None = None
+    plane: str | None = None
     has_zeros_left_out: bool = False
     others: tuple[str, ...] = ()
     is_plan: bool = False
@@ -190,6 +200,12 @@ def _best(messages: Sequence[object]) -> Guess | None:
     names = tuple(name for name in best.names if _distinguishes(name, best, messages))
     with suppress(FieldError):
         best = replace(best, bounds_have_size=_have_size(best, messages))
+    if best.size and not any(_values_at(best.size, best, messages)):
+        best = replace(best, size=(), is_sizeless=True)
+    elif best.size:
+        best = replace(best, other_outline=_outline_of_sizeless(best, messages))
+    if best.plane is not None and len(set(_values_at((best.plane,), best, messages))) < 2:
+        best = replace(best, plane=None)
     return replace(best, names=names or tuple(_names_beside(best, messages)))
 
 
@@ -270,6 +286,23 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
     return all(len(set(row)) == len(row) for row in texts)
 
 
+def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None:
+    """Return the path of the corners of objects whose size is 0."""
+    with suppress(FieldError):
+        for thing in (thing for message in messages for thing in _objects_in(guess, message)):
+            if not any(walk(FieldPath.of(path), thing) for path in guess.size):
+                return _outline_in(dict(_iter_fields(thing)))[0]
+    return None
+
+
+def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -> Iterator[object]:
+    """Iterate over the values at some paths in all objects, where they lead somewhere."""
+    for message in messages:
+        for path in paths:
+            with suppress(FieldError):
+                yield from [walk(FieldPath.of(path), thing) for thing in _objects_in(guess, message)]
+
+
 def _objects_in(guess: Guess, message: object) -> Iterator[object]:
     """Iterate over the objects in a message.
 
@@ -346,7 +379,10 @@ def _object_in(value: object) -> Guess | None:
         bounds=bounds,
         size=_size_in(fields) if polygon is None else (),
         names=_names_in(fields),
-        class_name=_first(fields, _CLASSES, lambda value: isinstance(value, str)),
+        class_name=_first(
+            fields, _CLASSES, lambda value: isinstance(value, str) and value not in _GEOMETRIES
+        ),
+        plane=_first(fields, _PLANES, lambda value: isinstance(value, str) and value != ""),
         is_in_pixels=not is_own and _are_pixels(corners),
     )
 
@@ -359,7 +395,20 @@ def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float
             path, value = f"{path}.points", get_field(value, "points")
         if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
             return path, [point for corner in value if (point := _point(corner)) is not None]
+    for path in _paths_by_name(fields, ("geometry",)):
+        # of GeoJSON
+        names = field_names(fields[path])
+        if "coordinates" in names and get_field(fields[path], "type") in _GEOMETRIES:
+            return path, list(_corners_in(get_field(fields[path], "coordinates")))
     return None, []
+
+
+def _corners_in(rings: object) -> Iterator[tuple[float, ...]]:
+    if (point := _point(rings)) is not None:
+        yield point
+    elif is_list(rings):
+        for ring in rings:
+            yield from _corners_in(ring)
 
 
 def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:

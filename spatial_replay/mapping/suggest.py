@@ -255,7 +255,7 @@ def _with_trial(
     if not entry or not examples or suggestion.is_transforms:
         return suggestion
     origin = ""
-    if layout is not None and geodetic_paths(layout) is not None:
+    if layout is not None and (layout.is_geojson or geodetic_paths(layout) is not None):
         place = _first_fix(layout, examples)
         if place is None:
             return replace(
@@ -293,10 +293,22 @@ def _origin_lines(
 def _first_fix(layout: MessageLayout, examples: Sequence[object]) -> tuple[float, float] | None:
     """Return latitude and longitude of the first fix, in degrees; None without one."""
     paths = geodetic_paths(layout)
+    if layout.is_geojson:
+        return next(filter(None, map(_first_corner, examples)), None)
     if paths is None:
         return None
     places = (_place_of_fix(fix, paths) for _, fix in _iter_objects(layout, examples))
     return next((place for place in places if place is not None), None)
+
+
+def _first_corner(message: object) -> tuple[float, float] | None:
+    """Return latitude and longitude of the first position in a message of GeoJSON; None without one."""
+    try:
+        text = str(walk(FieldPath.of("geojson"), message))
+    except FieldError:
+        return None
+    place = re.search(r'"coordinates":[\s[]*(-?[\d.]+)\s*,\s*(-?[\d.]+)', text)
+    return None if place is None else (float(place[2]), float(place[1]))
 
 
 def _place_of_fix(fix: object, paths: Sequence[str]) -> tuple[float, float] | None:
@@ -517,10 +529,17 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
     if guess.objects is None and guess.names:
         by_id = (f"one object a message: {guess.names[0]} takes turns",)
     sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
+    if guess.is_sizeless:
+        sizeless = (f"its sizes are 0 in all messages looked at: {_RADIUS} is a guess",)
     others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
     if isinstance(guess.bounds, str) and "xy" not in guess.bounds:
         sizeless = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
     indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
+    if guess.other_outline is not None:
+        shape = f"shape: {{polygon: {guess.other_outline}}}"
+        by_id = (*by_id, f"objects whose size is 0 have corners; `{shape}` reads these, and not the boxes")
+    if guess.plane is not None:
+        by_id = (*by_id, f"{guess.plane} names floors or maps; objects on all of them are in one plane here")
     if guess.has_compass:
         by_id = (*by_id, f"{guess.yaw} beside latitude and longitude counts from north, clockwise")
     return by_id + sizeless + indexed + others

@@ -153,6 +153,47 @@ def test_lists_of_changes_are_not_complete() -> None:
     assert suggested_for(whole)[1].complete is None
 
 
+def test_outlines_of_geojson_are_found() -> None:
+    ring = [[5.0, 52.0], [5.1, 52.0], [5.1, 52.1], [5.0, 52.0]]
+    geometry = {"type": "Polygon", "coordinates": [ring]}
+    _, topic = suggested_for([{"features": [{"id": "a", "type": "Feature", "geometry": geometry}]}])
+    assert (topic.objects, topic.polygon, topic.class_name) == ("features[*]", "geometry", None)
+    feature = {"type": "Feature", "properties": {"name": "field"}, "geometry": geometry}
+    text = json.dumps({"type": "FeatureCollection", "features": [feature]})
+    message = {"geojson": text}
+    suggestion = suggest_mapping("run", [Topic("/zones", "foxglove.GeoJSON", "json")], {"/zones": [message]})
+    mapping = parse_mapping(suggestion)
+    assert (mapping.topics[0].polygon, mapping.origin) == (None, (52.0, 5.0))
+
+
+def test_sizes_that_are_never_set_are_no_sizes() -> None:
+    def shape(*widths: float) -> tuple[str, ShapeMapping | None]:
+        things = [{"id": k, "x": 5.0 * k, "y": 0.0, "size": {"x": w, "y": w}} for k, w in enumerate(widths)]
+        text, topic = suggested_for([{"objects": things}])
+        return text, topic.shape
+
+    text, footprint = shape(0.0, 0.0)
+    assert footprint == ShapeMapping("disc", (0.5,))
+    assert "sizes are 0 in all messages" in text
+    text, footprint = shape(0.0, 1.0)
+    assert footprint == ShapeMapping("box", ("size.x", "size.y"))
+    assert "1 of 2 outlines have no extent" in text
+    tracks = [
+        {"id": k, "x": 9.0 * k, "y": 0.0, "size": {"x": w, "y": w}, "footprint": {"points": points}}
+        for k, (w, points) in enumerate([(1.0, []), (0.0, [POINT] * 4)])
+    ]
+    assert "`shape: {polygon: footprint.points}` reads these" in suggested_for([{"objects": tracks}])[0]
+
+
+def test_floors_are_named() -> None:
+    def text(*levels: str) -> str:
+        robots = [{"name": f"r{k}", "x": 1.0, "y": 2.0, "level_name": name} for k, name in enumerate(levels)]
+        return suggested_for([{"robots": robots}])[0]
+
+    assert "level_name names floors" in text("L1", "L2")
+    assert "floors" not in text("L1", "L1")
+
+
 def test_boxes_by_four_numbers_are_read_as_their_values_allow() -> None:
     names = ("xmin", "ymin", "xmax", "ymax")
     box = dict(zip(names, (1, 2, 3, 6), strict=True))
