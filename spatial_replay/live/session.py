@@ -684,8 +684,9 @@ class LiveSession:
         if self._mapping is None or self._mapping.sampling != Sampling():
             return None
         mapped = [entry for entry in self._mapping.topics if entry.topic in self._planned]
-        topics = [entry.topic for entry in mapped if entry.reads_objects] or [entry.topic for entry in mapped]
-        return topics[0] if len(topics) > 1 else None
+        topics = {entry.topic for entry in mapped if entry.reads_objects} or {entry.topic for entry in mapped}
+        first = next((entry.topic for entry in mapped if entry.topic in topics), None)
+        return first if len(topics) > 1 else None
 
     # ------------------------------------------------------------------------------ evaluating
 

@@ -107,7 +107,8 @@ class _Assembling:
             )
             for topic in plan.planned
         }
-        self._number_of_topic = {topic: number for number, topic in enumerate(self._readers)}
+        topics = dict.fromkeys(reader.planned.topic for reader in self._readers.values())
+        self._number_of_topic = {topic: number for number, topic in enumerate(topics)}
         self._tracker = Tracker(
             plan,
             self._readers,
@@ -234,12 +235,12 @@ class _Assembling:
         number_of_message = np.fromiter(numbers, np.int64, len(arrived))
         stamped: list[_Stamped] = []
         come = set(topics)
-        for number, reader in enumerate(self._readers.values()):
-            if reader.name not in come or (
+        for reader in self._readers.values():
+            if reader.planned.topic not in come or (
                 self._knows_static and reader.planned.is_static and not reader.is_mapped
             ):
                 continue
-            places = np.flatnonzero(number_of_message == number)
+            places = np.flatnonzero(number_of_message == self._number_of_topic[reader.planned.topic])
             if len(places):
                 stamped.append(self._stamp(reader, places, arrived))
         end = self._advance_time(stamped, arrived)
@@ -794,7 +795,8 @@ class LiveAssembler(_Assembling):
     @property
     def topics(self) -> tuple[str, ...]:
         """The topics that samples depend on, but those that are sent once and stay."""
-        return tuple(each.name for each in self._plan.planned if not (each.is_lasting or each.is_latched))
+        passing = (each.topic for each in self._plan.planned if not (each.is_lasting or each.is_latched))
+        return tuple(dict.fromkeys(passing))
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
         """Add messages as they came; return the samples that are final now.
@@ -804,7 +806,7 @@ class LiveAssembler(_Assembling):
             UsageError: the mapping does not fit what the messages hold.
         """
         self._now_s = now_s
-        self._lost.difference_update(message.topic for message in messages)
+        self._lost.difference_update(self._names_of({message.topic for message in messages}))
         if messages and not self.is_finished:
             self._add_step(self._columns(messages))
         waited_ns = self._silent[-1][1] if self._silent else max(self._settled_ns, self._patient_ns)
@@ -813,6 +815,10 @@ class LiveAssembler(_Assembling):
             self._silent.append((now_s + patience_s, self._newest_ns))
             self._arrivals.append((now_s, self._newest_ns))
         return self._settle(self._upto_ns(now_s))
+
+    def _names_of(self, topics: Collection[str]) -> set[str]:
+        """Return the names by which topics of the log are read."""
+        return {planned.name for planned in self._plan.planned if planned.topic in topics}
 
     def arrived_s(self, time_ns: int) -> float:
         """Return when the first message of the time of a sample, or a later one, arrived; inf if unknown.
@@ -842,7 +848,7 @@ class LiveAssembler(_Assembling):
         Nothing of what they reported holds on: not while a connection is lost, nor after silence. It stays
         unknown until they report it again. Messages of other topics wait as before.
         """
-        gone = set(topics) & set(self._latest_of) - self._lost
+        gone = self._names_of(topics) - self._lost
         if not gone:
             return Trace.empty()
         self._now_s = now_s

@@ -104,7 +104,7 @@ class MappedSource(FileSource):
         copied = _CopiedMessages(channels)
         read = mapped | copied.topics
         first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
-        moving = [topic.name for topic in plan.planned if not topic.is_static]
+        moving = {topic.topic for topic in plan.planned if not topic.is_static}
         read_end_ns = FOREVER if end_ns is None or not plan.by_log_time else end_ns + plan.margin_ns
         assembler = Assembler(
             plan,
@@ -128,14 +128,15 @@ class MappedSource(FileSource):
         if len(files) > 1:
             what = f"one of the {len(files)} files of a bag; give its folder for all of them"
             blocks.remarks.append(f"{self.name}: it is {what}")
-        static = [each.name for each in plan.planned if each.is_static]
+        static = list(dict.fromkeys(topic.topic for topic in plan.planned if topic.is_static))
         if static:
             # they count from before a window, and the first of a frame before it was recorded, too
             assembler.know_static(open_messages(self.path).iter_messages(static))
         if start_ns is not None and plan.by_log_time and plan.sampled_topic is not None:
             sampled_ns = first_ns([plan.sampled_topic])
+            fallback_topics = {each.topic for each in plan.planned if each.name in plan.fallback_topics}
             is_read = sampled_ns is None or sampled_ns >= plan.first_read_ns(start_ns)
-            assembler.know_start(None if is_read else sampled_ns, first_ns(plan.fallback_topics))
+            assembler.know_start(None if is_read else sampled_ns, first_ns(fallback_topics))
         as_recorded = self.reading.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded and plan.late_ns < LATEST_NS:

@@ -293,7 +293,8 @@ def _mapping(document: Document, name: str) -> LogMapping:
     # the hash ignores layout and comments: the same mapping has the same hash
     canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
-    topics = tuple(_topic_mapping(topic, entry or {}, shapes) for topic, entry in value["topics"].items())
+    entries = _entries(value["topics"])
+    topics = tuple(_topic_mapping(topic, entry or {}, shapes) for topic, _, entry in entries)
     units = {signal.name: signal.unit for topic in topics for signal in topic.signals if signal.unit}
     return LogMapping(
         name=name,
@@ -316,6 +317,15 @@ def _mapping(document: Document, name: str) -> LogMapping:
     )
 
 
+def _entries(topics: Table[str, Any]) -> Iterator[tuple[str, Place, Any]]:
+    """Yield each topic with the place of an entry and the entry; a topic may have a list of them."""
+    for topic, entry in topics.items():
+        if isinstance(entry, list):
+            yield from ((topic, ("topics", topic, index), part) for index, part in enumerate(entry))
+        else:
+            yield topic, ("topics", topic), entry
+
+
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
     """Find what a schema cannot express: unknown shapes, keys that exclude each other, durations of 0."""
     value = document.value
@@ -329,20 +339,25 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     if value.get("fixed_frame", "") is None:
         faults.append((("fixed_frame",), NO_FRAME))
     topics: Any = value["topics"]
-    for topic, entry in topics.items():
+    entries = list(_entries(topics))
+    for _, place, entry in entries:
         if not isinstance(entry, dict):
             continue
         shape = entry.get("shape")
         if isinstance(shape, str) and shape not in shapes:
             hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
-            faults.append((("topics", topic, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
+            faults.append(((*place, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
         outlines = combinations(("polygon", "bounds", "shape"), 2)
         for one, other in (*outlines, ("orientation", "yaw")):
             if one in entry and other in entry:
-                faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
-        faults += [(("topics", topic, *place), text) for place, text in _contradictions_of_turns(entry)]
-    tables = [((), value, "max_age"), ((), value, "max_gap"), (("sample",), value.get("sample"), "every")]
-    tables += [(("topics", topic), entry, "max_age") for topic, entry in topics.items()]
+                faults.append(((*place, other), f"there is {one!r} already; give one of the two"))
+        faults += [((*place, *within), text) for within, text in _contradictions_of_turns(entry)]
+    tables: list[tuple[Place, Any, str]] = [
+        ((), value, "max_age"),
+        ((), value, "max_gap"),
+        (("sample",), value.get("sample"), "every"),
+    ]
+    tables += [(place, entry, "max_age") for _, place, entry in entries]
     for place, table, key in tables:
         text = table.get(key) if isinstance(table, dict) else None
         if isinstance(text, str) and _NO_TIME.fullmatch(text):

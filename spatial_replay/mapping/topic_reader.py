@@ -105,9 +105,11 @@ _LONGEST_SILENCE_NS: Final = 10 * 10**9
 
 @dataclass(frozen=True, slots=True)
 class PlannedTopic:
-    """How one topic is read.
+    """How one topic is read, or one list of objects in its messages.
 
     Attributes:
+        name: of the topic, with the place of its entry if the mapping has several: `/scene`, `/scene[1]`.
+        topic: of the log.
         mapping: its entry; None for topics that are read for transforms or times only.
         layout: where its objects are; None for a topic without objects.
         max_age_ns: how long an observation or a signal stays valid.
@@ -120,6 +122,7 @@ class PlannedTopic:
     """
 
     name: str
+    topic: str
     clock: Clock
     mapping: TopicMapping | None
     layout: MessageLayout | None
@@ -185,7 +188,9 @@ class ReadingPlan:
         faults = _faults(mapping, known)
         if faults:
             raise UsageError("\n".join(f"{mapping.name}: {fault}" for fault in faults))
-        mapped = {entry.topic: entry for entry in mapping.topics}
+        mapped: dict[str, list[TopicMapping | None]] = {}
+        for entry in mapping.topics:
+            mapped.setdefault(entry.topic, []).append(entry)
         needs_frames = mapping.fixed_frame is not None
         names = [topic for topic in mapped if topic in known]
         others = [topic for topic in topics if needs_frames and topic.name not in mapped]
@@ -196,7 +201,11 @@ class ReadingPlan:
         sampled = None if is_stepped else mapping.sampling.topic or _most_frequent(mapping, known)
         if sampled is not None and sampled not in names:
             names.append(sampled)
-        planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
+        planned = tuple(
+            _planned(mapping, entry, known[name], place, needs_frames)
+            for name in names
+            for place, entry in enumerate(mapped.get(name, [None]))
+        )
         is_whole = all(topic in known for topic in mapped)
         if mapping.origin is not None and is_whole and not any(topic.is_geodetic for topic in planned):
             raise UsageError(
@@ -232,7 +241,11 @@ class ReadingPlan:
     def lookback_ns(self, topic: str) -> int | None:
         """Return how long before a window messages of a topic count; None for all, as of static
         transforms."""
-        planned = next(each for each in self.planned if each.name == topic)
+        own_ns = [self._lookback_ns(planned) for planned in self.planned if planned.topic == topic]
+        return None if None in own_ns else max(filter(None, own_ns), default=0)
+
+    def _lookback_ns(self, planned: PlannedTopic) -> int | None:
+        topic = planned.name
         ages = [
             each.max_age_ns
             for each in self.planned
@@ -318,7 +331,7 @@ def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> fr
         and not (topic.is_static or topic.is_latched or (topic.layout is not None and topic.layout.stays))
     ]
     with_objects = [topic for topic in mapped if topic.layout is not None]
-    return frozenset(topic.name for topic in with_objects or mapped) - {sampled}
+    return frozenset(topic.name for topic in with_objects or mapped if topic.topic != sampled)
 
 
 _MANY_TIMES = 10
@@ -360,10 +373,10 @@ def doubts_of(
 
 
 def _planned(
-    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, needs_frames: bool
+    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, place: int, needs_frames: bool
 ) -> PlannedTopic:
     kind = short_type((entry.type if entry is not None else None) or topic.type)
-    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
+    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and place == 0
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
     if layout is not None and GEODETIC in layout.position:
@@ -379,7 +392,8 @@ def _planned(
     given = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
     max_age_ns = FOREVER_NS if is_static else given or default
     return PlannedTopic(
-        name=topic.name,
+        name=f"{topic.name}[{place}]" if place else topic.name,
+        topic=topic.name,
         clock=(entry.clock if entry is not None else None) or mapping.clock,
         mapping=entry,
         layout=layout,
@@ -826,7 +840,7 @@ class TopicReader:
         self._mapping_name = mapping.name
         self._report = report
         reads = self.is_mapped or self.decodes_on_arrival
-        self._decode: Decoder = decoder(planned.name) if reads else _skip
+        self._decode: Decoder = decoder(planned.topic) if reads else _skip
         decode = self._decode
         if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
             self._decode = lambda payload: sparse(decode(payload))

@@ -14,8 +14,11 @@ from google.protobuf.json_format import MessageToDict
 from google.protobuf.struct_pb2 import Struct
 
 from mapping.feeding import SECOND, Feed, Made, make
-from spatial_replay import Footprint, UsageError
+from spatial_replay import Footprint, Trace, UsageError
 from spatial_replay.geometry.measure import contact
+from spatial_replay.mapping.assemble import LiveAssembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 
 def read(keys: str, *contents: Any, mapping: str = "", name: str = "a/Thing") -> Made:
@@ -309,3 +312,48 @@ def test_geojson_of_foxglove_is_read_in_metres() -> None:
     made = read("", content, mapping="origin: [52, 5]", name="foxglove.GeoJSON")
     assert made.footprint_row(0, "field").max(axis=0) == pytest.approx((68.68, 111.27), abs=0.1)
     assert made.states("post") == "?"
+
+
+LISTS = """
+max_age: 1s
+topics:
+  /scene:
+    - {objects: "cars[*]", name: "car{id}", position: [x, y], signals: {light: light}}
+    - {objects: "walkers[*]", name: "walker{id}", position: at, class: person}
+  /post: {name: post, position: at}
+"""
+
+
+def scenes() -> Feed:
+    feed = Feed(types={"/scene": "a/Scene", "/post": "a/Post"}, counts={"/scene": 5, "/post": 1})
+    feed.add("/post", 0, {"at": [0, 0]})
+    for second in range(5):
+        cars = [{"id": 1, "x": float(second), "y": 0.0}] * (second != 3)
+        walkers = [{"id": 1, "at": [0.0, float(second)]}]
+        feed.add("/scene", second * SECOND, {"cars": cars, "walkers": walkers, "light": second})
+    return feed
+
+
+def test_a_message_may_have_two_lists_of_objects() -> None:
+    made = make(LISTS, scenes())
+    assert [made.states(name) for name in ("car1", "walker1", "post")] == ["+++-+", "+++++", "++???"]
+    assert (made.centre(2, "car1"), made.centre(2, "walker1")) == ((2.0, 0.0), (0.0, 2.0))
+    assert made.trace.signals["light"].tolist() == [0, 1, 2, 3, 4]
+    one_name = LISTS.replace("walker{id}", "car{id}")
+    with pytest.raises(UsageError, match=r"both /scene and /scene\[1\] have an object 'car1'"):
+        make(one_name, scenes())
+    with pytest.raises(UsageError, match=r"test.yaml:6: topics./scene\[1\].positon: unknown key"):
+        make(LISTS.replace("position: at, class", "positon: at, class"), scenes())
+
+
+def test_two_lists_in_a_message_are_the_same_live_and_in_a_log() -> None:
+    feed = scenes()
+    plan = ReadingPlan.of(parse_mapping(LISTS), feed.topics())
+    assembler = LiveAssembler(plan, feed.decoder, name="", max_delay_s=1.0)
+    assert assembler.topics == ("/scene", "/post")
+    traces = [assembler.add([message], message.log_time_ns / 1e9) for message in feed.raw()]
+    trace = Trace.concatenate([*traces, assembler.flush()])
+    assert trace == make(LISTS, feed).trace
+    # silence makes the objects of both lists unknown
+    lost = assembler.lose(["/scene"], 9.0)
+    assert [int(lost.rows[-1, lost.names.index(name)]) < -1 for name in ("car1", "walker1")] == [True, True]
