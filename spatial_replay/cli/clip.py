@@ -90,7 +90,7 @@ def clip(
         )
     warn_of_input(clip.whole)
     print_verdicts(clip.replayed, output)
-    show(_summary(clip))
+    show(_summary(clip), *(f"  {reason}" for reason in clip.reasons))
     if clip.left_out and not of:
         show(f"  not kept, since nothing failed there: {', '.join(clip.left_out)}; --result NAME keeps one")
     left_out = () if of else clip.left_out

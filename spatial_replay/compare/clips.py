@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ from spatial_replay.replay.selection import (
 )
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Outline, Specification
+from spatial_replay.text import Instant, Sentence, counted_from
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
 from spatial_replay.tuning.tuned import last_that_holds
 
@@ -90,18 +91,31 @@ class _Decision(NamedTuple):
     """The verdict of a node and its reason, which a clip has to repeat.
 
     Attributes:
+        verdict: of the node.
         certain_ns: the sample that made the verdict certain.
+        numbers: the end that decides, and the nominal one, of the node and of that part. The other end may be
+            unknown because of a sample that decides nothing.
         cause: the part that failed first.
-        ends: the ends, the nominal ones, too, of the node and of that part.
         path: to the atom that decides the node over all samples.
         settled: to the atom that settled that part, or the verdict, when it did.
     """
 
+    verdict: Verdict
     certain_ns: int | None
+    numbers: tuple[float, ...]
     cause: int | None
-    ends: tuple[tuple[float, float], ...]
     path: _Path
     settled: _Path
+
+    def difference(self, other: _Decision | None) -> str:
+        """Say how another decision differs from this one."""
+        if other is None:
+            return "has no sample"
+        if self.verdict is not other.verdict:
+            return f"is {other.verdict}"
+        if self.numbers != other.numbers:
+            return "has another robustness"
+        return "is certain at another time" if self.certain_ns != other.certain_ns else "has another reason"
 
 
 class _Part:
@@ -122,25 +136,47 @@ class _Part:
             column = trace.names.index(result.object)
             self._seen_ns = trace.times_ns[trace.rows[:, column] != ABSENT]
         self._decision = self._decided(result, self._leaves)
-        times_ns = [self._decision.path.decided_ns, self._decision.settled.decided_ns]
-        times_ns += [] if self._decision.certain_ns is None else [self._decision.certain_ns]
-        self.span_ns = min(times_ns), max(times_ns)
+        # the last one of equal times is the one that is said
+        self._moments = {
+            self._decision.settled.decided_ns: f", where `{kept.title}` was settled",
+            self._decision.path.decided_ns: f", where the robustness of `{kept.title}` is decided",
+        }
+        if self._decision.certain_ns is not None:
+            certain = f", where `{kept.title}` became {self._decision.verdict} for certain"
+            self._moments[self._decision.certain_ns] = certain
+        self.span_ns = min(self._moments), max(self._moments)
+        self._title = kept.title
+
+    def moment(self, time_ns: int) -> str | None:
+        """Say what happened at a time that decides; None at others."""
+        return self._moments.get(time_ns)
 
     def holds_over(self, start_ns: int, end_ns: int) -> bool:
         """Say whether all of it is the same over the samples from one time to another, both included."""
+        return self._decision_over(start_ns, end_ns) == self._decision
+
+    def change_over(self, start_ns: int, end_ns: int) -> str | None:
+        """Say what is different over the samples from one time to another; None if nothing is."""
+        decision = self._decision_over(start_ns, end_ns)
+        if decision == self._decision:
+            return None
+        return f": in a shorter clip `{self._title}` {self._decision.difference(decision)}"
+
+    def _decision_over(self, start_ns: int, end_ns: int) -> _Decision | None:
+        """Return the decision over the samples from one time to another; None without a sample."""
         if self._seen_ns is not None:
             begin, end = window_of(self._seen_ns, start_ns, end_ns + 1)
             if begin == end:
-                return False
+                return None
             start_ns, end_ns = self._seen_ns[[begin, end - 1]].tolist()
         begin, end = window_of(self._times_ns, start_ns, end_ns + 1)
         if begin == end:
-            return False
+            return None
         leaves = self._within(begin, end, start_ns)
         stream = InstanceStream(self._result.evidence.instance)
         block = stream.extend_leaves(leaves, self._times_ns[begin:end])
         result = SpecResult.from_stream(stream, self._result.evidence, block)
-        return self._decided(result, leaves) == self._decision
+        return self._decided(result, leaves)
 
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
         """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
@@ -177,8 +213,18 @@ class _Part:
             count = int(np.searchsorted(times_ns, settled_ns, side="right"))
             first = evaluate_unfinished(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
             settled = _path(first, part)
-        ends = tuple(done.interval(node, wide=wide) for node in (self._node, part) for wide in (True, False))
-        return _Decision(certain_ns, None if cause is None else part, ends, path, settled)
+        numbers = (*_deciding_numbers(done, self._node), *_deciding_numbers(done, part))
+        verdict = final_verdict(*done.interval(self._node))
+        return _Decision(verdict, certain_ns, numbers, None if cause is None else part, path, settled)
+
+
+def _deciding_numbers(done: OfflineNodes, node: int) -> tuple[float, ...]:
+    """Return the end of a node's interval that decides, and the nominal one; none if both are open."""
+    end = End.of(final_verdict(*done.interval(node)))
+    if end is End.OPEN:
+        return ()
+    which = int(end is End.HIGH)
+    return done.interval(node)[which], done.interval(node, wide=False)[which]
 
 
 def _path(done: OfflineNodes, node: int) -> _Path:
@@ -221,6 +267,19 @@ class ClipSearch:
             min(last, int(np.searchsorted(self._times_ns, last_ns, side="right")) - 1),
         )
         self._known: dict[tuple[int, int], bool] = {}
+
+    def reasons(self, start_ns: int, end_ns: int) -> Iterator[Sentence]:
+        """Say why a window that was found neither begins later nor ends earlier; times count from 0."""
+        first, last = np.searchsorted(self._times_ns, [start_ns, end_ns]).tolist()
+        for verb, at, shorter in (("begins", first, (first + 1, last)), ("ends", last, (first, last - 1))):
+            time_ns = int(self._times_ns[at])
+            moments = (part.moment(time_ns) for part in self._parts)
+            window = [int(self._times_ns[place]) for place in shorter] if first < last else []
+            changes = (part.change_over(*window) for part in self._parts if window)
+            reason = next(filter(None, (*moments, *changes)), None)
+            # with --around, it may also be longer without any need
+            if window and reason is not None:
+                yield Sentence(f"it {verb} at ", Instant(time_ns, 0), reason)
 
     def window(self) -> tuple[int, int]:
         """Return the times of the first and the last sample of the clip."""
@@ -274,6 +333,7 @@ class Clip:
         start_ns, end_ns: times of the first and the last sample of the clip.
         kept: the titles of the results, and names of specs within them, that are as in the log.
         source_bytes, clip_bytes: sizes of the files; None for a log that is not one file here.
+        reasons: why the clip neither begins later nor ends earlier, as sentences.
     """
 
     whole: Replayed
@@ -283,6 +343,7 @@ class Clip:
     kept: tuple[str, ...]
     source_bytes: int | None
     clip_bytes: int
+    reasons: tuple[Sentence, ...] = ()
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -385,6 +446,7 @@ def cut_clip(
         tuple(each.title for each in chosen),
         _size_of(source),
         output.stat().st_size,
+        counted_from(search.reasons(start_ns, end_ns), whole.first_ns),
     )
 
 
