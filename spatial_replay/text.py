@@ -137,6 +137,15 @@ def with_unit(number: float, unit: str) -> str:
     return number_text(number) if unit in ("", "1") or math.isinf(number) else f"{number_text(number)} {unit}"
 
 
+def interval_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
+    """Return a robustness with its unit, and its interval where that is wider: "between -inf and -0.2 m"."""
+    number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
+    if math.isnan(lower) or lower == upper == robustness:
+        return number
+    interval = f"between {with_unit(lower, unit)} and {with_unit(upper, unit)}"
+    return interval if math.isnan(robustness) else f"{number}, {interval}"
+
+
 def names_from_unit(unit: str) -> dict[str, float]:
     """Return the numbers by name that stand, as a JSON object, in place of a unit; none for a unit."""
     try:

@@ -29,6 +29,7 @@ from spatial_replay.batch.run_table import (
     flaky_results,
     requirement_of,
     result_name,
+    robustness_of,
     summary_text,
     totals,
     verdict_word,
@@ -437,7 +438,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
             "tr",
             element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
             element("td", *_named(row)),
-            _number("td", "" if row["robustness"] is None else f"{row['robustness']:.4g}"),
+            _number("td", robustness_of(row)),
             element("td", text(row["failure"])),
             element("td", *_with_code(row["reason"])),
         )

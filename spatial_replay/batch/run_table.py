@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
 from spatial_replay.batch.suite import DOUBTFUL, UNTESTED
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, listed, nearest_hint, requirement_text
+from spatial_replay.text import counted, interval_text, listed, nearest_hint, requirement_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -88,6 +88,15 @@ def result_name(spec: str, object_name: str | None) -> str:
 def requirement_of(row: Values) -> str:
     """Return the requirement that a row is about, see `requirement_text`."""
     return requirement_text(row["requirement"], row["title"])
+
+
+def robustness_of(row: Values) -> str:
+    """Return the robustness of a row with its interval; "" for an error."""
+    if row["verdict"] is None:
+        return ""
+    names = "robustness", "lower", "upper"
+    robustness, lower, upper = (math.nan if row[name] is None else row[name] for name in names)
+    return interval_text(robustness, lower, upper, row["unit"] or "")
 
 
 def verdict_word(row: Values) -> str:

@@ -33,7 +33,7 @@ from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
-from spatial_replay.text import counted, first_lines, json_value, with_unit
+from spatial_replay.text import counted, first_lines, json_value
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
@@ -101,6 +101,7 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
         damage_word,
         requirement_of,
         result_name,
+        robustness_of,
         verdict_word,
         worst_rows,
     )
@@ -111,9 +112,8 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
         name = row["spec"] or row["file"]
         name = result_name(name, row["object"])
         verdict = Coloured(f"{verdict_word(row)}{damage_word(row)}", _COLOURS[verdict_word(row)])
-        robustness = row["robustness"]
-        number = "" if robustness is None else f", robustness {with_unit(robustness, row['unit'] or '')}"
-        show((f"  {row['log']}: {name}: ", verdict, number))
+        robustness = robustness_of(row)
+        show((f"  {row['log']}: {name}: ", verdict, f", robustness {robustness}" if robustness else ""))
         usual = f"{row['verdict']}, expected satisfied"
         failure = None if row["failure"] == usual else row["failure"]
         for line in (requirement_of(row), failure, row["reason"]):

@@ -40,9 +40,9 @@ from spatial_replay.text import (
     Sentence,
     counted,
     counted_from,
+    interval_text,
     json_fields,
     json_value,
-    with_unit,
 )
 from spatial_replay.trace.trace import Trace
 
@@ -242,8 +242,8 @@ class SpecDiff(Displayed):
             f"{outcome} → {outcome_text(self.new)}" if self.is_different else f"{outcome}, the same"
         )
         if self.first is not None:
-            old, new = with_unit(self.first.old, self.old.unit), with_unit(self.first.new, self.new.unit)
-            values = f"{old} → {new}"
+            pairs = (self.first.old, self.old.unit), (self.first.new, self.new.unit)
+            values = " → ".join(interval_text(value, value, value, unit) for value, unit in pairs)
             yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
         for edit, alone in zip(self.cause, self.alone, strict=True):
             more = max(len(edit.old_nodes), len(edit.new_nodes)) - 1
@@ -251,7 +251,7 @@ class SpecDiff(Displayed):
             yield Sentence(f"because: {edit}, in `{edit.spec}`{elsewhere}")
             yield from self._lines_of(edit, shown)
             if alone is not None:
-                number = with_unit(alone.robustness, self.old.unit)
+                number = interval_text(*alone[1:], self.old.unit)
                 yield Sentence(f"  with this edit alone: {alone.verdict}, robustness {number}")
         if len(self.cause) > 1:
             yield Sentence(self._together())
@@ -321,8 +321,8 @@ _MOST_LISTED: Final = 8
 
 
 def outcome_text(result: SpecResult) -> str:
-    """Return a verdict with its robustness: "violated (-0.2 m)"."""
-    return f"{result.verdict} ({with_unit(result.robustness, result.unit)})"
+    """Return a verdict with its robustness: "violated (-0.2 m)", "violated (between -inf and -0.2 m)"."""
+    return f"{result.verdict} ({interval_text(*EditOutcome.of(result)[1:], result.unit)})"
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,7 +63,14 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit, nodes_of
-from spatial_replay.text import Instant, Sentence, counted_from, named_arguments, shortened_formula
+from spatial_replay.text import (
+    Instant,
+    Sentence,
+    counted_from,
+    interval_text,
+    named_arguments,
+    shortened_formula,
+)
 from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace, require_time, window_of
 
@@ -592,7 +599,8 @@ class SpecResult(Displayed):
 
     def __repr__(self) -> str:
         instance = f" for {self.object}" if self.object is not None else ""
-        return f"<{self.name}{instance}: {self.verdict}, robustness {self.robustness:.6g}>"
+        number = interval_text(self.robustness, self.lower, self.upper)
+        return f"<{self.name}{instance}: {self.verdict}, robustness {number}>"
 
 
 def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:

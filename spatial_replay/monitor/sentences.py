@@ -21,6 +21,7 @@ from spatial_replay.text import (
     Instant,
     Sentence,
     counted,
+    interval_text,
     is_text_number,
     names_from_unit,
     number_text,
@@ -317,11 +318,20 @@ _TESTED = {"nothing": ", tested by nothing", "cut": ", cut by the end of the log
 
 
 def verdict_text(
-    verdict: Verdict, robustness: float, unit: str, tested: str = "full", *, is_doubtful: bool = False
+    verdict: Verdict,
+    numbers: tuple[float, float, float],
+    unit: str,
+    tested: str = "full",
+    *,
+    is_doubtful: bool = False,
 ) -> str:
-    """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03 m"."""
+    """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03 m".
+
+    Args:
+        numbers: the robustness, and both ends of its interval.
+    """
     doubtful = ", doubtful" if is_doubtful else ""
-    number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
+    number = interval_text(*numbers, unit)
     return f"{verdict}{_TESTED.get(tested, '')}{doubtful}, robustness {number}"
 
 

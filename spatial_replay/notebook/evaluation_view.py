@@ -46,7 +46,7 @@ from spatial_replay.notebook.figures import (
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.spec.format import iter_branches, label_of, title_of
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operands_of
-from spatial_replay.text import counted, time_text, with_unit
+from spatial_replay.text import counted, interval_text, time_text
 from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
@@ -376,17 +376,10 @@ def result_html(result: SpecResult) -> Html:
     return element("div", _results_table([result]), *_trees([result]))
 
 
-def _robustness_text(value: float, lower: float, upper: float, unit: str = "") -> str:
-    """Return a robustness with its unit, or its interval if it is unknown."""
-    return (
-        with_unit(value, unit) if value == value else f"{with_unit(lower, unit)} to {with_unit(upper, unit)}"
-    )
-
-
 def _results_table(results: Sequence[SpecResult]) -> Html:
     rows = []
     for result in results:
-        robustness = _robustness_text(result.robustness, result.lower, result.upper, result.unit)
+        robustness = interval_text(result.robustness, result.lower, result.upper, result.unit)
         name, verdict = element("b", result.title), verdict_mark(result.verdict)
         marks = ", ".join([result.tested, *["doubtful"] * bool(result.doubts)])
         tested = element("span", marks, title=" ".join(result.remarks))
@@ -420,7 +413,7 @@ def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
         lower, upper = result.final[identifier].tolist()
         value = float(result.series[identifier, 0, -1])
         verdict = verdict_mark(final_verdict(lower, upper))
-        yield verdict, _robustness_text(value, lower, upper), tree_cell(stem, node)
+        yield verdict, interval_text(value, lower, upper), tree_cell(stem, node)
 
 
 def _worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
@@ -577,7 +570,7 @@ def _apart(places: Sequence[float]) -> list[float]:
 
 
 def _title(result: SpecResult) -> str:
-    robustness = _robustness_text(result.robustness, result.lower, result.upper, result.unit)
+    robustness = interval_text(result.robustness, result.lower, result.upper, result.unit)
     return plain(f"{result.title}: {result.verdict}, robustness {robustness}")
 
 

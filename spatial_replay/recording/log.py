@@ -251,7 +251,7 @@ class Recording:
             texts = {
                 tree.title: verdict_text(
                     each.verdict,
-                    float(each.robustness[0]),
+                    (float(each.robustness[0]), *each.final[0].tolist()),
                     declared_unit(tree.formula, self._evaluation.units),
                 )
                 for tree, each in results

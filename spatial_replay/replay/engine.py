@@ -554,7 +554,11 @@ def run_replay(
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
             each.title: verdict_text(
-                each.verdict, each.robustness, each.unit, each.tested, is_doubtful=bool(each.doubts)
+                each.verdict,
+                (each.robustness, each.lower, each.upper),
+                each.unit,
+                each.tested,
+                is_doubtful=bool(each.doubts),
             )
             for each in (replayed.results[place] for place in worst_first(replayed.results))
         }

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -61,7 +60,7 @@ from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
-from spatial_replay.text import counted_from, listed
+from spatial_replay.text import counted_from, interval_text, listed
 from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import Trace, within
 
@@ -529,7 +528,7 @@ class Evaluated:
 
 
 def _result_text(result: SpecResult) -> str:
-    number = "not determined" if math.isnan(result.robustness) else f"{result.robustness:.4g}"
+    number = interval_text(result.robustness, result.lower, result.upper)
     return f"`{result.title}` is {result.verdict}: robustness {number}"
 
 

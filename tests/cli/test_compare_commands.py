@@ -68,6 +68,28 @@ def test_numbers_of_a_diff_have_the_units_that_replay_says(capsys: pytest.Captur
 
 
 @pytest.mark.usefixtures("folder")
+def test_intervals_are_said_by_every_command_as_by_replay(capsys: pytest.CaptureFixture[str]) -> None:
+    # milk comes late
+    Path("safe.spatial").write_text("spec safe = G (milk dist cup >= 0.2)")
+    Path("safer.spatial").write_text("spec safe = G (milk dist cup >= 0.25)")
+    given, interval = ("table.jsonl", "--spec", "safe.spatial"), "between -inf and -0.0873"
+    assert f"robustness not determined, {interval}" in said(capsys, "replay", *given, "-o", "out.mcap")[1]
+    edited = said(capsys, "diff", *given, "--spec", "safer.spatial")[1]
+    assert f"violated ({interval}) → violated (between -inf and -0.1373)" in edited
+    assert "with this edit alone: violated, robustness between -inf and -0.1373" in edited
+    for command in (
+        ("diff", "table.jsonl", "out.mcap", "--spec", "safe.spatial"),
+        ("info", "out.mcap"),
+        ("batch", *given, "-o", "results", "--html", "page"),
+        ("results", "results"),
+    ):
+        out = said(capsys, *command)[1]
+        assert "nan" not in out.split(), command
+        assert interval in out or "the same 300 samples" in out, command
+    assert interval in Path("page/index.html").read_text()
+
+
+@pytest.mark.usefixtures("folder")
 def test_what_is_equal_differs_in_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     same = ("--spec", "table.spatial")
     assert said(capsys, "diff", "table.jsonl", *same, *same)[0] == 0
@@ -201,6 +223,10 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     code, out, _ = said(capsys, *arguments)
     assert code == 0
     assert "gaps: 32 of 545 samples, 4.233 s to 5.267 s of the log" in out
+    assert "it begins at 4.233 s, where `gaps` became violated for certain" in out
+    assert "it ends at 5.267 s, where the robustness of `gaps` is decided" in out
+    longer = said(capsys, "clip", "push.mcap", "--spec", "push_edited.spatial", "-o", "long.mcap")[1]
+    assert "it ends at 15.967 s: in a shorter clip `push` has another robustness" in longer
     size = Path("bug.mcap").stat().st_size
     assert f"{size:,} bytes" in out
     assert size < Path("push.mcap").stat().st_size / 4
