@@ -250,6 +250,12 @@ class Annotator:
         self._remember(trace, blocks)
         return self._events(self._changes(trace, blocks))
 
+    def draw(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
+        """Show the scene at the next sample, however short ago the one before was; nothing else is made."""
+        self.pass_over(trace, blocks)
+        self._scene = replace(self._scene, written_ns=None)
+        self._scene_messages(trace, blocks)
+
     def end(
         self, time_ns: int, finals: Sequence[Floats], results: Sequence[SpecResult] = ()
     ) -> list[Messages]:

@@ -180,12 +180,18 @@ class AnnotatedEvaluation:
 
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
 
-    def new_annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
+    def new_annotator(
+        self,
+        scene: SceneState | None = None,
+        arrow: str = "",
+        show: Callable[[SceneFrames], None] | None = None,
+    ) -> Annotator:
         """Return an annotator that starts before the first sample.
 
         Args:
             scene: what a viewer already shows, if it continues with these messages.
             arrow: the title of the result whose violation the scene points at; "" for the first one.
+            show: takes what the messages of the scene show, instead of that of the evaluation.
         """
         from spatial_replay.annotate.annotator import Annotator
 
@@ -197,7 +203,7 @@ class AnnotatedEvaluation:
             self.automata,
             self._semantics,
             scene,
-            self._show,
+            show or self._show,
             arrow,
             self.units,
         )

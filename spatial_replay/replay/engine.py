@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -270,6 +271,30 @@ class Replay:
             write(merge(annotator.end(self._end_ns, finals, replayed.results)))
         return replayed
 
+    def draw_samples(self, times_ns: Sequence[int], show: Callable[[SceneFrames], None]) -> None:
+        """Draw the scene at some samples; call it after `run`, which kept series and leaves.
+
+        Messages of the scene leave out samples that follow each other closely.
+
+        Args:
+            times_ns: those of the samples, increasing.
+            show: takes what the scene shows at each.
+        """
+        stretches = [join_blocks(kept) for kept in self._kept]
+        scene = replace(self._evaluation.annotator.scene, written_ns=None, shown=(), last={})
+        annotator = self._evaluation.new_annotator(scene, self._selection.options.arrow, show)
+        waiting = deque(times_ns)
+        for trace in self._traces.read():
+            rest = self._selection.inside(trace)
+            while waiting and len(rest) and waiting[0] <= int(rest.times_ns[-1]):
+                at = int(np.searchsorted(rest.times_ns, waiting.popleft()))
+                annotator.pass_over(*with_stretches(rest.slice(0, at), stretches))
+                annotator.draw(*with_stretches(rest.slice(at, at + 1), stretches))
+                rest = rest.slice(at + 1, len(rest))
+            if not waiting:
+                return
+            annotator.pass_over(*with_stretches(rest, stretches))
+
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
         """The automaton of each of `trees`, or the reason why it has none."""
@@ -407,6 +432,14 @@ class Replay:
             if 0 < LONG_PAUSE * usual_ns < end_ns - start_ns and end_ns != FOREVER:
                 begin, end = Instant(start_ns, first_ns), Instant(end_ns, first_ns)
                 yield Sentence("the window has no sample from ", begin, " to ", end)
+
+
+def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trace, list[SeriesBlock]]:
+    """Return samples with the part of each stretch that is about them."""
+    if not len(trace):
+        return trace, [stretch.between(0, 0) for stretch in stretches]
+    first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
+    return trace, [stretch.between(first_ns, last_ns + 1) for stretch in stretches]
 
 
 class _KeptTraces:

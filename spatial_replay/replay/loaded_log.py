@@ -44,7 +44,7 @@ from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import idle_templates
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.replay.engine import Replayed, dropped_samples, replayed_specs
+from spatial_replay.replay.engine import Replayed, dropped_samples, replayed_specs, with_stretches
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
@@ -520,11 +520,7 @@ class Evaluated:
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Return samples `begin` to before `end` of those in the window, with their evaluation."""
-        trace = self.loaded.inside.slice(begin, end)
-        if not len(trace):
-            return trace, [stretch.between(0, 0) for stretch in self.stretches]
-        first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
-        return trace, [stretch.between(first_ns, last_ns + 1) for stretch in self.stretches]
+        return with_stretches(self.loaded.inside.slice(begin, end), self.stretches)
 
 
 def _result_text(result: SpecResult) -> str:

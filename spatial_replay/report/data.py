@@ -49,6 +49,8 @@ from spatial_replay.trace.units import Axes
 
 MANY: Final = 6
 """More results are counted, sorted and can be filtered; only the explanation of the first is unfolded."""
+_MOST_MARKED: Final = 200
+"""Events whose samples are drawn in any case: the first ones."""
 MOST_DRAWN: Final = 24
 """Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
 
@@ -154,6 +156,15 @@ class RunReport:
     def decided_ns(self) -> list[int]:
         """The samples that decided the drawn results."""
         return [each.decided.time_ns for each in self.drawn if each.decided is not None]
+
+    @property
+    def marked_ns(self) -> list[int]:
+        """The samples that sentences are about: that decided a result or are its least, or begin an event."""
+        least_ns = (shown.result.least_at_ns for shown in self.drawn)
+        events_ns = sorted(set(map(start_of, self.events)))[:_MOST_MARKED]
+        return sorted(
+            {*self.decided_ns, *(time_ns for time_ns in least_ns if time_ns is not None), *events_ns}
+        )
 
 
 def worst_results(results: Sequence[SpecResult]) -> list[int]:
@@ -304,11 +315,11 @@ def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
 def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
     """Return samples that the page has whatever else it leaves out: `most` at most, but what decided.
 
-    They are the samples that decided a verdict, the samples of events and, if there is room, samples of the
-    scene at equal distances. At one cursor, the page shows one sample.
+    They are the samples that sentences are about, those of further events and, if there is room, samples of
+    the scene at equal distances. At one cursor, the page shows one sample.
     """
     events_ns = sorted(set(map(start_of, report.events[:MOST_EVENTS])))[: most // 2]
-    shown_ns = np.array([*report.decided_ns, *events_ns], np.int64)
+    shown_ns = np.array(sorted({*report.marked_ns, *events_ns}), np.int64)
     room = max(most - len(shown_ns), 2)
     scene_ns = report.scene.times_ns[:: max(1, -(-len(report.scene.times_ns) // room))]
     return np.intersect1d(np.concatenate([shown_ns, scene_ns]), times_ns)
@@ -395,7 +406,10 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
             "changes of sign, and the extremes of every curve in between."
         )
     if report.scene.stride > 1:
-        yield f"The scene has one of {report.scene.stride} messages of /spatial/scene."
+        yield (
+            f"The scene has one of {report.scene.stride} messages of /spatial/scene, and every sample that "
+            "decides, is least or begins an event."
+        )
     drawn = [each for _, frame in report.scene.frames[:1] for each in frame.entities.values()]
     if len(report.results) > 1 and not all(each.shades for each in drawn):
         yield "The scene has the colours of all results together: there are too many for colours of each."

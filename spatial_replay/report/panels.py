@@ -11,10 +11,12 @@ import math
 import re
 import zlib
 from array import array
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -445,6 +447,12 @@ class ReportedScene:
             self.frames = self.frames[::2]
             self.stride *= 2
             self._corners = sum(frame.corners for _, frame in self.frames)
+
+    def insert(self, frames: SceneFrames) -> None:
+        """Add frames of other times than the ones that were collected."""
+        for index, time_ns in enumerate(frames.times_ns.tolist()):
+            at = bisect_left(self.frames, time_ns, key=itemgetter(0))
+            self.frames.insert(at, (time_ns, frames.frame(index)))
 
     @property
     def times_ns(self) -> Integers:

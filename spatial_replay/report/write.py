@@ -148,6 +148,8 @@ def report_of(
         collector.redone,
         planned_for(source, replay.files),
     )
+    missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
+    replay.draw_samples(missing_ns, collector.scene.insert)
     return replayed, report
 
 

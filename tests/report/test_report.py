@@ -618,6 +618,27 @@ def test_the_sample_that_made_a_result_violated_is_kept(tmp_path: Path) -> None:
     assert satisfied.facts["results"][0]["fault"] is None
 
 
+def test_the_scene_of_a_long_run_has_every_sample_that_a_sentence_is_about(tmp_path: Path) -> None:
+    # at 100 Hz: /spatial/scene has every second sample, and the page some of these
+    trace = two_discs(12_000)
+    page = report_of_trace(tmp_path / "run.html", trace, "spec apart = G (a dist b >= 0.00001)")
+    (result,) = page.facts["results"]
+    scene = page.facts["scene"]
+    times = page.numbers(scene["times"])
+    assert scene["stride"] >= 2
+    assert {result["fault"], *(event["time"] for event in page.facts["events"])} <= set(times)
+    (violated,) = [event["time"] for event in page.facts["events"] if event["status"] == "violated"]
+    # the picture at the cursor is that of the sentence: where the discs overlap most
+    low, size = np.array(scene["low"]), np.array(scene["high"]) - scene["low"]
+    drawn = next(entity for entity in scene["entities"] if entity["name"] == "a")
+    points = low + page.numbers(drawn["points"]).reshape(len(times), -1, 2) / 65535 * size
+    right = points[..., 0].max(axis=1) - 1.0
+    for time in (result["fault"], violated):
+        assert right[times.tolist().index(time)] == pytest.approx(np.sin(time * 2), abs=1e-3)
+    assert round(result["fault"] * 100) % 4 != 0
+    assert "every sample that decides, is least or begins an event" in page.within("header#")
+
+
 def test_of_a_large_tree_the_uppermost_nodes_are_shown(tmp_path: Path) -> None:
     deep = " and ".join(f"(F (a dist b >= {k}) or G (a dist b <= {k}))" for k in range(150))
     page = report_of_samples(tmp_path / "run.html", moving(3), f"spec s = {deep}")
