@@ -37,7 +37,7 @@ def test_a_page_shows_the_interval_of_an_unknown_robustness():
     text = shown(judged("G a dist b <= 1", points(a=[0, None], b=[0, 0])))
     assert "■ unknown" in text
     assert "not known" in text
-    assert "-inf to" in text
+    assert "between -inf and" in text
 
 
 def test_texts_of_logs_are_escaped():
@@ -98,7 +98,7 @@ def test_names_of_curves_do_not_cover_each_other(semantics):
 def test_a_robustness_that_is_never_known_is_drawn_too():
     ax = judged("G a dist b <= 1", points(a=[None, None], b=[0, 0])).result().plot()
     ax.figure.canvas.draw()
-    assert "unknown, robustness -inf to inf" in ax.get_title(loc="left")
+    assert "unknown, robustness between -inf and inf" in ax.get_title(loc="left")
 
 
 @pytest.mark.usefixtures("figures")
