@@ -432,6 +432,14 @@ def ns_from_json(value: Any) -> int:
     return ns_from_text(value, 1) if isinstance(value, str) else int(value or 0)
 
 
+def _is_numeral(value: object) -> bool:
+    """Return whether a text is a number, as JSON of protobuf has whole numbers of 64 bits and NaN."""
+    try:
+        return isinstance(value, str) and float(value) is not None
+    except ValueError:
+        return False
+
+
 class _Columns:
     """Distinct paths of numbers, each with a column."""
 
@@ -443,7 +451,7 @@ class _Columns:
         if path.from_message:
             raise FieldError(f"{path.text}: $. is for frame, stamp and signals; give a field of the object")
         value = walk(path, self.example)
-        if not is_number(value):
+        if not (is_number(value) or _is_numeral(value)):
             raise FieldError(f"{path.text}: expected a number, got {type_name(value)}")
         texts = [known.text for known in self.paths]
         if path.text in texts:

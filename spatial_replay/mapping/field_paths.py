@@ -182,6 +182,8 @@ def type_name(value: object) -> str:
         return "a truth value"
     if isinstance(value, int | float):
         return "a number"
+    if isinstance(value, Mapping):
+        return "the map"
     return "a list" if hasattr(value, "__len__") else "nothing" if value is None else "a value"
 
 
@@ -322,18 +324,28 @@ _BRACKETS: Mapping[str, Each | Best | Place] = MappingProxyType(
 
 
 def walk(
-    path: FieldPath, value: object, index: int | str | None = None, *, is_strict: bool = False
+    path: FieldPath,
+    value: object,
+    index: int | str | None = None,
+    *,
+    is_strict: bool = False,
+    may_lack_keys: bool = False,
 ) -> object:
     """Return the value at a path without `[*]`.
 
     Args:
         index: the place or the key of an object in its list, for `[index]`.
         is_strict: whether fields that a sparse message leaves out are missing, and not 0.
+        may_lack_keys: whether a key that a protobuf map or Struct lacks is unknown, and no error.
 
     Raises:
         FieldError: the path leads nowhere; the text says where it ends and which fields exist there.
     """
     for step in path.steps:
+        # a Struct is read as a dictionary
+        has_free_keys = may_lack_keys and (isinstance(value, Mapping) or _is_free(value))
+        if has_free_keys and str(step) not in field_names(value):
+            return None
         if isinstance(step, str):
             is_left_out = isinstance(value, Sparse) and not is_strict
             value = value[step] if is_left_out else _field_at(path, value, step)  # type: ignore[index]
@@ -464,7 +476,7 @@ def getter(path: FieldPath, example: object) -> Get:
         example: a message like those that the function is for.
     """
     if _has_free_keys(path, example):
-        return lambda value: walk(path, value)
+        return lambda value: walk(path, value, may_lack_keys=True)
     style = style_of(example)
     if style == "attributes" and path.steps and all(isinstance(step, str) for step in path.steps):
         return attrgetter(".".join(map(str, path.steps)))

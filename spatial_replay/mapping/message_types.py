@@ -237,7 +237,11 @@ GENERIC = MessageLayout(
     position=(*((path,) for path in _POINTS), ("x", "y", "z"), ("x", "y")),
     orientation=("pose.pose.orientation", "pose.orientation", "orientation"),
     yaw=("theta", "yaw", "heading", "pose.theta", "pose.yaw", "base.orientation.yaw"),
-    frame=("header.frame_id", "$.header.frame_id", "frame_id", "$.frame_id"),
+    frame=(
+        *("header.frame_id", "$.header.frame_id", "frame_id", "$.frame_id"),
+        # as protobuf writes them in JSON
+        *("header.frameId", "$.header.frameId", "frameId", "$.frameId"),
+    ),
     stamp=tuple(
         Stamp(path)
         for path in ("header.stamp", "$.header.stamp", "stamp", "$.stamp", "timestamp", "$.timestamp")

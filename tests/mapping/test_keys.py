@@ -357,3 +357,18 @@ def test_two_lists_in_a_message_are_the_same_live_and_in_a_log() -> None:
     # silence makes the objects of both lists unknown
     lost = assembler.lose(["/scene"], 9.0)
     assert [int(lost.rows[-1, lost.names.index(name)]) < -1 for name in ("car1", "walker1")] == [True, True]
+
+
+def test_numbers_and_frames_are_read_as_json_of_protobuf_has_them() -> None:
+    contents = [{"x": "12", "y": y, "frameId": "map"} for y in (1, "NaN", "3.5")]
+    made = read("", *contents, mapping="fixed_frame: map")
+    assert (made.states("t"), made.centre(2, "t"), made.faults) == ("+?+", (12.0, 3.5), ())
+
+
+def test_a_key_that_a_map_lacks_is_unknown() -> None:
+    first, second = Struct(), Struct()
+    first.update({"levels": {"tank 1": 0.5}})
+    second.update({"levels": {"tank 2": 0.5}})
+    made = read("signals: {level: levels.'tank 1'}", first, second)
+    assert np.isnan(made.trace.signals["level"]).tolist() == [False, True]
+    assert made.faults == ()
