@@ -651,7 +651,7 @@ class Evaluation(Displayed):
 
     @cached_property
     def remarks(self) -> tuple[Diagnostic, ...]:
-        """Diagnostics about the specification's names in this trace (see `check_names`).
+        """Warnings about the specification's text (see `Specification.warnings`) and its names in this trace.
 
         A warning for each object and signal that the trace never has, which is therefore unknown in every
         sample. Also for each class of a template without an object, and for each object hidden by a
@@ -661,7 +661,8 @@ class Evaluation(Displayed):
         found = check_names(
             self.specification, self.objects, self.signals, classes=self.classes, each=self.each
         )
-        return tuple(replace(remark, severity="warning") for remark in found)
+        names = (replace(remark, severity="warning") for remark in found)
+        return (*self.specification.warnings, *names)
 
     @cached_property
     def vacuous(self) -> tuple[UntestedPart, ...]:

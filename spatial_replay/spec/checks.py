@@ -50,6 +50,7 @@ from spatial_replay.text import is_text_number, names_from_unit, text_number
 _NO_CHOICE: Mapping[str, str] = MappingProxyType({})
 _LISTED = 12
 """Names that a hint lists."""
+_R2U2_SIGNS = frozenset({"&&", "||"})
 _TIGHTNESS = MappingProxyType({"IFF": 0, "IMPLIES": 1, "OR": 2, "XOR": 3, "AND": 4})
 
 
@@ -113,6 +114,9 @@ def _strong_next(prefix: Token, sign: Token, source: SourceText) -> Diagnostic:
 def _reach(prefix: Token, operator: Token, source: SourceText) -> Diagnostic:
     message = f"{prefix.value!r} reaches over {operator.value!r} up to the closing bracket"
     hint = f"write ({prefix.value} ...) {operator.value} ... or {prefix.value} (... {operator.value} ...)"
+    tool = "R2U2" if _written(operator, source) in _R2U2_SIGNS else "rtamt"
+    if tool == "R2U2" or _written(prefix, source) != prefix.value:
+        hint = f"in {tool} it ends in front of {operator.value!r}; {hint}"
     return source.diagnostic("warning", span_of(prefix), message, hint)
 
 
@@ -131,6 +135,30 @@ def _differs(first: Token, second: Token) -> bool:
     if "INFIX" in (first.type, second.type):
         return first.type != second.type
     return _TIGHTNESS[first.type] > _TIGHTNESS[second.type]
+
+
+def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[Diagnostic]:
+    """Yield a warning for each operator that the tool whose spelling was read defines otherwise.
+
+    A bounded until is spelt alike here and in R2U2, so it counts only in a text with signs of R2U2.
+    """
+    is_of_r2u2 = any(_written(token, source) in _R2U2_SIGNS for token in tokens)
+    for place, token in enumerate(tokens):
+        if _written(token, source) == "next" and token.type == "PREFIX":
+            message = "'next' is read as X, so there has to be a next sample"
+            hint = "in rtamt it holds at the last sample, too: write WX for that, X for this"
+            yield source.diagnostic("warning", span_of(token), message, hint)
+        window = tokens[place + 1 : place + 3]
+        is_window = [each.type for each in window] == ["LSQB", "NUMBER"]
+        begin = window[1].value if is_window else ""
+        if is_of_r2u2 and token.value in ("U", "R") and token.type == "INFIX" and begin.strip("0").isdigit():
+            message = f"the left side of {token.value!r} counts from now, not from its window's beginning"
+            hint = f"in R2U2 it counts from there: F[{begin}, {begin}] (a {token.value}[0, ...] b)"
+            yield source.diagnostic("warning", span_of(token), message, hint)
+
+
+def _written(token: Token, source: SourceText) -> str:
+    return source.text[span_of(token).start : span_of(token).end]
 
 
 def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:

@@ -25,6 +25,7 @@ from spatial_replay.spec.checks import (
     past_warnings,
     reach_warnings,
     scale_warnings,
+    spelling_warnings,
     unused_warnings,
 )
 from spatial_replay.spec.comparisons import ComparisonBuilder
@@ -90,7 +91,15 @@ from spatial_replay.spec.syntax import (
     TruthSyntax,
     UseStatement,
 )
-from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, span_of, tokenize
+from spatial_replay.spec.tokens import (
+    MAX_TOKENS,
+    SAMPLES,
+    function_hint,
+    is_reserved,
+    quoted,
+    span_of,
+    tokenize,
+)
 from spatial_replay.spec.walks import (
     base_of,
     is_centre,
@@ -575,6 +584,8 @@ class Elaborator:
             hint = self.faults.nearest(name.text, self._formula_names())
             if name.text.lower() in ("true", "false"):
                 hint = f"truth values are written {name.text.lower()}"
+            elif name.text.lower() in SAMPLES:
+                hint = f"it is written {SAMPLES[name.text.lower()]}"
             written = name.text if name.text.isidentifier() else quoted(name.text)
             hint = hint or (
                 f"a signal needs a comparison, such as {written} >= 1.0 or, for a flag, {written} == 1; "
@@ -709,7 +720,10 @@ def parse_specification(
     if not specs and not any(isinstance(statement, BrokenStatement) for statement in statements):
         end = Span(len(text), len(text))
         if not faults.found:
-            faults.add(end, "this text holds no spec", "write a formula, or: spec name = formula")
+            hint = "write a formula, or: spec name = formula"
+            if text.lstrip().startswith("#") and any(sign in text for sign in "<>="):
+                hint += "; # begins a comment, and a plug-in counts objects"
+            faults.add(end, "this text holds no spec", hint)
     try:
         done = elaborator.specs(specs)
     except TooLargeError:
@@ -717,6 +731,7 @@ def parse_specification(
     faults.raise_if_any()
     warnings: list[Diagnostic] = [
         *reach_warnings(tokens, faults.source, used_profile == "spatial_spec"),
+        *spelling_warnings(tokens, faults.source),
         *past_warnings(done, faults.source),
         *equality_warnings(done, faults.source),
         *unused_warnings(namespace, faults.source),

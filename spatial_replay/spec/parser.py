@@ -635,7 +635,9 @@ def _report(
         faults.add(span, *other)
         return
     if token.type == "$END":
-        faults.add(span, f"the statement ends too early: expected {_expected(accepted)}")
+        rest = faults.source.text[span.start :].partition("\n")[0].lstrip()
+        hint = "# begins a comment; a plug-in counts objects" if rest.startswith("#") else ""
+        faults.add(span, f"the statement ends too early: expected {_expected(accepted)}", hint)
         return
     found = f"expected {_expected(accepted)}, found {token.value!r}"
     kinds = [each.type for each in tokens[: position + 1]]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
+from math import cos, radians
 from types import MappingProxyType
 
 from lark import Token
@@ -46,12 +47,13 @@ _MEANT: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("f", "finally", "ev", "sometime", "sometimes"), "F"),
         **{"x": "X", "wx": "WX", "h": "H", "o": "O", "y": "Y", "never": "G not", "if": "->"},
         **{"previously": "Y", "yesterday": "Y", "p": "O", "n": "X", "gf": "G F", "fg": "F G"},
-        **{"[]": "G", "<>": "F"},
+        **{"[]": "G", "<>": "F", "s_next": "X", "s_prev": "Y", "prev": "not Y not", "z": "not Y not"},
     }
 )
 """Operators for lower-case words that may also be names."""
 _MEANT_BETWEEN: Mapping[str, str] = MappingProxyType(
     {
+        **{"v": "R", "m": "U: (p) M (q) is (q) U (p and q)", "t": "S: (p) T (q) is not ((not p) S (not q))"},
         **{"iff": "<->", "unless": "W", "weak_until": "W", "releases": "R", "then": "->", "therefore": "->"},
         **{word.lower(): operator for word, (_, operator) in _INFIX_WORDS.items()},
     }
@@ -79,6 +81,7 @@ _MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("◇", "◊", "⋄"), "eventually is written F, as in F (a ovlp b)"),
         **{"○": "next is written X, as in X (a ovlp b)", "∀": "write forall", "∃": "write exists"},
         **{"≤": "write <=", "≥": "write >=", "≠": "write not (... == ...)", "\u2212": "write -"},
+        **{"^": "write xor, or and; a power of a signal is computed by a plug-in"},
         **{"%": "a share is written as the log has it: 20 % of a signal from 0 to 1 is 0.2"},
         **{";": "a statement ends with its line; leave it out"},
         **dict.fromkeys(("{", "}"), "numbers stand in square brackets: F[0, 5s], closeto[0.1]"),
@@ -129,6 +132,22 @@ _AT_TIMES: Mapping[str, str] = MappingProxyType(
     }
 )
 """Operators that words of time stand for, given that time."""
+_ORDERING: Mapping[str, str] = MappingProxyType(
+    {
+        "at": "both in one sample: F (p and q); at the end of a log: F (p and WX false)",
+        "before": "p before q is written (not q) U p, or with W if p need not be",
+        "precedes": "p before q is written (not q) U p, or with W if p need not be; of places, a prec[x] b",
+        "after": "p after q is written (not p) U q; always after q, G (q -> G p)",
+        "by": "a margin is a part of an object: a leftof enlarge(b, 0.1)",
+    }
+)
+"""Words between two formulas that no single operator stands for."""
+SAMPLES: Mapping[str, str] = MappingProxyType(
+    {
+        **{"tt": "true", "ff": "false", "last": "WX false", "ftp": "not Y true"},
+    }
+)
+"""Formulas that are words elsewhere, by the word in lower case."""
 _QUANTIFYING: Mapping[str, str] = MappingProxyType(
     {**dict.fromkeys(("for", "all", "every", "each"), "forall"), **dict.fromkeys(("any", "some"), "exists")}
 )
@@ -278,6 +297,10 @@ def unit_hint(number: str, unit: str, per: str = "") -> str:
         seconds = _TIMES.get(per, 1.0)
         metres = format(float(number) * _LENGTHS[unit] / seconds, ".4g")
         return f"lengths are in the unit of the log's footprints: write {metres} if those are metres"
+    if unit in ("deg", "degrees", "rad", "radians"):
+        angle = float(number) if unit.startswith("rad") else radians(float(number))
+        turned = format(1.0 - cos(angle), ".4g")
+        return f"orientations are compared by 1 - cos of their angle: write {turned}"
     if unit == "px":
         return f"lengths are in the unit of the log's footprints: write {number} if those are pixels"
     if unit in _TIMES:
@@ -299,6 +322,11 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     found = f"{token.value!r} cannot stand here"
     if position == 1 and (statement := meant_statement(tokens)):
         return f"{last.value!r} begins no statement", statement
+    operator = tokens[position - 3].value if position > 2 else ""
+    is_bound = before.type == "LSQB" and last.type == "NUMBER" and token.type == "RSQB"
+    if is_bound and operator in ("X", "WX", "Y"):
+        within = f"{'O' if operator == 'Y' else 'F'}[0, {last.value}]"
+        return f"{operator} takes no window", f"it means one sample; within {last.value} is {within} (...)"
     if window := _meant_window(tokens, position):
         return found, f"a window is written with both of its ends: {window}"
     relation = last if last.type == "RELATION" else before
@@ -326,6 +354,10 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         before.value == "=>" and token.type in ("RPAR", "$END")
     ):
         return "'=>' means implies", "at least is written >="
+    if token.value == "=" and last.value in ("==", "!="):
+        return found, f"it is written {last.value}"
+    if token.type == "NOT" and last.type == "LSQB" and before.value in ("X", "WX"):
+        return f"{before.value}[!] is no operator", "a next sample that has to be there is written X (...)"
     if token.value == "=" and (
         sign := {"<": "<=", ">": ">="}.get(after.value if "COMPARE" in accepted else last.value)
     ):
@@ -376,6 +408,8 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
     kinds = [each.type for each in inner]
     numbers = [each.value.strip(".") for each in inner if each.type == "NUMBER"]
     operator = tokens[start].value
+    if operator in ("X", "WX", "Y"):
+        return ""
     match kinds:
         case ["COMPARE", "NUMBER", *_] | ["LSQB", "COMPARE", "NUMBER", *_]:
             sign = next(each.value for each in inner if each.type == "COMPARE")
@@ -407,6 +441,10 @@ def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str]
 def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
     word = str(token.value).lower()
     found = f"{token.value!r} cannot stand here"
+    if word in _ORDERING and "AND" in accepted and (after.type != "NUMBER" or word == "by"):
+        return found, _ORDERING[word]
+    if (str(last.value).lower(), word) == ("exactly", "once"):
+        return found, "p holds in one sample only is written (not p) U (p and WX (G not p))"
     if "RELATION" in accepted:
         if word in ("is", "are"):
             relation = after.value if after.type in _RELATIONS else "leftof"
@@ -514,6 +552,8 @@ def function_hint(name: str, argument: str, arguments: Sequence[str] = ()) -> st
             return f"it is written speed({inner})"
         case "derivative" | "der" | "diff", [inner]:
             return f"it is written rate({inner})"
+        case "angle" | "heading" | "yaw" | "orientation", _:
+            return "orientations are compared by a oriented[k] b, where k is 1 - cos of the greatest angle"
         case "min" | "max", [_, _, *_]:
             return "compare each by itself, joined by and, or by or"
         case _, [first, second] if first.isidentifier() and second.isidentifier():
@@ -716,7 +756,8 @@ def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Toke
         owner = before[-1].value
         message = f"an object has no fields, so nothing is behind {owner!r}"
         hint = (
-            f"compare places by relations, such as {owner} leftof b; a name with a dot is written in quotes"
+            f"places are compared by relations, such as {owner} leftof b, speeds by speed({owner}) <= 1; "
+            "a name with a dot is written in quotes"
         )
         faults.add(span, message, hint)
         return

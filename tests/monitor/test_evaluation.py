@@ -87,7 +87,7 @@ def test_an_unknown_node_name_is_answered_with_the_nearest(trace):
 
 
 def test_names_missing_from_the_trace_are_reported(trace):
-    text = "region b = box(0, 0, 1, 1)\nspec s = F (aa ovlp b) and G q >= 0 and F a ovlp b"
+    text = "region b = box(0, 0, 1, 1)\nspec s = (F (aa ovlp b)) and (G q >= 0) and F a ovlp b"
     evaluation = judged(text, trace)
     assert [(each.severity, each.line, each.message) for each in evaluation.remarks] == [
         ("warning", 1, "the log has an object 'b', which this definition hides"),

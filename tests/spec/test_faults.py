@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import pytest
 
-from spatial_replay import SpecificationError, UsageError, load_specification, parse_specification
+from cli.program import run
+from spatial_replay import (
+    Footprint,
+    Sample,
+    SpecificationError,
+    Trace,
+    UsageError,
+    evaluate,
+    load_specification,
+    parse_specification,
+)
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import MAX_FAULTS
 
@@ -95,6 +106,34 @@ spec template(ego) = ego ovlp goal
         ("spec s = G (a dist b)", "(a dist b)", "a number, where a formula", "(a dist b) <= 1"),
         ("spec s = x[-3] >= 1", ">=", "a signal has no [-n]", "rate(x) is its change"),
         ("spec s = x >= y + z[-1]", "", "a signal has no [-n]", "rate(x) is its change"),
+        ("spec s = G (prev(a ovlp b))", "prev", "'prev' is not an operator", "is written not Y not"),
+        ("spec s = Z (a ovlp b)", "Z", "'Z' is not an operator", "is written not Y not"),
+        ("spec s = s_next (a ovlp b)", "s_next", "'s_next' is not an operator", "is written X"),
+        ("spec s = X[!] (a ovlp b)", "!", "X[!] is no operator", "is written X (...)"),
+        ("spec s = earlier and last", "last", "no spec is named 'last'", "it is written WX false"),
+        ("spec s = FTP -> earlier", "FTP", "no spec is named 'FTP'", "it is written not Y true"),
+        ("spec s = earlier or tt", "tt", "no spec is named 'tt'", "it is written true"),
+        ("spec s = LAST V earlier", "V", "'V' is not an operator", "is written R"),
+        ("spec s = earlier M (a ovlp b)", "M", "'M' is not an operator", "(q) U (p and q)"),
+        ("spec s = earlier T (a ovlp b)", "T", "'T' is not an operator", "not ((not p) S (not q))"),
+        ("spec s = x !== 3", "=", "'=' cannot stand here", "it is written !="),
+        ("spec s = earlier ^ earlier", "^", "the character '^'", "write xor, or and"),
+        ("spec s = F p at q", "at", "'at' cannot stand here", "F (p and q)"),
+        ("spec s = G (a ovlp b) at the end", "at", "'at' cannot stand here", "F (p and WX false)"),
+        ("spec s = earlier before (a ovlp b)", "before", "cannot stand here", "(not q) U p"),
+        ("spec s = p precedes q", "precedes", "cannot stand here", "(not q) U p"),
+        ("spec s = exactly once a ovlp b", "once", "cannot stand here", "(not p) U (p and WX (G not p))"),
+        ("spec s = a leftof b by 0.1", "by", "cannot stand here", "a leftof enlarge(b, 0.1)"),
+        ("spec s = X[1s] (a ovlp b)", "]", "X takes no window", "within 1s is F[0, 1s]"),
+        ("spec s = angle(a, b) <= 10", "angle(a, b)", "is not a function", "a oriented[k] b"),
+        (
+            "spec s = a oriented[10deg] b",
+            "10deg",
+            "neither a number",
+            "1 - cos of their angle: write 0.01519",
+        ),
+        ("spec s = robot.speed <= 1", ".", "an object has no fields", "speed(robot) <= 1"),
+        ("spec s = count(people) <= 2", "count(people)", "is not a function", "a plug-in computes it"),
         ("spec s = 2 <= 3", "2 <= 3", "two constants are compared", "a signal, a distance"),
         ("spec s = x <= 2s + y", "2s", "a duration, where a plain number", "its unit"),
         ("const e = 5 s", "s", "'s' is no unit here", "without the blank: 5s"),
@@ -252,6 +291,13 @@ def test_a_fault_names_the_place_and_the_remedy(statement: str, where: str, mess
     assert marked.startswith(where) if where else caret.index("^") == len(line)
 
 
+@pytest.mark.parametrize("text", ["spec s = #people <= 2", "#people <= 2"])
+def test_a_number_of_objects_is_no_comment(text: str) -> None:
+    (fault,) = faults_of(text)
+    assert "# begins a comment" in fault
+    assert "a plug-in counts objects" in fault
+
+
 def test_all_faults_are_reported_together_in_the_order_of_the_text() -> None:
     lines = [f"spec s{number} = a closto b" for number in range(10)]
     found = faults_of("\n".join(lines))
@@ -351,6 +397,12 @@ def test_a_text_full_of_faults_takes_no_longer_than_a_correct_one(wrong: str) ->
         ("(G (a ovlp b)) and H (a ovlp b)", ["'H' looks back"]),
         ("not (a ovlp b) and (b ovlp c)", []),
         ("X! (a ovlp b)", ["'X!' is read as 'X not'"]),
+        ("G (next (a ovlp b))", ["'next' is read as X"]),
+        ("next ovlp b", []),
+        ("always (a ovlp b) and (c ovlp d)", ["'G' reaches over 'and'"]),
+        ("(a ovlp b) U[1,4] (c ovlp d) && (a ovlp c)", ["the left side of 'U' counts from now"]),
+        ("(a ovlp b) U[0,4] (c ovlp d) && (a ovlp c)", []),
+        ("(a ovlp b) U[1,4] (c ovlp d)", []),
         ("X !(a ovlp b) or X not (a ovlp b)", ["'X' reaches over 'or'"]),
         ("use spatial_spec\nnot (a ovlp b) and (b ovlp c)", ["'not' over 'and'"]),
         ("use spatial_spec\n(not (a ovlp b)) and (b ovlp c)", []),
@@ -372,6 +424,21 @@ def test_legal_but_misleading_texts_give_warnings(text: str, messages: list[str]
     for warning, message in zip(warnings, messages, strict=True):
         assert message in warning.message
         assert warning.severity == "warning"
+
+
+def test_an_evaluation_and_a_replay_warn_of_spellings_that_another_tool_reads_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "always (a ovlp b) and (next (a ovlp b))"
+    cube = Footprint.box(0, 0, 1, 1)
+    trace = Trace.from_samples([Sample(0, {"a": cube, "b": cube})])
+    remarks = evaluate(parse_specification(text), trace).remarks
+    assert "in rtamt it ends in front of 'and'" in remarks[0].hint
+    assert "write WX for that" in remarks[1].hint
+    log = tmp_path / "run.jsonl"
+    log.write_text('{"time_ns": 0, "objects": [{"name": "a", "polygon": [[0, 0], [1, 0], [1, 1]]}]}\n')
+    run(["replay", str(log), "--spec", text])
+    assert "in rtamt it ends in front of 'and'" in capsys.readouterr().err
 
 
 def test_names_are_compared_with_those_of_a_log() -> None:

@@ -105,7 +105,7 @@ def test_a_sum_has_the_unit_of_its_first_number_without_a_factor(
 @pytest.mark.parametrize(
     ("edited", "kind"), [("load - limit <= 9", "constant"), ("limit - load <= 1", "replaced")]
 )
-def test_an_edited_number_of_a_sum_is_told_from_another_sum(edited: str, kind: str) -> None:
+def test_an_edited_number_of_a_sum_is_distinguished_from_another_sum(edited: str, kind: str) -> None:
     old, new = (sr.parse_specification(f"G ({text})") for text in ("load - limit <= 1", edited))
     (edit,) = sr.diff_specifications(trace(), old, new).spec("spec").edits
     assert edit.kind == kind
