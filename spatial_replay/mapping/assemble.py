@@ -31,7 +31,7 @@ from spatial_replay.mapping.assumptions import contradictions
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.facts import facts_of
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import MISFITS, ReadingPlan, TopicReader
+from spatial_replay.mapping.topic_reader import MISFITS, PlannedTopic, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart
@@ -241,11 +241,31 @@ class _Assembling:
             ):
                 continue
             places = np.flatnonzero(number_of_message == self._number_of_topic[reader.planned.topic])
+            places = self._of_publisher(reader.planned, places, arrived)
             if len(places):
                 stamped.append(self._stamp(reader, places, arrived))
         end = self._advance_time(stamped, arrived)
         for each in stamped:
             self._put(each.before(end), arrived)
+
+    def _of_publisher(self, planned: PlannedTopic, places: Integers, arrived: MessageColumns) -> Integers:
+        """Return the places of messages whose publisher the mapping takes.
+
+        Raises:
+            UsageError: the topic has no such publisher.
+        """
+        number = None if planned.mapping is None else planned.mapping.publisher
+        if number is None:
+            return places
+        channels = sorted(
+            code for code, channel in arrived.channels.items() if channel.topic == planned.topic
+        )
+        if number > len(channels):
+            raise UsageError(
+                f"{self._plan.mapping.name}: topics.{planned.name}.publisher: there is no publisher {number};"
+                f" the topic has {counted(len(channels), 'channel')}"
+            )
+        return places[arrived.channel[places] == channels[number - 1]]
 
     def _stamp(self, reader: TopicReader, places: Integers, arrived: MessageColumns) -> _Stamped:
         """Return the messages of one topic with their times on its clock, decoded if the clock needs that."""

@@ -670,7 +670,7 @@ ASSUMPTIONS: Final = (
         "One publisher sends a topic.",
         "channels of the topic that alternate and share names",
         _publishers,
-        "split the log by channel, and give each its own topic",
+        "`[{name: a, publisher: 1}, {name: b, publisher: 2}]` for the topic makes two objects",
         is_about_signals=True,
     ),
     Assumption(

@@ -151,6 +151,7 @@ class TopicMapping:
         has_zeros_left_out: whether fields that JSON messages lack are 0.
         reads_objects: false for topics that are read for their signals only.
         optional: whether a log may lack the topic.
+        publisher: the number, from 1 on, of the only publisher whose messages count.
     """
 
     topic: str
@@ -182,6 +183,7 @@ class TopicMapping:
     invalid: tuple[float, ...] = ()
     has_zeros_left_out: bool = False
     optional: bool = False
+    publisher: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +255,7 @@ def age_ns(text: str) -> int:
 
 
 _NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
-_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional", "missing"})
+_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional", "missing", "publisher"})
 """Keys that do not concern objects: a topic with signals and no other keys has no objects."""
 
 
@@ -421,6 +423,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         invalid=tuple(map(float, entry.get("invalid", ()))),
         has_zeros_left_out="missing" in entry,
         optional=entry.get("optional", False),
+        publisher=entry.get("publisher"),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,13 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.struct_pb2 import Struct
+from mcap.writer import Writer
 
 from mapping.feeding import SECOND, Feed, Made, make
 from spatial_replay import Footprint, Trace, UsageError
 from spatial_replay.geometry.measure import contact
 from spatial_replay.mapping.assemble import LiveAssembler
+from spatial_replay.mapping.mapped_source import MappedSource
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.topic_reader import ReadingPlan
 
@@ -372,3 +375,32 @@ def test_a_key_that_a_map_lacks_is_unknown() -> None:
     made = read("signals: {level: levels.'tank 1'}", first, second)
     assert np.isnan(made.trace.signals["level"]).tolist() == [False, True]
     assert made.faults == ()
+
+
+def test_a_topic_of_two_publishers_is_two_objects(tmp_path: Path) -> None:
+    path = tmp_path / "merged.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200)
+        writer.start("", "test")
+        channels = [writer.register_channel("/odom", "json", 0) for _ in range(2)]
+        for tick in range(20):
+            x = 30.0 * (tick % 2) + 0.01 * tick
+            content = json.dumps({"x": x, "y": 0.0}).encode()
+            writer.add_message(channels[tick % 2], SECOND + tick * SECOND // 10, content, SECOND, tick)
+        writer.finish()
+
+    def log(entries: str) -> MappedSource:
+        mapping = parse_mapping(f"topics: {{/odom: {entries}}}", "two.yaml")
+        return MappedSource(path, mapping=mapping)
+
+    part = "position: [x, y], shape: {disc: 0.3}"
+    entries = f"[{{name: a, publisher: 1, {part}}}, {{name: b, publisher: 2, {part}}}]"
+    blocks = list(log(entries).iter_blocks())
+    *_, sample = Trace.concatenate([block.trace for block in blocks])
+    assert sorted(sample.objects) == ["a", "b"]
+    assert contact(*(sample.objects[name].footprint for name in "ab")).distance == pytest.approx(
+        29.4, abs=0.1
+    )
+    assert [doubt for block in blocks for doubt in block.doubts] == []
+    with pytest.raises(UsageError, match=r"publisher 3; the topic has 2 channels"):
+        list(log(f"{{name: a, publisher: 3, {part}}}").iter_blocks())
