@@ -133,6 +133,14 @@ def test_what_changed_is_found_and_the_smallest_piece_that_shows_it_is_cut_out(
 
 
 @pytest.mark.usefixtures("desk")
+def test_the_way_out_needs_no_program_of_ours(capsys: pytest.CaptureFixture[str]) -> None:
+    follow("limits.md", {}, capsys)
+    assert len(Path("numbers.csv").read_text().splitlines()) == 301
+    read = subprocess.run([sys.executable, "leave.py"], capture_output=True, text=True, check=True)
+    assert read.stdout.splitlines()[0].startswith("0: ['cup'")
+
+
+@pytest.mark.usefixtures("desk")
 def test_numbers_that_fit_recorded_runs_are_found_and_written(capsys: pytest.CaptureFixture[str]) -> None:
     follow("tuning.md", {}, capsys)
     assert "const clearance = 0.8 in [0, 2]    # metres, a first guess" in Path("pass.spatial").read_text()

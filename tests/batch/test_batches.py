@@ -288,7 +288,7 @@ def test_results_of_an_edited_spec_are_marked_once_for_each_spec_and_counted_apa
     batch(*run, "--update-baseline")
     same = batch(*run)
     assert "edited" not in same.out + same.err
-    # a stricter spec, and one log that is worse for the spec that nobody edited
+    # a stricter spec, and one log that is worse for the spec that was not edited
     Path("gate.spatial").write_text(GATE.replace(">= 0.3", ">= 0.45").replace("REQ-4: ", "REQ-9: "))
     write_log(Path("logs/run-0.jsonl"), 1.2)
     monkeypatch.setenv("GITHUB_ACTIONS", "true")
