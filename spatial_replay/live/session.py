@@ -29,7 +29,7 @@ from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.monitor.doubtful import ClassMembers, doubts_about, needs_of_spec
 from spatial_replay.monitor.ends import Needs, RunEnds
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update, Violation

@@ -31,7 +31,8 @@ from spatial_replay.mapping.assumptions import contradictions
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.facts import facts_of
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import MISFITS, PlannedTopic, ReadingPlan, TopicReader
+from spatial_replay.mapping.reading_plan import PlannedTopic, ReadingPlan
+from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart

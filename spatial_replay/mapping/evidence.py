@@ -17,7 +17,8 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.detections import Detections
 from spatial_replay.mapping.message_types import geodetic_order
-from spatial_replay.mapping.topic_reader import PlannedTopic, TopicReader
+from spatial_replay.mapping.reading_plan import PlannedTopic
+from spatial_replay.mapping.topic_reader import TopicReader
 
 _HEADING: Final = re.compile(r"heading|course|bearing|azimuth|cog$", re.I)
 """Names of fields that hold angles from north, clockwise."""

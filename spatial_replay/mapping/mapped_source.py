@@ -38,7 +38,7 @@ from spatial_replay.logs.read_options import FaultList, late_ns
 from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import LogMapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 

@@ -40,7 +40,7 @@ from spatial_replay.mapping.message_types import (
     short_type,
 )
 from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in, takes_turns
-from spatial_replay.mapping.topic_reader import doubts_of
+from spatial_replay.mapping.reading_plan import doubts_of
 from spatial_replay.mapping.trial import FROM_NORTH, choose_entry, flow_text, readable_messages, yaml_text
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted

@@ -24,13 +24,8 @@ from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, 
 from spatial_replay.mapping.evidence import TopicEvidence
 from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping
 from spatial_replay.mapping.message_types import name_pattern, possible_classes
-from spatial_replay.mapping.topic_reader import (
-    PlannedTopic,
-    ReadingPlan,
-    ReportFault,
-    TopicReader,
-    unit_of_stamp,
-)
+from spatial_replay.mapping.reading_plan import PlannedTopic, ReadingPlan
+from spatial_replay.mapping.topic_reader import ReportFault, TopicReader, unit_of_stamp
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.observations import Observations, check_observations

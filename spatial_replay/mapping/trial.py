@@ -22,7 +22,8 @@ from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.assumptions import ASSUMPTIONS
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan, TopicReader
+from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping.topic_reader import TopicReader
 from spatial_replay.trace.doubts import Doubt
 
 Fields: TypeAlias = Mapping[str, str]

@@ -16,7 +16,7 @@ from spatial_replay.bags.decoders import Topic
 from spatial_replay.bags.reader import Message
 from spatial_replay.mapping.assemble import Assembler, LiveAssembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 PASSERS_BY = (*(f"p{number}" for number in range(5)), "?", "?(0,) 0", "?(1,) 0")
 ANYONE = st.sets(st.sampled_from((*NAMES, *PASSERS_BY)), max_size=6)

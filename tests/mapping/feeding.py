@@ -15,7 +15,7 @@ from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.bags.reader import Message
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.doubts import Doubt
 
 SECOND = 10**9

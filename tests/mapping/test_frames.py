@@ -20,7 +20,7 @@ from mapping.feeding import SECOND, Feed, header, make, pose, pose_stamped, ros,
 from spatial_replay import Trace
 from spatial_replay.mapping.mapped_source import MappedSource
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.transforms import FrameTree
 
 MS = 10**6

@@ -21,7 +21,7 @@ from spatial_replay.geometry.measure import contact
 from spatial_replay.mapping.assemble import LiveAssembler
 from spatial_replay.mapping.mapped_source import MappedSource
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 
 def read(keys: str, *contents: Any, mapping: str = "", name: str = "a/Thing") -> Made:

@@ -10,7 +10,7 @@ from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import Trace, parse_specification
 from spatial_replay.mapping.assemble import LiveAssembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.monitor.ends import Needs, trim_trace
 
 MS = 10**6

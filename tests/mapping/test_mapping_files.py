@@ -21,7 +21,7 @@ from spatial_replay.mapping.mapping_file import (
     load_mapping,
     parse_mapping,
 )
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 EXAMPLE = """
 fixed_frame: world

@@ -12,7 +12,7 @@ from spatial_replay.bags.open import open_messages
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 TURTLES = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")
 POSES = """

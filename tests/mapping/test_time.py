@@ -13,7 +13,7 @@ from spatial_replay.bags.reader import MessageColumns
 from spatial_replay.logs.messages import Channel
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.trace import LATEST_NS
 
 MS = 10**6

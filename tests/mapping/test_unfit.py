@@ -13,7 +13,7 @@ from spatial_replay import UsageError
 from spatial_replay.bags.decoders import Topic
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 HUGE = 10**400
 

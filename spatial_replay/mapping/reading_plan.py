@@ -1,0 +1,353 @@
+"""Plan what to read of a log: compare a mapping with the topics of a log.
+
+`ReadingPlan.of` finds the faults of a mapping that only a log shows, which topics are read for what, and how
+far beyond a window messages count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.bags.reader import DISORDER_NS
+from spatial_replay.errors import UsageError
+from spatial_replay.mapping.mapping_file import (
+    DEFAULT_MAX_AGE_NS,
+    FOREVER_NS,
+    Clock,
+    LogMapping,
+    TopicMapping,
+)
+from spatial_replay.mapping.message_types import (
+    BUILT_IN,
+    GEODETIC,
+    GEODETIC_TYPES,
+    TRANSFORM_TYPES,
+    MessageLayout,
+    geodetic_order,
+    layout_of_topic,
+    short_type,
+)
+from spatial_replay.mapping.transforms import HISTORY_NS
+from spatial_replay.text import counted, nearest_hint
+from spatial_replay.trace.trace import LONG_PAUSE
+
+_LONGEST_SILENCE_NS: Final = 10 * 10**9
+"""A longer silence of the sampled topic is a pause, however rarely it came before."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTopic:
+    """How one topic is read, or one list of objects in its messages.
+
+    Attributes:
+        name: of the topic, with the place of its entry if the mapping has several: `/scene`, `/scene[1]`.
+        topic: of the log.
+        mapping: its entry; None for topics that are read for transforms or times only.
+        layout: where its objects are; None for a topic without objects.
+        max_age_ns: how long an observation or a signal stays valid.
+        between_ns: its objects are unknown between transforms that are farther apart.
+        silence_ns: after so long a silence it has ended, also where its last message stays valid.
+        is_transforms: whether its transforms place frames; `is_static`: at all times.
+        is_lasting: whether a message counts however old it is.
+        is_latched: whether it may have been sent long before it was recorded.
+        is_protobuf_json: whether its messages are of Foxglove and JSON, as protobuf writes it or not.
+    """
+
+    name: str
+    topic: str
+    clock: Clock
+    mapping: TopicMapping | None
+    layout: MessageLayout | None
+    max_age_ns: int
+    between_ns: int
+    silence_ns: int
+    is_transforms: bool
+    is_static: bool
+    is_lasting: bool
+    is_latched: bool = False
+    is_protobuf_json: bool = False
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether positions are latitudes and longitudes, counted from the mapping's origin."""
+        return self.layout is not None and self.layout.is_geodetic
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingPlan:
+    """Selection of messages for a mapping that fits the log.
+
+    Attributes:
+        topics: every topic to read: those mapped, and those with transforms if frames are needed.
+        by_log_time: whether the times of samples are log times. If not, the messages of a window are known
+            only when all have been decoded.
+        late_ns: how far messages may be out of order; it is also how long samples wait for late messages.
+        wait_ns: how long they wait for messages that change them.
+        margin_ns: how far beyond the end of a window messages still count.
+        planned: how each topic is read, in the order of `topics`.
+        lost: topics with transforms that cannot be decoded, with the reason.
+        absent: optional topics that the log lacks.
+        sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
+        fallback_topics: the topics that are sampled where that one is silent.
+        silence_ns: that topic is silent for at least so long before these are sampled.
+        longest_silence_ns: if it is silent for longer than that, they are, however rarely it came before.
+        remarks: what is doubtful about the choice of that topic.
+    """
+
+    mapping: LogMapping
+    topics: tuple[str, ...]
+    by_log_time: bool
+    wait_ns: int
+    margin_ns: int
+    late_ns: int = DISORDER_NS
+    planned: tuple[PlannedTopic, ...] = ()
+    sampled_topic: str | None = None
+    fallback_topics: frozenset[str] = frozenset()
+    silence_ns: int = DEFAULT_MAX_AGE_NS
+    longest_silence_ns: int = 0
+    lost: tuple[tuple[str, str], ...] = ()
+    absent: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, mapping: LogMapping, topics: Sequence[Topic], late_ns: int = DISORDER_NS) -> ReadingPlan:
+        """Compare a mapping with the topics of a log.
+
+        Raises:
+            UsageError: the mapping does not fit the topics; all errors are listed.
+        """
+        by_name = {topic.name: topic for topic in topics}
+        faults = _faults_of(mapping, by_name)
+        if faults:
+            raise UsageError("\n".join(f"{mapping.name}: {fault}" for fault in faults))
+        mapped: dict[str, list[TopicMapping | None]] = {}
+        for entry in mapping.topics:
+            mapped.setdefault(entry.topic, []).append(entry)
+        needs_frames = mapping.fixed_frame is not None
+        names = [topic for topic in mapped if topic in by_name]
+        others = [topic for topic in topics if needs_frames and topic.name not in mapped]
+        transforms = [topic for topic in others if short_type(topic.type) in TRANSFORM_TYPES]
+        names += [topic.name for topic in transforms if topic.unreadable is None]
+        lost = [
+            (topic.name, topic.unreadable) for topic in transforms if topic.unreadable and topic.count != 0
+        ]
+        is_stepped = mapping.sampling.step_ns is not None
+        sampled = None if is_stepped else mapping.sampling.topic or _most_frequent(mapping, by_name)
+        if sampled is not None and sampled not in names:
+            names.append(sampled)
+        planned = tuple(
+            _plan_of_topic(mapping, entry, by_name[name], place, needs_frames)
+            for name in names
+            for place, entry in enumerate(mapped.get(name, [None]))
+        )
+        is_whole = all(topic in by_name for topic in mapped)
+        if mapping.origin is not None and is_whole and not any(topic.is_geodetic for topic in planned):
+            raise UsageError(
+                f"{mapping.name}: origin: it has no effect, since no topic has positions in degrees; name"
+                " fields called latitude and longitude as `position`, or leave it out"
+            )
+        waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
+        fallback_topics = _fallback_topics(planned, sampled)
+        silences_ns = (topic.silence_ns for topic in planned if topic.name == sampled)
+        silence_ns = max([DEFAULT_MAX_AGE_NS, *silences_ns])
+        longest_silence_ns = max(silence_ns, _LONGEST_SILENCE_NS) if sampled and fallback_topics else 0
+        wait_ns = late_ns + max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0)
+        return cls(
+            mapping=mapping,
+            topics=tuple(names),
+            by_log_time=all(topic.clock == "log" for topic in planned),
+            late_ns=late_ns,
+            wait_ns=wait_ns,
+            margin_ns=max(wait_ns, late_ns + longest_silence_ns),
+            planned=planned,
+            sampled_topic=sampled,
+            fallback_topics=fallback_topics,
+            silence_ns=silence_ns,
+            longest_silence_ns=longest_silence_ns,
+            lost=tuple(lost),
+            absent=tuple(topic for topic in mapped if topic not in by_name),
+            remarks=(
+                *_slow_sampling(sampled, [by_name[topic] for topic in mapped if topic in by_name], by_name),
+                *doubts_of(topics, has_frames=needs_frames, has_stamps=mapping.clock == "header"),
+            ),
+        )
+
+    def lookback_ns(self, topic: str) -> int | None:
+        """Return how long before a window messages of a topic count; None for all, as of static
+        transforms."""
+        lookbacks_ns = [self._lookback_ns(planned) for planned in self.planned if planned.topic == topic]
+        return None if None in lookbacks_ns else max(filter(None, lookbacks_ns), default=0)
+
+    def _lookback_ns(self, planned: PlannedTopic) -> int | None:
+        ages_ns = [
+            other.max_age_ns
+            for other in self.planned
+            if other.layout is not None and not other.is_lasting and not other.is_transforms
+        ]
+        lookback_ns = planned.max_age_ns if planned.mapping is not None else 0
+        if planned.name == self.sampled_topic:
+            # its last message before a pause, and the one before that
+            pauses_ns = self.longest_silence_ns + self.longest_silence_ns // LONG_PAUSE
+            lookback_ns = max(lookback_ns, pauses_ns)
+        if planned.is_transforms and not planned.is_static:
+            # an observation of the window may be that old, and is placed by a transform of its time
+            lookback_ns = max(lookback_ns, HISTORY_NS + max(ages_ns, default=0))
+            if any(other.is_lasting and other.layout is not None for other in self.planned):
+                return None
+        lookback_ns += self.late_ns
+        return None if planned.is_lasting or lookback_ns >= FOREVER_NS else lookback_ns
+
+    def first_read_ns(self, start_ns: int) -> int:
+        """Return from which log time on messages count in a window that starts at a time."""
+        lookbacks = [self.lookback_ns(topic) for topic in self.topics]
+        return max(0, start_ns - max((lookback for lookback in lookbacks if lookback is not None), default=0))
+
+
+def _faults_of(mapping: LogMapping, by_name: dict[str, Topic]) -> list[str]:
+    faults: list[str] = []
+    named = [entry.topic for entry in mapping.topics]
+    sampled = mapping.sampling.topic
+    optional = {entry.topic for entry in mapping.topics if entry.optional}
+    for name in [*named, *([sampled] if sampled is not None and sampled not in named else [])]:
+        where = f"topics.{name}" if name in named else "sample.topic"
+        if name in optional and name not in by_name:
+            if name == sampled:
+                faults.append(
+                    f"sample.topic: the log has no topic {name!r}, so no sample can be taken; name one that"
+                    " every log has, or {every: 100ms}"
+                )
+        elif name not in by_name:
+            hint = nearest_hint(name, by_name) or f"its topics are {_topics_in_words(by_name)}"
+            if name in named and not hint.endswith("?"):
+                hint += "; where only some logs have it, add `optional: true`"
+            faults.append(f"{where}: the log has no topic {name!r}; {hint}")
+        elif (reason := by_name[name].unreadable) is not None:
+            faults.append(f"{where}: its messages cannot be decoded: {reason}")
+    if optional.issuperset(named) and by_name.keys().isdisjoint(named):
+        names = _topics_in_words(by_name)
+        faults.append(f"topics: the log has none of these optional topics; its topics are {names}")
+    for entry in mapping.topics:
+        kind = short_type(entry.type or (by_name[entry.topic].type if entry.topic in by_name else ""))
+        if (
+            kind in GEODETIC_TYPES
+            and entry.reads_objects
+            and entry.position is None
+            and entry.polygon is None
+            and mapping.origin is None
+        ):
+            faults.append(
+                f"topics.{entry.topic}: {kind} holds degrees; give the file an"
+                " `origin: [latitude, longitude]`, and positions are metres east and north of it"
+            )
+        if entry.type is not None and short_type(entry.type) not in BUILT_IN:
+            hint = nearest_hint(short_type(entry.type), BUILT_IN) or f"known are {', '.join(BUILT_IN)}"
+            faults.append(f"topics.{entry.topic}.type: {entry.type!r} is not a known type; {hint}")
+    return faults
+
+
+def _topics_in_words(by_name: Mapping[str, Topic]) -> str:
+    return ", ".join(sorted(by_name)[:20]) or "none"
+
+
+def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
+    """Return the topic that is sampled by default: of those with objects, if any, the one with most messages.
+
+    Where a log does not say how many there are, the first one counts.
+    """
+    present = [entry for entry in mapping.topics if entry.topic in by_name]
+    names = [entry.topic for entry in present if entry.reads_objects] or [entry.topic for entry in present]
+    counts = [by_name[name].count for name in names]
+    return names[0] if None in counts else max(names, key=lambda name: by_name[name].count or 0)
+
+
+def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> frozenset[str]:
+    """Return the topics that are sampled where the sampled one is silent: those that keep coming."""
+    mapped = [
+        topic
+        for topic in planned
+        if topic.mapping is not None
+        and not (topic.is_static or topic.is_latched or (topic.layout is not None and topic.layout.stays))
+    ]
+    with_objects = [topic for topic in mapped if topic.layout is not None]
+    return frozenset(topic.name for topic in with_objects or mapped if topic.topic != sampled)
+
+
+_MANY_TIMES = 10
+
+
+def _slow_sampling(
+    sampled: str | None, mapped: Sequence[Topic], by_name: Mapping[str, Topic]
+) -> tuple[str, ...]:
+    """Return a remark if a mapped topic has many times the messages of the one that is sampled."""
+    most = max(mapped, key=lambda topic: topic.count or 0)
+    count = None if sampled is None else by_name[sampled].count
+    if count is None or most.count is None or most.count < _MANY_TIMES * max(count, 1):
+        return ()
+    messages = counted(count, "message")
+    return (
+        f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
+        f" `sample: {{topic: {most.name}}}` takes one at each of these",
+    )
+
+
+def doubts_of(
+    topics: Iterable[Topic], *, has_frames: bool = False, has_stamps: bool = False
+) -> Iterator[str]:
+    """Yield what is doubtful about a mapping without a fixed frame, or with `clock: log`."""
+    topics = tuple(topics)
+    transforms = [topic.name for topic in topics if short_type(topic.type) in TRANSFORM_TYPES]
+    moving = [name for name in transforms if not name.endswith("tf_static")]
+    if len(moving) > 1 and not has_frames:
+        yield (
+            f"transforms come on {' and '.join(moving)}, so frames of one name may be of two robots; without"
+            " `fixed_frame`, coordinates are taken to be in one frame"
+        )
+    clock = next((topic.name for topic in topics if short_type(topic.type) == "rosgraph_msgs/Clock"), None)
+    if clock is not None and not has_stamps:
+        yield (
+            f"{clock} has simulated time, which may run at another rate than the recording; `clock: header`"
+            " takes the stamps of messages"
+        )
+
+
+def _plan_of_topic(
+    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, place: int, needs_frames: bool
+) -> PlannedTopic:
+    kind = short_type((entry.type if entry is not None else None) or topic.type)
+    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and place == 0
+    is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
+    layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
+    if layout is not None and GEODETIC in layout.position:
+        layout = replace(layout, origin=mapping.origin)
+    elif layout is not None and mapping.origin is not None and layout.position:
+        paths = geodetic_order(layout.position[0])
+        if paths is not None:
+            layout = replace(layout, origin=mapping.origin, position=(paths,))
+    if layout is not None and layout.polygon and layout.polygon[-1].rpartition(".")[2] in _GEOMETRIES:
+        layout = replace(layout, corner_origin=mapping.origin)
+    stays = topic.latched or (layout is not None and layout.stays)
+    default = FOREVER_NS if stays else DEFAULT_MAX_AGE_NS
+    mapped_ns = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
+    max_age_ns = FOREVER_NS if is_static else mapped_ns or default
+    return PlannedTopic(
+        name=f"{topic.name}[{place}]" if place else topic.name,
+        topic=topic.name,
+        clock=(entry.clock if entry is not None else None) or mapping.clock,
+        mapping=entry,
+        layout=layout,
+        max_age_ns=max_age_ns,
+        between_ns=min(mapped_ns or DEFAULT_MAX_AGE_NS, HISTORY_NS),
+        silence_ns=DEFAULT_MAX_AGE_NS if mapped_ns is None or mapped_ns >= FOREVER_NS else mapped_ns,
+        is_transforms=is_transforms,
+        is_static=is_static,
+        is_latched=topic.latched,
+        is_protobuf_json=topic.encoding == "json" and kind.startswith("foxglove/"),
+        is_lasting=is_static or (layout is not None and max_age_ns >= FOREVER_NS),
+    )
+
+
+_GEOMETRIES = frozenset({"geometry", "coordinates"})
+"""Fields of GeoJSON, whose corners are longitudes and latitudes (RFC 7946)."""
