@@ -6,11 +6,12 @@ Their centres, and footprints moved and turned, are here, too.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from struct import Struct
-from typing import Final, Literal, TypeAlias
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Literal, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -135,8 +136,23 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     ]
 
 
+_SHAPES: Final[Mapping[str, str]] = MappingProxyType(
+    {"circle": "disc(x, y, radius)", **dict.fromkeys(("rectangle", "rect"), "box(xmin, ymin, xmax, ymax)")}
+)
+"""Constructors of footprints by the names of their shapes elsewhere, also in the specification language."""
+
+
+class _FootprintType(type):
+    # hidden from type checkers, to which every attribute would exist otherwise
+    if not TYPE_CHECKING:
+
+        def __getattr__(cls, name: str) -> NoReturn:
+            hint = f"; write {cls.__name__}.{_SHAPES[name]}" if name in _SHAPES else ""
+            raise AttributeError(f"type object {cls.__name__!r} has no attribute {name!r}{hint}")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Footprint:
+class Footprint(metaclass=_FootprintType):
     """A union of rounded convex parts; equal when the sets of parts are.
 
     Raises:

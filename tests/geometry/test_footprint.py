@@ -133,6 +133,12 @@ def test_invalid_footprints_are_refused_with_their_value(make, message):
         make()
 
 
+def test_a_shape_of_another_name_is_answered_with_its_constructor():
+    with pytest.raises(AttributeError, match=r"'circle'; write Footprint\.disc\(x, y, radius\)"):
+        Footprint.circle(0, 0, 1)
+    assert not hasattr(Footprint, "sphere")
+
+
 def test_vertices_are_read_only_copies():
     source = np.array(SQUARE, dtype=float)
     part = ConvexPart(source)
