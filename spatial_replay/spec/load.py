@@ -900,8 +900,10 @@ def _profile(statements: Sequence[Statement], plugins: Mapping[str, Plugin], fau
     return None
 
 
-_FORMULA = re.compile(r"[(<>=]|\S [a-z]+(\[.*\])? \S")
-"""Marks of a formula that file names hardly ever have: some characters, and a word between two others."""
+_FORMULA = re.compile(
+    r"[(<>=]|\S [a-z]+(\[.*\])? \S|^(true|false)$|^(!|not |always |eventually |([FGXYOH]|WX)(\[.*\])? )"
+)
+"""Marks of a formula that file names hardly ever have: signs, a word between two others, an operator."""
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
 

@@ -358,6 +358,8 @@ def test_a_formula_stands_in_place_of_a_file_and_a_mapping_does_not(
     log.write_text(LOG)
     assert run(["replay", str(log), "--spec", "F (cube dist hans <= 1)"]) in (1, 4)
     assert "spec" in capsys.readouterr().out
+    assert run(["replay", str(log), "--spec", "F near"]) == 2
+    assert "no spec is named 'near'" in capsys.readouterr().err
     assert run(["check", "--spec", str(log)]) == 2
     assert "check FILE takes the specification without it" in capsys.readouterr().err
     mapping = tmp_path / "own.yaml"
