@@ -295,6 +295,8 @@ def test_how_often_and_where_an_invariant_is_violated_is_listed(
     ("formula", "advice"),
     [
         ("G (load >= 1)", "satisfied with 0 or less instead of 1 in `load >= 1`"),
+        ("F (load >= 2.001)", "satisfied with 2 or less instead of 2.001 in `load >= 2.001`"),
+        ("F (load <= -0.001)", "satisfied with 0 or more instead of -0.001 in `load <= -0.001`"),
         ("G (load >= 0)", "violated with any number above 0 in `load >= 0`"),
         ("G (load <= 2)", "violated with any number below 2 in `load <= 2`"),
         ("G (load >= -1)", "violated with 0.001 or more instead of -1 in `load >= -1`"),

@@ -205,6 +205,8 @@ RESIDUE: Final = 1e-12
 """A difference of so little, to what is compared, is the rounding error of its two numbers."""
 _PRECISION: Final = 60
 _FAR = 1e300
+_STEPS = 8.0
+"""Floating-point steps by which a number is moved further, so that rounding cannot undo it."""
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
 """Parts per round of a search for a number that does not move all samples alike. Each round reads the log
@@ -440,7 +442,7 @@ class _Search:
         A radius goes no lower than 0.
         """
         value = self._dial.value
-        beyond = 0.0 if self._dial.is_exact else 8.0 * float(np.spacing(max(abs(value) + size, 1.0)))
+        beyond = 0.0 if self._dial.is_exact else _STEPS * float(np.spacing(max(abs(value) + size, 1.0)))
         number = value + direction * (size + beyond)
         return max(number, 0.0) if self._dial.kind == "radius" else number
 
@@ -573,8 +575,8 @@ def _rounded(number: float, value: float) -> Iterator[float]:
     """Iterate over short numbers near one, and beyond it as seen from a value; the number itself is last."""
     exact, change = Decimal(number), Decimal(number) - Decimal(value)
     beyond = ROUND_CEILING if change > 0 else ROUND_FLOOR
-    # a rounding error has no digits of its own
-    leading = change if abs(number) <= RESIDUE * abs(value) else exact
+    # a rounding error, or the step that `_moved` adds near 0, has no digits of its own
+    leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
     last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):
         for rounding in (ROUND_HALF_EVEN, beyond):
