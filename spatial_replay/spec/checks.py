@@ -33,7 +33,14 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.resolve import Namespace, kind_of
 from spatial_replay.spec.syntax import BrokenStatement, ScaleStatement, SpecStatement, Statement
-from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, quoted, span_of, tokenize
+from spatial_replay.spec.tokens import (
+    BINARY_TYPES,
+    STATEMENT_TYPES,
+    quoted,
+    span_of,
+    title_hint,
+    tokenize,
+)
 from spatial_replay.spec.walks import (
     LENGTHS,
     base_of,
@@ -352,7 +359,9 @@ def check_names(
     for name, span in defined.items():
         if name in objects:
             message = f"the {where} has an object {name!r}, which this definition hides"
-            found.append(source.diagnostic("warning", span, message, "give the definition another name"))
+            hint = "give the definition another name"
+            hint += f"; {title_hint(name)}" if any(spec.name == name for spec in specification.specs) else ""
+            found.append(source.diagnostic("warning", span, message, hint))
     return tuple(sorted(found, key=lambda each: (each.line, each.column)))
 
 

@@ -49,7 +49,7 @@ from spatial_replay.spec.syntax import (
     TermSyntax,
     UseStatement,
 )
-from spatial_replay.spec.tokens import quoted
+from spatial_replay.spec.tokens import quoted, title_hint
 from spatial_replay.spec.walks import LENGTHS, standing
 
 Corner: TypeAlias = tuple[float, float]
@@ -485,7 +485,10 @@ class Resolver:
                 return self.names.groups[name.text]
             case other:
                 message = f"{name.text!r} is {kind_of(other)}; an object, region or group is expected here"
-                self.fault(name.span, scope, message, "if an object is meant, rename the definition")
+                hint = "if an object is meant, rename the definition"
+                if isinstance(other, SpecStatement):
+                    hint = f"if an object is meant, rename the specification; {title_hint(name.text)}"
+                self.fault(name.span, scope, message, hint)
                 return TrackedName(name.text)
 
     def _exclusion(self, written: Exclusion, scope: Scope) -> Term:

@@ -646,6 +646,12 @@ def written_name(name: str, relations: Iterable[str]) -> str:
     return quoted(name)
 
 
+def title_hint(name: str) -> str:
+    """Return how a specification that needs another name keeps its own as a title."""
+    other = re.sub(r"\W", "_", name) + "_holds"
+    return f"a title keeps its name: spec {other} {quoted(name)} = ..."
+
+
 def quoted(name: str) -> str:
     """Return a name in quotes."""
     escaped = name.replace("\\", "\\\\").replace('"', '\\"')

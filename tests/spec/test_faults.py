@@ -84,6 +84,12 @@ spec template(ego) = ego ovlp goal
         ("spec s = a ovlp box", "box", "expected an object", 'in quotes: "box"'),
         ("group g = [a, b]", "[", "'[' cannot stand here", "without brackets: group g = a, b"),
         ("region r = polygon(0, 0, 1, 1)", "0", "cannot stand here", "polygon((0, 0), (1, 1))"),
+        (
+            "spec s = G (earlier ovlp b)",
+            "earlier",
+            "'earlier' is a spec",
+            'spec earlier_holds "earlier" = ...',
+        ),
         ("spec s = G (earlier >= 1)", "earlier", "'earlier' is a specification", "rename the definition"),
         ("spec s = G battery >= 1)", ")", "')' closes nothing", "leave it out"),
         ("spec s = G (battery => 1)", " => ", "'=>' means implies", "at least is written >="),
