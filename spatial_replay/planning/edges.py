@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from itertools import pairwise, product, takewhile
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -21,11 +22,26 @@ from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_ob
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.witness.path import unknowns_of
 from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outcome, Reason, Stage, Target
 from spatial_replay.planning.maps import Cube, concerns
 from spatial_replay.planning.settings import Settings
-from spatial_replay.spec.formula import Boolean, Formula, Outline, Specification, Truth, expand
-from spatial_replay.spec.walks import iter_formulas
+from spatial_replay.spec.format import format_term
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Boolean,
+    Formula,
+    Group,
+    Outline,
+    Quantified,
+    Specification,
+    TrackedName,
+    Truth,
+    expand,
+)
+from spatial_replay.spec.walks import base_of, iter_formulas, iter_terms
+from spatial_replay.text import nearest_hint
 from spatial_replay.trace.trace import Sample, Trace
 
 # ---------------------------------------------------------------------------------------------------- demands
@@ -157,6 +173,70 @@ class Observer:
         lower, upper = values[0, :, 0].tolist(), values[min(1, len(values) - 1), :, 0].tolist()
         bounds = zip(lower, upper, strict=True)
         return tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in bounds)
+
+
+def unknown_reasons(
+    formulas: Iterable[Formula], sample: Sample, seen: Collection[str], regions: Mapping[str, Outline]
+) -> list[str]:
+    """Return why propositions are unknown in a sample, each reason once.
+
+    Args:
+        seen: names of the objects of this sample and of those before.
+    """
+    scene = TraceScene(Trace.from_samples([sample]), regions)
+    reasons: dict[str, None] = {}
+    for leaf in _leaves_of(formulas):
+        if not isinstance(leaf, Atom):
+            continue
+        names = [base.name for term in leaf.terms if isinstance(base := base_of(term), TrackedName)]
+        for reason in unknowns_of(scene, leaf):
+            missing = next((name for name in names if reason == f"{name} is not in the sample"), None)
+            hint = nearest_hint(missing, sample.objects) if missing and missing not in seen else ""
+            reasons[f"{reason}; {hint}" if hint else reason] = None
+    return list(reasons)
+
+
+def groups_without_members(formula: Formula, sample: Sample) -> list[Group]:
+    """Return the open groups without members that a proposition is about; none if it is about others, too."""
+    empty: list[Group] = []
+    for leaf in _leaves_of([formula]):
+        count = 1
+        groups = [base for term in iter_terms([leaf]) if isinstance(base := base_of(term), Group)]
+        if isinstance(leaf, Quantified) and isinstance(leaf.group, Group):
+            groups, count = [leaf.group], len(leaf.variables)
+        missing = [group for group in groups if group.is_open and _members_of(group, sample) < count]
+        if not missing:
+            return []
+        empty += missing
+    return empty
+
+
+def absence_text(groups: Iterable[Group], sample: Sample) -> str:
+    """Return which groups have no members, with the nearest class of the sample."""
+    classes = sorted({tracked.class_name for tracked in sample.objects.values() if tracked.class_name})
+    hints = {
+        format_term(replace(group, name="")): nearest_hint(group.class_name or "", classes)
+        for group in groups
+    }
+    return " and ".join(f"{text}; {hint}" if hint else text for text, hint in hints.items())
+
+
+def _leaves_of(formulas: Iterable[Formula]) -> Iterator[Formula]:
+    for formula in formulas:
+        if isinstance(formula, Boolean):
+            yield from _leaves_of(formula.operands)
+        else:
+            yield formula
+
+
+def _members_of(group: Group, sample: Sample) -> int:
+    classes = {name: tracked.class_name for name, tracked in sample.objects.items()} | dict(sample.unknown)
+    excluded = {name.name for name in group.excluded}
+    wanted = (group.class_name or ANY_CLASS).casefold()
+    return sum(
+        name not in excluded and wanted in (ANY_CLASS, (class_name or "").casefold())
+        for name, class_name in classes.items()
+    )
 
 
 def refuse_template(specification: Specification, name: str) -> None:

@@ -35,13 +35,16 @@ from spatial_replay.planning.edges import (
     Budget,
     Observer,
     Symbol,
+    absence_text,
     consideration_of,
     equivalent_edges,
+    groups_without_members,
     idle_transitions,
     loss_text,
     moved_later,
     refuse_template,
     specs_of,
+    unknown_reasons,
     why_no_path,
     worst_state,
 )
@@ -49,7 +52,7 @@ from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
 from spatial_replay.planning.maps import concerns, refuse_delays, refuse_unknown
 from spatial_replay.planning.motions import Expectations, Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
-from spatial_replay.spec.formula import Specification, Temporal
+from spatial_replay.spec.formula import Group, Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import counted, named_arguments, times_apart
 from spatial_replay.trace.trace import Sample, require_sample
@@ -135,6 +138,10 @@ class Planner:
         ]
         self._words = self.automaton.renamed(named)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
+        # the same, where what only groups without members satisfy may still be to do
+        self._tested = self._states
+        self._awaited: list[Group] = []
+        self._seen: frozenset[str] = frozenset()
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
@@ -221,12 +228,29 @@ class Planner:
         states, symbol = self._states, self._symbol
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(states, self._symbol)
+        self._seen |= sample.objects.keys()
+        self._test(sample)
         if self._lost is None and self._states.isdisjoint(self.automaton.can_accept):
             text = loss_text(self._words, states, symbol, self._symbol)
             self._lost = Loss(sample.time_ns, text)
         self._stop_reason = self._why_stop(before, sample)
         # a wait ends early if the automaton is not where time alone should have taken it
         self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
+
+    def _test(self, sample: Sample) -> None:
+        """Step the states in which groups without members have done nothing, unless that loses acceptance."""
+        groups = [groups_without_members(formula, sample) for formula in self._formulas]
+        known = self.automaton.step_set(self._tested, self._symbol)
+        symbol = [None if empty else value for empty, value in zip(groups, self._symbol, strict=True)]
+        still_open = self.automaton.step_set(self._tested, symbol) & self.automaton.can_accept
+        self._awaited = [] if still_open <= known else [group for empty in groups for group in empty]
+        self._tested = known | still_open
+
+    @property
+    def _lacks_members(self) -> bool:
+        """Whether only groups without members satisfy the specification."""
+        accepting = self.automaton.accepting
+        return bool(self._awaited) and self._states <= accepting and not self._tested <= accepting
 
     def _why_stop(self, before: Sample | None, sample: Sample) -> str:
         """Return why the motion has to stop on a sample that follows another one; "" if it need not."""
@@ -294,7 +318,7 @@ class Planner:
         self._attempts.conclude(step.aim, step.target, outcome, self.states, self._newest())
 
     def _waits_on(self, step: Step) -> bool:
-        return bool(self._ahead) if step.ahead else self._is_blind()
+        return bool(self._ahead) if step.ahead else self._is_blind() or self._lacks_members
 
     def _is_blind(self) -> bool:
         """Return whether unknown propositions leave the automaton's state open."""
@@ -302,10 +326,16 @@ class Planner:
         return len(self._states) > 1 and None in self._symbol and not is_accepting
 
     def _next_step(self) -> Step:
+        if self._lacks_members:
+            groups = absence_text(self._awaited, self._newest())
+            return self._decision("wait", (), f"nothing shows that it is done: no object is in {groups}")
         if self._states <= self.automaton.accepting:
-            return self._decision("hold", (), "the specification is satisfied: hold")
+            if self._tested <= self.automaton.accepting:
+                return self._decision("hold", (), "the specification is satisfied: hold")
+            # members have come, and have not done it yet
+            self._states = self._tested
         if self._is_blind():
-            return self._decision("wait", (), f"not enough is seen: {self._unknown()} unknown")
+            return self._decision("wait", (), f"not enough is seen: {self._unknown()}")
         state = worst_state(self.automaton, self.states)
         if state is None:
             reason = "no path left: the specification cannot be satisfied any more"
@@ -449,10 +479,12 @@ class Planner:
         return self._sample
 
     def _unknown(self) -> str:
-        """Return the labels of the propositions that the newest sample leaves unknown."""
-        propositions = self._words.propositions
-        labels = zip(propositions, self._symbol, strict=True)
-        return ", ".join(proposition.label for proposition, value in labels if value is None)
+        """Return the labels of the propositions that the newest sample leaves unknown, and why it does."""
+        unknown = [place for place, value in enumerate(self._symbol) if value is None]
+        labels = ", ".join(self._words.propositions[place].label for place in unknown)
+        formulas = [self._formulas[place] for place in unknown]
+        reasons = unknown_reasons(formulas, self._newest(), self._seen, self._regions)
+        return f"{labels} unknown: {'; '.join(reasons)}" if reasons else f"{labels} unknown"
 
 
 def _cost(target: Target, pushes: bool) -> float:

@@ -13,6 +13,7 @@ from planning.plans import PUSH, record_plan_of
 from spatial_replay import NoAutomatonError, Planner, Settings
 from spatial_replay.planning import (
     Grid,
+    Outcome,
     Workspace,
     moved_object,
     read_decisions,
@@ -134,3 +135,59 @@ def test_a_wait_is_logged_once_with_its_outcome(tmp_path, text):
     assert recomputed.differences == ()
     assert recomputed.decisions == len(steps)
     assert [each.step.reason for each in read_steps(log)] == [each.reason for each in steps]
+
+
+def block(x: float, yaw: float | None = None) -> sr.TrackedObject:
+    return sr.TrackedObject(sr.Footprint.disc(x, 0, 0.02), class_name="block", yaw=yaw)
+
+
+IN_BIN = 'region bin = box(0.6, -0.1, 0.8, 0.1)\ngroup all_blocks = class "block"\nspec s = '
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (f"{IN_BIN}F (rad enclosedin bin)", "rad is not in the sample; did you mean 'red'?"),
+        ("F (red oriented[0.1] blue)", "red oriented[0.1] blue unknown: red has no orientation"),
+        (
+            'F (forall b in class "blok": b above red)',
+            "nothing shows that it is done: no object is in class \"blok\"; did you mean 'block'?",
+        ),
+    ],
+)
+def test_a_wait_says_what_it_lacks(text: str, reason: str) -> None:
+    planner = Planner(sr.parse_specification(text), PUSH)
+    for time_ns in range(3):
+        planner.observe(sr.Sample(time_ns, {"red": block(0.4), "blue": block(0.5, yaw=0.0)}))
+        step = planner.next_step()
+        assert (step.kind, step.number) == ("wait", 0)
+        assert reason in step.reason
+
+
+def test_a_class_without_members_is_not_done_until_they_come_and_do_it() -> None:
+    planner = Planner(sr.parse_specification(f"{IN_BIN}F (forall b in all_blocks: b enclosedin bin)"), PUSH)
+    kinds = []
+    for time_ns, objects in enumerate([{}, {}, {"red": block(0.4)}]):
+        planner.observe(sr.Sample(time_ns, objects))
+        step = planner.next_step()
+        kinds.append(step.kind)
+    assert kinds == ["wait", "wait", "execute"]
+    planner.observe(sr.Sample(9, {"red": block(0.7)}))
+    planner.conclude(Outcome(True))
+    assert planner.next_step().kind == "hold"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "(F red enclosedin bin) and G (forall b in people: b dist red >= 0.1)",
+        "F (red enclosedin bin and forall b in people: b dist red >= 0.1)",
+    ],
+)
+def test_people_who_never_come_hold_nothing_up(text: str) -> None:
+    planner = Planner(sr.parse_specification(f'group people = class "person"\n{IN_BIN}{text}'), PUSH)
+    planner.observe(sr.Sample(0, {"red": block(0.4)}))
+    assert planner.next_step().kind == "execute"
+    planner.observe(sr.Sample(1, {"red": block(0.7)}))
+    planner.conclude(Outcome(True))
+    assert planner.next_step().kind == "hold"
