@@ -11,13 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import degrees, pi
-from statistics import median
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from spatial_replay.mapping.binding import BY_PLACE
-from spatial_replay.mapping.evidence import TopicEvidence
+from spatial_replay.mapping.evidence import Moment, TopicEvidence
 from spatial_replay.mapping.mapping_file import UNITS_NS, LogMapping
 from spatial_replay.text import Instant, Sentence, counted, number_text
 from spatial_replay.trace.doubts import MANY_TURNS, SHORTEST_PERIOD_NS, Doubt
@@ -114,14 +113,16 @@ _FEW: Final = 3
 
 def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals = evidence.arrivals
-    period_ns = arrivals.period_s.median * 1e9
-    if evidence.planned.clock == "header" or arrivals.messages <= _FEW or arrivals.first_ns is None:
+    first_ns, last_ns = arrivals.first_ns, arrivals.last_ns
+    if evidence.planned.clock == "header" or arrivals.messages <= _FEW or first_ns is None or last_ns is None:
         return None
+    # the mean, since messages of one burst are close in any unit
+    period_ns = (last_ns - first_ns) / (arrivals.messages - 1)
     for unit, ns in list(UNITS_NS.items())[1:]:
-        year = _year(arrivals.first_ns * ns)
+        year = _year(first_ns * ns)
         if year is not None and period_ns < SHORTEST_PERIOD_NS < period_ns * ns:
             return (
-                f"its times look like {unit}: {arrivals.first_ns} is {year} in {unit} and January 1970 in ns;"
+                f"its times look like {unit}: {first_ns} is {year} in {unit} and January 1970 in ns;"
                 f" messages would come every {period_ns:.3g} ns"
             )
     return None
@@ -142,7 +143,9 @@ def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, clock = evidence.arrivals, evidence.planned.clock
     varies = {"log": arrivals.log_varies, "publish": arrivals.publish_varies}
     others = [name for name, is_varying in varies.items() if is_varying and name != clock]
-    if varies.get(clock, True) or arrivals.messages < _FEW or not others:
+    # what is latched may all arrive at once
+    is_latched = evidence.planned.is_latched or evidence.planned.is_lasting
+    if varies.get(clock, True) or arrivals.messages < _FEW or not others or is_latched:
         return None
     return f"its {arrivals.messages:,} messages have one {clock} time, and different {others[0]} times"
 
@@ -150,6 +153,9 @@ def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
 def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, planned = evidence.arrivals, evidence.planned
     if planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays):
+        return None
+    # what is sent again with its first stamp only needs another one in a frame that moves
+    if not evidence.uses_stamps or not (arrivals.stamps_vary or evidence.uses_frames):
         return None
     still_s, usual_s = arrivals.longest_still_s, arrivals.log_period_s.median
     if not still_s > max(_LONG_STILL_S, _LONG_STILL * usual_s):
@@ -168,19 +174,25 @@ _LONG_STILL_S, _LONG_STILL = 0.3, 5
 
 
 def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
-    late_s = evidence.arrivals.lateness_s.median
-    others = [other.arrivals.lateness_s.median for other in log.values() if other is not evidence]
-    others = [other_s for other_s in others if other_s == other_s]
-    uses_stamps = evidence.planned.clock == "header" or evidence.uses_frames
-    if not uses_stamps or not others or late_s != late_s or abs(late_s - median(others)) < _OTHER_CLOCK_S:
+    lateness_s = [topic.arrivals.lateness_s for topic in log.values() if topic.has_moving_stamps]
+    # of two clocks, the one nearer to that of the log is right
+    medians_s = sorted((late_s.median for late_s in lateness_s), key=abs)
+    late_s = evidence.arrivals.lateness_s
+    if not (evidence.uses_stamps and evidence.has_moving_stamps):
+        return None
+    usual_s = medians_s[(len(medians_s) - 1) // 2]
+    off_s = late_s.median - usual_s
+    # messages that take long to compute come late, but by times that differ
+    is_steady = late_s.quantile(0.9) - late_s.quantile(0.1) < _STEADY_S
+    if abs(off_s) < _OTHER_CLOCK_S or (0 < off_s < _SLOWEST_S and not is_steady):
         return None
     return (
-        f"its stamps lie {_signed_s(late_s)} the log's clock, and those of other topics"
-        f" {_signed_s(median(others))}"
+        f"its stamps lie {_signed_s(late_s.median)} the log's clock, and those of other topics"
+        f" {_signed_s(usual_s)}"
     )
 
 
-_OTHER_CLOCK_S: Final = 5.0
+_OTHER_CLOCK_S, _SLOWEST_S, _STEADY_S = 5.0, 600.0, 0.5
 
 
 def _signed_s(late_s: float) -> str:
@@ -194,6 +206,9 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
     upright, other_upright = evidence.upright, evidence.upright_otherwise
     if other_upright < _MOST_UPRIGHT * count or upright > _FEW_UPRIGHT * count:
         return None
+    # a tag on a table, seen from above, is upside down, and as if upright and not turned in the other order
+    if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * count):
+        return None
     other = "xyzw" if layout.order == "wxyz" else "wxyz"
     return (
         f"{upright:,} of {counted(count, 'object')} stand upright if the order of the four numbers is"
@@ -201,18 +216,30 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
-_MOST_UPRIGHT, _FEW_UPRIGHT = 0.9, 0.5
+_MOST_UPRIGHT, _FEW_UPRIGHT, _SOME_TURNED = 0.9, 0.5, 0.05
 
 
 def _length_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
     length = evidence.quaternion_length
-    if not length.count or (length.least > 1 - _LENGTH_ERROR and length.greatest < 1 + _LENGTH_ERROR):
+    short, long = length.quantile(_OUTLIERS), length.quantile(1 - _OUTLIERS)
+    if not long - short > _LENGTH_ERROR * long:
         return None
-    odd = length.greatest if length.greatest - 1 > 1 - length.least else length.least
-    return f"its quaternions have lengths of up to {number_text(odd)} instead of 1"
+    return f"its quaternions have lengths from {number_text(short)} to {number_text(long)}"
 
 
-_LENGTH_ERROR: Final = 0.05
+def _scaled_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
+    usual = evidence.quaternion_length.median
+    if not abs(usual - 1) > _LENGTH_ERROR or _length_of_quaternion(evidence, log):
+        return None
+    return f"its quaternions have the length {number_text(usual)}, and are taken as multiples of a rotation"
+
+
+_LENGTH_ERROR, _OUTLIERS = 0.05, 0.02
+
+
+def _is_unwrapped(evidence: TopicEvidence, turn: float) -> bool:
+    """Whether angles may count turns: they begin within one, and never step by half of one or more."""
+    return evidence.first_turn <= turn and evidence.motions.turn_step < turn / 2
 
 
 def _radians(evidence: TopicEvidence, log: Log) -> str | None:
@@ -220,13 +247,19 @@ def _radians(evidence: TopicEvidence, log: Log) -> str | None:
     most = max(turn.greatest, -turn.least)
     if layout is None or abs(layout.angle_scale) != 1.0 or not most > MANY_TURNS:
         return None
+    # degrees stay below a turn of them; few robots turn more than once a second
+    is_fast = evidence.motions.turn_rate.quantile(0.9) > 2 * pi and most <= _A_TURN
+    if _is_unwrapped(evidence, 2 * pi) and not is_fast:
+        return None
     return f"its angles reach {number_text(most)} and are read as radians"
 
 
 def _some_turns(evidence: TopicEvidence, log: Log) -> str | None:
     layout, turn = evidence.planned.layout, evidence.turn
     most = max(turn.greatest, -turn.least)
-    if layout is None or abs(layout.angle_scale) != 1.0 or not 2 * pi + _ROUNDING < most <= MANY_TURNS:
+    if layout is None or abs(layout.angle_scale) != 1.0 or not most > 2 * pi + _ROUNDING:
+        return None
+    if _radians(evidence, log):
         return None
     return f"its angles reach {number_text(most)} and are read as radians"
 
@@ -237,6 +270,8 @@ _ROUNDING: Final = 0.01
 def _beyond_a_turn(evidence: TopicEvidence, log: Log) -> str | None:
     layout, turn = evidence.planned.layout, evidence.turn
     if layout is None or abs(layout.angle_scale) == 1.0 or not turn.greatest > _A_TURN:
+        return None
+    if _is_unwrapped(evidence, _A_TURN):
         return None
     reached = number_text(turn.greatest)
     return f"its yaw reaches {reached} degrees, which is beyond a turn; {reached} often means not available"
@@ -256,9 +291,10 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _STEADY and abs(phase(mean)) < _ALONG}
     keys = max(fits, key=lambda keys: fits[keys].real, default=None)
-    # on one straight way, a robot may go sideways; only the name of the field says more
+    # on one straight way, a robot may go sideways; but headings of satellite receivers count from north
     is_straight = abs(motions.course) > _STEADY
-    if keys is None or (is_straight and not ("north" in keys and evidence.is_called_heading)):
+    is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
+    if keys is None or (is_straight and not ("north" in keys and is_compass)):
         return None
     off = f"{degrees(phase(read)):.0f} degrees" if abs(read) > _STEADY else "by changing angles"
     return (
@@ -284,7 +320,7 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
-_FEW_STEPS: Final = 5
+_FEW_STEPS: Final = 10
 _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
 
 
@@ -298,8 +334,14 @@ def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     if not (abs(evidence.low[:2]).max() <= 360 and abs(evidence.high[:2]).max() <= 360):
         return None
+    # a radar may call its metres lat and lon; no degrees a second are so many
+    if evidence.motions.speed.quantile(0.9) > _FAST_DEGREES:
+        return None
     low, high = (", ".join(map(number_text, corner[:2].tolist())) for corner in (evidence.low, evidence.high))
     return f"its latitudes and longitudes, from {low} to {high}, are taken as metres"
+
+
+_FAST_DEGREES: Final = 0.01
 
 
 def _upward(evidence: TopicEvidence, log: Log) -> str | None:
@@ -370,7 +412,8 @@ def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, extractor, layout = evidence.arrivals, evidence.reader.extractor, evidence.planned.layout
-    if len(arrivals.publishers) < 2 or arrivals.switches < _FEW:
+    # files of one bag have channels of their own, and a publisher may take over from one that ends
+    if arrivals.returns < max(_FEW, _IN_TURN * arrivals.messages):
         return None
     shares_names = extractor is None or extractor.namer.is_constant or evidence.motions.returns > 0
     if not (shares_names or (layout is not None and layout.complete)):
@@ -381,16 +424,23 @@ def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
+_IN_TURN: Final = 0.01
+
+
 def _one_object(evidence: TopicEvidence, log: Log) -> str | None:
     motions = evidence.motions
     moment = motions.return_moment
-    if moment is None or motions.returns < max(_FEW, motions.triples / 4):
+    returns = motions.returns - motions.slow_returns
+    if moment is None or returns < max(_FEW, motions.chances / 4):
         return None
+    return _there_and_back(moment, returns, motions.chances, "two objects under one name do")
+
+
+def _there_and_back(moment: Moment, returns: int, chances: int, like: str) -> Sentence:
     return Sentence(
         f"{moment.name} leaps by {number_text(moment.amount)} at ",
         Instant(moment.time_ns, 0),
-        f" and back, and so in {motions.returns:,} of {counted(motions.triples, 'report')}, as two objects"
-        " under one name do",
+        f" and back, and so in {returns:,} of {counted(chances, 'report')}, as {like}",
     )
 
 
@@ -401,7 +451,7 @@ def _complete_list(evidence: TopicEvidence, log: Log) -> str | None:
     if evidence.reader.extractor is not None and evidence.reader.extractor.differences:
         count = counted(evidence.reader.extractor.differences, "message")
         return f"{count} have `is_diff`: lists of changes, and objects that they leave out are still there"
-    usual = int(gaps.argmax())
+    usual = int(gaps[:-1].argmax())
     if usual < 2 or gaps[usual] < max(2 * _FEW, _REGULAR * gaps.sum()):
         return None
     return (
@@ -437,6 +487,10 @@ def _corners(evidence: TopicEvidence, log: Log) -> str | None:
     left, low, count = extractor.leftward, extractor.downward, extractor.boxes
     if left < count / 5 and not count / 5 < low < count * 4 / 5:
         return None
+    # the second of opposite corners goes as far as the first, but a size does not
+    reach = extractor.corner_high - extractor.corner_low
+    if min(left, low) == count and (reach[1] > reach[0] / 2).all():
+        return None
     return (
         f"in {left:,} of {count:,} boxes the second corner lies left of the first: these may be x, y,"
         " width and height"
@@ -452,13 +506,15 @@ def _extent(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
-    sizes = [other.size.median for other in log.values() if other is not evidence and other.size.median > 0]
-    speeds = [
-        other.motions.speed.quantile(0.9) for other in log.values() if other is not evidence and other.objects
-    ]
+    others = [other for other in log.values() if other is not evidence and other.objects]
+    sizes = [other.size.median for other in others if other.size.median > 0]
+    speeds = [other.motions.speed.quantile(0.9) for other in others]
     speeds = [speed for speed in speeds if speed > 0]
     size, speed = evidence.size.median, evidence.motions.speed.quantile(0.9)
-    if not (sizes and speeds and size > _THOUSAND * max(sizes) and speed > _THOUSAND * max(speeds)):
+    if not (sizes and speeds and speed > _THOUSAND * max(speeds)):
+        return None
+    # a shape in the mapping has the unit of the mapping; no robot is faster than sound
+    if not (size > _THOUSAND * max(sizes) or speed > _SOUND):
         return None
     return (
         f"its objects are {number_text(size)} long and move at {number_text(speed)} a second, and others at"
@@ -466,7 +522,7 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
-_THOUSAND: Final = 200
+_THOUSAND, _SOUND = 200, 343.0
 
 
 def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
@@ -474,6 +530,20 @@ def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
     if evidence.uses_frames or len(frames) < 2 or not evidence.frames:
         return None
     return f"coordinates are in the frames {', '.join(map(repr, frames[:_MOST_NAMED]))} and taken as they are"
+
+
+def _alternating(evidence: TopicEvidence, log: Log) -> str | None:
+    arrivals, mapping = evidence.arrivals, evidence.planned.mapping
+    if mapping is None or evidence.signal_chances < _FEW_LEAPS or arrivals.period_s.median > 1.0:
+        return None
+    often = evidence.signal_returns > _IN_PAIRS * evidence.signal_chances
+    names = [signal.name for signal, is_often in zip(mapping.signals, often, strict=True) if is_often]
+    if not names:
+        return None
+    return f"{', '.join(names[:_MOST_NAMED])} goes there and back with each message, as if two senders report"
+
+
+_IN_PAIRS: Final = 0.5
 
 
 def _by_place(evidence: TopicEvidence, log: Log) -> str | None:
@@ -516,12 +586,8 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
     usual_step = motions.speed.median * evidence.arrivals.period_s.median
     is_far = moment is not None and moment.amount > _FAST_LEAP * usual_step
     if moment is not None and is_far and motions.returns >= _FEW and _one_object(evidence, log) is None:
-        return Sentence(
-            f"{moment.name} leaps by {number_text(moment.amount)} at ",
-            Instant(moment.time_ns, 0),
-            f" and back, and so in {motions.returns:,} of {counted(motions.triples, 'report')}, as with a"
-            " number that stands for not available",
-        )
+        like = "with a number that stands for not available"
+        return _there_and_back(moment, motions.returns, motions.chances, like)
     jump, usual = motions.jump, motions.speed.quantile(0.9)
     if jump is None or motions.speed.count < _FEW_LEAPS or not evidence.size.greatest > 0:
         return None
@@ -566,7 +632,7 @@ ASSUMPTIONS: Final = (
     Assumption(
         "one_clock",
         "All stamps are of one clock.",
-        "how late messages are recorded after their stamps; 5 s from other topics contradicts",
+        "how late messages are recorded after their stamps; 5 s from other topics contradict",
         _another_clock,
         "`clock: log` takes one clock for all",
         is_about_signals=True,
@@ -581,14 +647,22 @@ ASSUMPTIONS: Final = (
     Assumption(
         "quaternion_length",
         "Quaternions have the length 1.",
-        "their lengths; 5 % off contradicts",
+        "their lengths; 5 % between 2 % of the shortest and 2 % of the longest contradict",
         _length_of_quaternion,
         "give the path of a quaternion as `orientation`",
     ),
     Assumption(
+        "quaternion_scale",
+        "Quaternions of another length are multiples of a rotation.",
+        "the median length; 5 % off is remarked",
+        _scaled_quaternion,
+        "numbers that are no rotation are better left out: give `position` alone",
+        is_remark=True,
+    ),
+    Assumption(
         "radians",
         "Angles without a unit are radians.",
-        "the greatest angle; four turns contradict, one turn is remarked",
+        "the greatest angle; four turns contradict, unless angles begin within one and count turns slowly",
         _radians,
         _DEGREES,
     ),
@@ -603,7 +677,7 @@ ASSUMPTIONS: Final = (
     Assumption(
         "degrees",
         "Angles in degrees stay within a turn.",
-        "the greatest angle; above 360.5 contradicts",
+        "the greatest angle; above 360.5 contradicts, unless angles count turns",
         _beyond_a_turn,
         "`invalid: [NUMBER]` makes the object unknown there",
     ),
@@ -668,7 +742,7 @@ ASSUMPTIONS: Final = (
     Assumption(
         "one_publisher",
         "One publisher sends a topic.",
-        "channels of the topic that alternate and share names",
+        "channels of the topic that come in turn and share names",
         _publishers,
         "`[{name: a, publisher: 1}, {name: b, publisher: 2}]` for the topic makes two objects",
         is_about_signals=True,
@@ -676,7 +750,7 @@ ASSUMPTIONS: Final = (
     Assumption(
         "one_object",
         "A name is one object.",
-        "reports that leap by more than the object's size, and back; a quarter of all contradicts",
+        "leaps by more than the object's size, and back within four reports; a quarter of all contradicts",
         _one_object,
         "give a `name` with the field that tells them apart",
     ),
@@ -712,7 +786,7 @@ ASSUMPTIONS: Final = (
     Assumption(
         "one_unit",
         "All topics have one unit of length.",
-        "sizes and speeds; 200 times those of all other topics contradicts",
+        "sizes and speeds; 200 times those of all other topics contradict",
         _one_unit,
         "`scale: 0.001` for the topic brings it into metres",
     ),
@@ -722,6 +796,15 @@ ASSUMPTIONS: Final = (
         "the frames that messages and objects name; two contradict",
         _one_frame,
         "`fixed_frame` brings them into one",
+    ),
+    Assumption(
+        "one_series",
+        "A signal is one series.",
+        "values that are back at the last but one; half of all is remarked, but for switches of 0 and 1",
+        _alternating,
+        "",
+        is_remark=True,
+        is_about_signals=True,
     ),
     Assumption("places", "Places in a list name objects.", "whether ids do", _by_place, "", True),
     Assumption(

@@ -7,6 +7,7 @@ the values. `assumptions` compares the measurements with what a mapping assumes.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from math import inf, nan, pi
 from typing import Final, NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.mapping.binding import Codes
+from spatial_replay.mapping.binding import Binding, Codes
 from spatial_replay.mapping.detections import Detections
 from spatial_replay.mapping.message_types import geodetic_order
 from spatial_replay.mapping.reading_plan import PlannedTopic
@@ -32,8 +33,14 @@ _MOST_VALUES: Final = 4_096
 _ROWS_AT_ONCE: Final = 4_096
 """Objects that wait until they are measured, because a column of few costs as much as one of many."""
 
-_LONGEST_GAP: Final = 8
+_LONGEST_GAP: Final = 9
 """Messages from one report of an object to the next; longer gaps count as this one."""
+
+_MOST_LEAPS: Final = 4
+"""Reports that tell whether an object is back where it was."""
+
+_FAST: Final = 100.0
+"""Footprint units a second: what leaps there and back faster is not one robot."""
 
 
 class Spread:
@@ -102,21 +109,22 @@ class Arrivals:
         period_s, log_period_s: the intervals between messages, and between their times of recording.
         lateness_s: how much later messages were recorded than their stamps say.
         publish_varies, log_varies: whether publish times, and log times, differ at all.
-        publishers: numbers of the channels; `switches` counts messages from another one than the message
-            before.
+        publishers: numbers of the channels; `returns` counts messages from another one than the message
+            before, which had come earlier, too.
         longest_still_s: the longest time for which stamps stood still; `still_ns` is when that began.
+        stamps_vary: whether they differ at all.
     """
 
     def __init__(self) -> None:
-        self.messages = self.switches = 0
+        self.messages = self.returns = 0
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.period_s, self.lateness_s = Spread(), Spread()
         self.publish_varies = self.log_varies = False
         self.publishers: set[int] = set()
         self.log_period_s = Spread()
-        self.longest_still_s, self.still_ns = 0.0, 0
-        self._first_log_ns = self._first_publish_ns = 0
+        self.longest_still_s, self.still_ns, self.stamps_vary = 0.0, 0, False
+        self._first_log_ns = self._last_log_ns = self._first_publish_ns = 0
         self._publisher: int | None = None
         self._stamp_ns: int | None = None
         self._since_ns = 0
@@ -129,16 +137,20 @@ class Arrivals:
             self.first_ns = self.last_ns = int(times_ns[0])
             self._first_log_ns, self._first_publish_ns = int(log_ns[0]), int(publish_ns[0])
             self._publisher = int(channels[0])
+            self.publishers.add(self._publisher)
         self.log_varies = self.log_varies or bool((log_ns != self._first_log_ns).any())
         self.publish_varies = self.publish_varies or bool((publish_ns != self._first_publish_ns).any())
         since = np.append(self.last_ns, times_ns)
         passed = slice(0 if self.messages else 1, None)
         self.period_s.add(np.diff(since)[passed] / 1e9, times_ns[passed])
-        self.log_period_s.add(np.diff(log_ns) / 1e9)
-        if len(self.publishers) != 1 or (channels != self._publisher).any():
-            self.publishers.update(np.unique(channels).tolist())
+        log_since = np.append(self._last_log_ns, log_ns)
+        self.log_period_s.add(np.diff(log_since)[passed] / 1e9)
+        self._last_log_ns = int(log_ns[-1])
+        if (channels != self._publisher).any():
             before = np.append(self._publisher or 0, channels[:-1])
-            self.switches += int(np.count_nonzero(channels != before))
+            for channel in channels[channels != before].tolist():
+                self.returns += channel in self.publishers
+                self.publishers.add(channel)
         self._publisher = int(channels[-1])
         self.messages += len(times_ns)
         self.last_ns = int(times_ns[-1])
@@ -153,6 +165,7 @@ class Arrivals:
         if self._stamp_ns is None:
             self._stamp_ns, self._since_ns = int(stamps_ns[0]), int(log_ns[0])
         is_new = np.append(stamps_ns[0] != self._stamp_ns, stamps_ns[1:] != stamps_ns[:-1])
+        self.stamps_vary = self.stamps_vary or bool(is_new.any())
         since_ns = np.where(is_new, log_ns, 0)
         since_ns[0] = since_ns[0] or self._since_ns
         since_ns = np.maximum.accumulate(since_ns)
@@ -183,9 +196,12 @@ class Motions:
     Attributes:
         speed, turn_rate: in footprint units, and radians, a second.
         jump: the longest step of an object; `jump_s` is how long it took.
-        triples: how many times an object was reported three times in a row; in `returns` of them it left by
-            more than its size, and came back. `return_moment` is the first.
-        gaps: (9,) how often so many messages passed from one report of an object to its next.
+        turn_step: the greatest change of the number that is read as yaw.
+        chances: reports of objects that were reported at least twice before; in `returns` of them an object
+            is back where it was two to four reports before, having leapt by more than its size in each step.
+            `return_moment` is the first, and `slow_returns` those of leaps that took a second or more, at
+            speeds that are usual.
+        gaps: (10,) how often so many messages passed from one report of an object to its next.
         changes: the first changes of classes; `change_count` counts all.
         courses: for the angle as it is read, and for each of `HEADINGS`: the mean of exp(i (course - angle))
             over the steps of objects that move, and `course`, the mean of exp(i course).
@@ -196,7 +212,8 @@ class Motions:
         self.speed, self.turn_rate = Spread(), Spread()
         self.jump: Moment | None = None
         self.jump_s = 0.0
-        self.triples = self.returns = 0
+        self.turn_step = 0.0
+        self.chances = self.returns = self.slow_returns = 0
         self.return_moment: Moment | None = None
         self.gaps = np.zeros(_LONGEST_GAP + 1, np.int64)
         self.changes: list[ClassChange] = []
@@ -219,17 +236,17 @@ class Motions:
         name = reports[:, _NAME].astype(np.int64)
         reports = reports[np.argsort(name, kind="stable")]
         same = reports[1:, _NAME] == reports[:-1, _NAME]
-        is_last = np.append(~same, True)
-        is_before_last = np.append(is_last[1:], False) & np.append(same, False)
-        self._tail = reports[is_last | is_before_last].copy()
+        # an object is as far from its last report as that one's place says
+        last = np.append(np.flatnonzero(~same), len(reports) - 1)
+        behind = np.repeat(last, np.diff(last, prepend=-1)) - np.arange(len(reports))
+        self._tail = reports[behind < _MOST_LEAPS].copy()
         self._tail[:, _IS_NEW] = 0.0
         after = np.flatnonzero(same & (reports[1:, _IS_NEW] > 0)) + 1
         if not len(after):
             return
         earlier, later = reports[after - 1], reports[after]
         self._add_steps(earlier, later, turns_back=turns_back, zero=zero, scale=scale)
-        thrice = after[(after > 1) & same[np.maximum(after - 2, 0)]]
-        self._add_returns(reports[thrice - 2], reports[thrice - 1], reports[thrice])
+        self._add_returns(reports, after)
         gap = np.clip(later[:, _MESSAGE] - earlier[:, _MESSAGE], 0, _LONGEST_GAP).astype(np.int64)
         self.gaps += np.bincount(gap, minlength=_LONGEST_GAP + 1)
         for at in np.flatnonzero(earlier[:, _CLASS] != later[:, _CLASS]).tolist():
@@ -246,6 +263,8 @@ class Motions:
         distance = np.hypot(step[:, 0], step[:, 1])
         times_ns = self._begin_ns + (later[:, _SECONDS] * 1e9).astype(np.int64)
         self.speed.add(np.where(seconds > 0, distance / seconds, nan), times_ns)
+        turn_step = np.fmax.reduce(np.abs(later[:, _TURN] - earlier[:, _TURN]))
+        self.turn_step = max(self.turn_step, float(np.nan_to_num(turn_step)))
         turn = np.abs((later[:, _YAW] - earlier[:, _YAW] + pi) % (2 * pi) - pi)
         self.turn_rate.add(np.where(seconds > 0, turn / seconds, nan), times_ns)
         at = int(np.nan_to_num(distance, nan=0.0).argmax())
@@ -265,19 +284,35 @@ class Motions:
         self._courses += np.array([*offsets, np.exp(1j * course).sum()])
         self._steps += int(np.count_nonzero(moves))
 
-    def _add_returns(self, first: Floats, second: Floats, third: Floats) -> None:
-        if not len(first):
-            return
-        away = np.hypot(*(second - first)[:, _X : _Y + 1].T)
-        back = np.hypot(*(third - second)[:, _X : _Y + 1].T)
-        between = np.hypot(*(third - first)[:, _X : _Y + 1].T)
-        least = np.minimum(away, back)
-        returns = (least > second[:, _SIZE]) & (between < least / 4)
-        self.triples += int(np.isfinite(least).sum())
-        self.returns += int(np.count_nonzero(returns))
-        if self.return_moment is None and returns.any():
-            at = int(returns.argmax())
-            self.return_moment = Moment(self._name(second[at]), self._time_ns(second[at]), float(away[at]))
+    def _add_returns(self, reports: Floats, after: Integers) -> None:
+        """Count the objects that are back where they were some reports before, and leapt in between.
+
+        Args:
+            reports: those of one object after the other.
+            after: the places of those that are new, and not the first of their object.
+        """
+        place, name = reports[:, _X : _Y + 1], reports[:, _NAME]
+        gone = np.diff(place, axis=0, prepend=place[:1])
+        leap = np.hypot(gone[:, 0], gone[:, 1])
+        took = np.diff(reports[:, _SECONDS], prepend=0.0)
+        leap = np.where(leap > np.fmax(reports[:, _SIZE], 0.0), leap, 0.0)
+        least, is_back = leap[after], np.zeros(len(after), np.bool_)
+        for steps in range(2, _MOST_LEAPS + 1):
+            before = np.maximum(after - steps, 0)
+            least = np.minimum(least, leap[before + 1])
+            apart = place[after] - place[before]
+            is_same = (name[before] == name[after]) & (after >= steps)
+            is_back |= is_same & (np.hypot(apart[:, 0], apart[:, 1]) < least / 4)
+            if steps == 2:
+                self.chances += int(np.count_nonzero(is_same & np.isfinite(leap[after])))
+        is_slow = is_back & (took[after] >= 1.0) & (leap[after] < _FAST * took[after])
+        self.returns += int(np.count_nonzero(is_back))
+        self.slow_returns += int(np.count_nonzero(is_slow))
+        if self.return_moment is None and is_back.any():
+            at = after[is_back.argmax()]
+            self.return_moment = Moment(
+                self._name(reports[at]), self._time_ns(reports[at - 1]), float(leap[at - 1])
+            )
 
     @property
     def steps(self) -> int:
@@ -303,6 +338,17 @@ class Motions:
 _MOST_CHANGES: Final = 8
 
 
+class _Objects(NamedTuple):
+    """Objects that wait until they are measured; `first` is the number of their first message."""
+
+    first: int
+    times_ns: Integers
+    detections: Detections
+    shapes: FootprintBatch
+    yaw: Floats
+    uncertainty: Floats
+
+
 class TopicEvidence:
     """What the messages of one mapped topic say about how it is read.
 
@@ -310,13 +356,17 @@ class TopicEvidence:
         arrivals, motions: of its messages and objects.
         objects: the number of reports; `most_at_once` in one message.
         quaternion_length: of the `quaternions` that are not zeros; `upright` and `upright_otherwise`
-            count upright objects in the order that is read, and with w at the other end.
-        turn: the numbers that are read as yaw.
+            count upright objects in the order that is read, and with w at the other end; `turned_otherwise`
+            those of the latter that are turned by more than 20 degrees.
+        turn: the numbers that are read as yaw; `first_turn` is the greatest of the first message, without
+            its sign.
         low, high: (3,) the least and the greatest coordinates, in the numbers of the messages.
         is_single: whether float32 holds all coordinates, and some are no whole numbers.
         size: the longer sides of outlines; `shorter` the shorter; `pointlike` counts objects that have none.
         bottom, top: heights of the objects.
         uncertainty: the radii; `zero_covariances` counts covariances of zeros only.
+        signal_chances: messages with signals that follow two others; in `signal_returns` (S,) of them a
+            signal is back at its last but one value.
     """
 
     def __init__(self, reader: TopicReader, names: Codes, classes: Codes) -> None:
@@ -328,15 +378,25 @@ class TopicEvidence:
         self.name_codes: set[int] = set()
         self.class_codes: set[int] = set()
         self.quaternion_length, self.turn = Spread(), Spread()
-        self.upright = self.upright_otherwise = self.quaternions = 0
+        self.first_turn = nan
+        self.upright = self.upright_otherwise = self.turned_otherwise = self.quaternions = 0
         self.low, self.high = np.full(3, inf), np.full(3, -inf)
         self.is_single, self.has_fraction = True, False
         self.size, self.shorter, self.pointlike = Spread(), Spread(), 0
         self.bottom, self.top, self.uncertainty = Spread(), Spread(), Spread()
         self.zero_covariances = self.covariances = 0
         self._messages = 0
-        self._waiting: list[Floats] = []
+        self._binding: Binding | None = None
+        self._waiting: list[_Objects] = []
         self._waiting_rows = 0
+        self._reports: list[Floats] = []
+        self._reports_rows = 0
+        mapping = reader.planned.mapping
+        signals = 0 if mapping is None else len(mapping.signals)
+        self.signal_chances, self.signal_returns = 0, np.zeros(signals, np.int64)
+        self._last_values = np.empty((0, signals))
+        self._waiting_signals: list[Floats] = []
+        self._waiting_values = 0
 
     @property
     def planned(self) -> PlannedTopic:
@@ -347,6 +407,20 @@ class TopicEvidence:
     def uses_frames(self) -> bool:
         """Whether objects are placed by transforms at their stamps."""
         return self.reader.needs_frame and self.reader.extractor is not None
+
+    @property
+    def uses_stamps(self) -> bool:
+        """Whether stamps say when, or where, objects are."""
+        return self.planned.clock == "header" or self.uses_frames
+
+    @property
+    def has_moving_stamps(self) -> bool:
+        """Whether its stamps are those of things that are reported again and again."""
+        planned, arrivals = self.planned, self.arrivals
+        stays = (
+            planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays)
+        )
+        return not stays and arrivals.stamps_vary
 
     @property
     def frames(self) -> frozenset[str]:
@@ -402,20 +476,56 @@ class TopicEvidence:
         Args:
             times_ns: (M,) of each message.
         """
-        count = len(detections.name)
         first, self._messages = self._messages, self._messages + len(times_ns)
-        if not count:
+        if not len(detections.name):
             return
-        self.objects += count
-        self.most_at_once = max(self.most_at_once, int(np.bincount(detections.message).max()))
-        self.name_codes.update(np.unique(detections.name).tolist())
-        self.class_codes.update(np.unique(detections.class_code).tolist())
-        self._add_numbers(detections)
+        binding = None if self.reader.extractor is None else self.reader.extractor.binding
+        if binding is not self._binding:
+            self._measure()
+            self._binding = binding
+        self._waiting.append(_Objects(first, times_ns, detections, shapes, yaw, uncertainty))
+        self._waiting_rows += len(detections.name)
+        if self._waiting_rows >= _ROWS_AT_ONCE:
+            self._measure()
+
+    def add_signals(self, values: Floats) -> None:
+        """Add the signals (N, S) of messages, in order."""
+        self._waiting_signals.append(values)
+        self._waiting_values += values.size
+        if self._waiting_values >= _ROWS_AT_ONCE:
+            self._measure_signals()
+
+    def settle(self) -> None:
+        """Measure the objects and signals that wait, after the last of them."""
+        self._measure()
+        self._measure_signals()
+        self._measure_motions(self._reports_rows)
+
+    def _measure(self) -> None:
+        if not self._waiting:
+            return
+        waiting, self._waiting, self._waiting_rows = self._waiting, [], 0
+        detections = [objects.detections for objects in waiting]
+        name = np.concatenate([detected.name for detected in detections])
+        class_code = np.concatenate([detected.class_code for detected in detections])
+        message = np.concatenate([objects.first + objects.detections.message for objects in waiting])
+        yaw, uncertainty = (
+            np.concatenate(columns)
+            for columns in zip(*((objects.yaw, objects.uncertainty) for objects in waiting), strict=True)
+        )
+        shapes = FootprintBatch.concatenate([objects.shapes for objects in waiting])
+        self.objects += len(name)
+        begins = np.flatnonzero(np.diff(message, prepend=-1))
+        self.most_at_once = max(self.most_at_once, int(np.diff(begins, append=len(name)).max()))
+        self.name_codes.update(name.tolist())
+        self.class_codes.update(class_code.tolist())
+        numbers = self._measure_numbers(detections, message)
         self.uncertainty.add(uncertainty)
-        if detections.covariance is not None:
-            self.covariances += count
-            is_zero = ~detections.covariance.reshape(count, -1).any(axis=1)
-            self.zero_covariances += int(np.count_nonzero(is_zero))
+        for detected in detections:
+            if detected.covariance is not None:
+                self.covariances += len(detected.name)
+                is_set = detected.covariance.reshape(len(detected.name), -1).any(axis=1)
+                self.zero_covariances += int(np.count_nonzero(~is_set))
         centre, sides = extents(shapes)
         longer = sides.max(axis=1)
         self.size.add(longer)
@@ -423,58 +533,79 @@ class TopicEvidence:
         self.pointlike += int(np.count_nonzero(longer == 0.0))
         self.bottom.add(shapes.bottom)
         self.top.add(shapes.top)
-        begin_ns = self.arrivals.first_ns or 0
-        reports = np.empty((count, _IS_NEW + 1))
-        reports[:, _NAME] = detections.name
-        reports[:, _MESSAGE] = first + detections.message
-        reports[:, _SECONDS] = (times_ns[detections.message] - begin_ns) / 1e9
+        passed_ns = np.concatenate([objects.times_ns[objects.detections.message] for objects in waiting])
+        reports = np.empty((len(name), _IS_NEW + 1))
+        reports[:, _NAME] = name
+        reports[:, _MESSAGE] = message
+        reports[:, _SECONDS] = (passed_ns - (self.arrivals.first_ns or 0)) / 1e9
         reports[:, _X : _Y + 1] = centre
         reports[:, _YAW] = yaw
-        reports[:, _TURN] = self._turns(detections)
+        reports[:, _TURN] = nan
+        if numbers is not None and self._binding is not None and self._binding.yaw is not None:
+            reports[:, _TURN] = numbers[:, self._binding.yaw]
         reports[:, _SIZE] = longer
-        reports[:, _CLASS] = detections.class_code
+        reports[:, _CLASS] = class_code
         reports[:, _IS_NEW] = 1.0
-        self._waiting.append(reports)
-        self._waiting_rows += count
-        if self._waiting_rows >= _ROWS_AT_ONCE:
-            self.settle()
+        self._reports.append(reports)
+        self._reports_rows += len(reports)
+        self._measure_motions(self._reports_rows // _ROWS_AT_ONCE * _ROWS_AT_ONCE)
 
-    def settle(self) -> None:
-        """Measure the objects that wait."""
-        if not self._waiting:
+    def _measure_motions(self, count: int) -> None:
+        """Measure the motions of so many reports, in pieces that do not depend on how messages came."""
+        if not count:
             return
         layout = self.planned.layout
-        # numbers of a log may be NaN, infinite and equal
+        reports = np.concatenate(self._reports)
+        for begin in range(0, count, _ROWS_AT_ONCE):
+            # numbers of a log may be NaN, infinite and equal
+            with np.errstate(all="ignore"):
+                self.motions.add(
+                    reports[begin : min(begin + _ROWS_AT_ONCE, count)],
+                    self.arrivals.first_ns or 0,
+                    turns_back=self.reader.axes.y == "down",
+                    zero=0.0 if layout is None else layout.angle_zero,
+                    scale=1.0 if layout is None else layout.angle_scale,
+                )
+        self._reports, self._reports_rows = [reports[count:]], len(reports) - count
+
+    def _measure_signals(self) -> None:
+        """Count the reports of signals that are back at their last but one value."""
+        if not self._waiting_values:
+            return
+        values = np.concatenate([self._last_values, *self._waiting_signals])
+        self._waiting_signals, self._waiting_values = [], 0
+        self._last_values = values[-2:]
+        if len(values) < 3:
+            return
         with np.errstate(all="ignore"):
-            self.motions.add(
-                np.concatenate(self._waiting),
-                self.arrivals.first_ns or 0,
-                turns_back=self.reader.axes.y == "down",
-                zero=0.0 if layout is None else layout.angle_zero,
-                scale=1.0 if layout is None else layout.angle_scale,
-            )
-        self._waiting, self._waiting_rows = [], 0
+            step = np.abs(np.diff(values, axis=0))
+            least = np.minimum(step[1:], step[:-1])
+            is_back = np.abs(values[2:] - values[:-2]) < least / 4
+            is_switch = (np.fmin.reduce(values) == 0) & (np.fmax.reduce(values) == 1)
+        self.signal_chances += len(is_back)
+        self.signal_returns[: values.shape[1]] += np.where(is_switch, 0, is_back.sum(axis=0))
 
-    def _turns(self, detections: Detections) -> Floats | float:
-        binding = None if self.reader.extractor is None else self.reader.extractor.binding
-        if binding is None or binding.yaw is None or detections.numbers is None:
-            return nan
-        return detections.numbers[:, binding.yaw]
-
-    def _add_numbers(self, detections: Detections) -> None:
-        """Add the numbers as messages have them."""
-        binding = None if self.reader.extractor is None else self.reader.extractor.binding
-        numbers = detections.numbers
-        places = detections.poses.position
+    def _measure_numbers(self, detections: Sequence[Detections], message: Integers) -> Floats | None:
+        """Measure the numbers as messages have them, and return them."""
+        binding = self._binding
+        listed = [detected.numbers for detected in detections if detected.numbers is not None]
+        numbers = np.concatenate(listed) if binding is not None and len(listed) == len(detections) else None
+        places = np.concatenate([detected.poses.position for detected in detections])
         if binding is not None and numbers is not None:
             if binding.orientation:
-                self._add_quaternions(numbers[:, list(binding.orientation)])
+                self._measure_quaternions(numbers[:, list(binding.orientation)])
             if binding.yaw is not None:
-                self.turn.add(numbers[:, binding.yaw])
+                turn = numbers[:, binding.yaw]
+                self.turn.add(turn)
+                is_finite = np.isfinite(turn)
+                if not self.first_turn >= 0 and is_finite.any():
+                    is_first = message == message[is_finite.argmax()]
+                    self.first_turn = float(np.fmax.reduce(np.abs(turn[is_first])))
             if binding.position:
                 places = numbers[:, list(binding.position[:3])]
-            elif len(detections.solids.points):
-                places = detections.solids.points
+            else:
+                points = [detected.solids.points for detected in detections if len(detected.solids.points)]
+                places = np.concatenate(points) if points else places
         with np.errstate(all="ignore"):
             low, high = np.fmin.reduce(places, axis=0), np.fmax.reduce(places, axis=0)
         axes = slice(places.shape[1])
@@ -483,11 +614,14 @@ class TopicEvidence:
         is_far = self.planned.is_geodetic or np.fmax.reduce(np.abs([*low, *high])) > _FAR
         if self.is_single and is_far:
             plane = places[:, :2]
+            if not self.planned.is_geodetic:
+                plane = plane[(np.abs(plane) > _FAR).any(axis=1)]
             is_finite = np.isfinite(plane)
             self.is_single = bool((plane.astype(np.float32) == plane)[is_finite].all())
             self.has_fraction = self.has_fraction or bool((plane != np.rint(plane))[is_finite].any())
+        return numbers
 
-    def _add_quaternions(self, quaternions: Floats) -> None:
+    def _measure_quaternions(self, quaternions: Floats) -> None:
         length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
         is_set = length > 0
         quaternions, length = quaternions[is_set], length[is_set]
@@ -497,15 +631,20 @@ class TopicEvidence:
         # the z axis of an object points up where the squares of its x and y are small
         self.upright += int(np.count_nonzero(x * x + y * y < _LEVEL))
         layout = self.planned.layout
-        # in the other order, w stands for x and x for y, or y for x and z for y
-        first, second = (w, x) if layout is not None and layout.order == "wxyz" else (y, z)
-        self.upright_otherwise += int(np.count_nonzero(first * first + second * second < _LEVEL))
+        # in the other order, w, x and y stand for x, y and z, or y, z and w do
+        is_w_first = layout is not None and layout.order == "wxyz"
+        first, second, up = (w, x, y) if is_w_first else (y, z, w)
+        is_upright = first * first + second * second < _LEVEL
+        self.upright_otherwise += int(np.count_nonzero(is_upright))
+        self.turned_otherwise += int(np.count_nonzero(is_upright & (np.abs(up) > _TURNED)))
 
 
 _FAR: Final = 1e4
 """Coordinates from which on the steps of float32 are worth a look."""
 _LEVEL: Final = 0.0076
 """Twice this is 1 - cos 10 degrees: objects tilted by less count as upright."""
+_TURNED: Final = 0.174
+"""The sine of half of 20 degrees."""
 
 
 def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:

@@ -129,6 +129,8 @@ class Extractor:
         """Timestamps of the entities of a scene by the codes of their names, until they are deleted."""
         self.boxes, self.leftward, self.downward = 0, 0, 0
         """Bounds, and those whose second corner lies left of, and below in numbers, the first."""
+        self.corner_low, self.corner_high = np.full((2, 2), np.inf), np.full((2, 2), -np.inf)
+        """The least and the greatest coordinates of first and second corners."""
         self.differences = 0
         """Messages that say of themselves that they list changes only."""
         self.turned, self.unturned = 0, 0
@@ -322,6 +324,9 @@ class Extractor:
         self.boxes += len(along)
         self.leftward += int(np.count_nonzero(along[:, 0] < 0))
         self.downward += int(np.count_nonzero(along[:, 1] < 0))
+        for corner, number in enumerate((first, first + 1) if len(first) else ()):
+            self.corner_low[corner] = np.fmin(self.corner_low[corner], np.fmin.reduce(points[number, :2]))
+            self.corner_high[corner] = np.fmax(self.corner_high[corner], np.fmax.reduce(points[number, :2]))
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
         """Return all objects, the index of each one's message, and its index, or key, in that message."""

@@ -379,6 +379,8 @@ class Tracker:
                     is_placed = self._take_detections(reader, times_ns, log_times_ns, columns.detections)
                 elif columns.signals.size:
                     self._count_replaced(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
+                if columns.signals.size:
+                    self.evidence[name].add_signals(columns.signals)
                 for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
                     before_ns, before = self._signals.get((name, index), (times_ns[:0], values[:0]))
                     series = np.concatenate([before_ns, times_ns]), np.concatenate([before, values])
