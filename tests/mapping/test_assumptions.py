@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -12,61 +11,23 @@ from bags.bag_files import write_mcap
 from spatial_replay.cli import run as run_program
 from spatial_replay.mapping.assumptions import NAMES
 from spatial_replay.mapping.yaml_document import schema_of
-from tests.mapping.feeding import SECOND, Feed, make
+from tests.mapping.contradicting_logs import CASES, Case, read
+from tests.mapping.feeding import SECOND
 
 
-def doubts(mapping: str, *messages: tuple[str, float, object]) -> list[str]:
-    """Return the names of the contradicted assumptions; each message has a topic, a time and a content."""
-    feed = Feed()
-    for topic, seconds, content in messages:
-        feed.add(topic, round(seconds * SECOND), content)
-    return [doubt.assumption for doubt in make(mapping, feed).doubts]
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.assumption}: {case.label}")
+def test_a_log_contradicts_an_assumption_or_only_looks_like_it(case: Case, tmp_path: Path) -> None:
+    trace = read(tmp_path, f"{case.mapping}\naccept: [{case.assumption}]", case.messages)
+    in_vain = f"`accept: [{case.assumption}]` has no effect"
+    assert any(in_vain in remark for remark in trace.remarks) == (not case.contradicts), trace.remarks
+    # what only looks like it raises no other doubt
+    if not case.contradicts:
+        assert [str(doubt.text) for doubt in trace.doubts] == []
 
 
-def run(topic: str, contents: Iterable[object]) -> list[tuple[str, float, object]]:
-    """Return messages at 10 Hz."""
-    return [(topic, 1.0 + number / 10, content) for number, content in enumerate(contents)]
-
-
-@pytest.mark.parametrize(
-    ("numbers", "expected"),
-    [
-        ((0.707106781, 0.0, 0.0, 0.707106781), ["quaternion_order"]),
-        ((0.0, 0.0, 0.707106781, 0.707106781), []),
-        # one that lies on its side in both orders
-        ((0.5, 0.5, 0.5, 0.5), []),
-    ],
-)
-def test_quaternions_in_the_other_order_stand_upright(
-    numbers: tuple[float, ...], expected: list[str]
-) -> None:
-    mapping = "topics: {/uav: {name: uav, position: p, orientation: q, order: xyzw, shape: {box: [2, 1]}}}"
-    messages = run("/uav", ({"p": {"x": float(i), "y": 0.0}, "q": list(numbers)} for i in range(10)))
-    assert doubts(mapping, *messages) == expected
-
-
-def test_an_object_that_leaps_there_and_back_is_two_objects() -> None:
-    mapping = "topics: {/bot: {name: bot, position: [x, y], shape: {disc: 0.3}}}"
-    alternating = ({"x": i * 0.1 + 30.0 * (i % 2), "y": 0.0} for i in range(20))
-    assert doubts(mapping, *run("/bot", alternating)) == ["one_object"]
-    # one that goes to and fro within its own size, and one that is placed anew
-    trembling = ({"x": 0.2 * (i % 2), "y": 0.0} for i in range(20))
-    assert doubts(mapping, *run("/bot", trembling)) == []
-    placed = ({"x": i * 0.1 + 30.0 * (i > 9), "y": 0.0} for i in range(20))
-    assert doubts(mapping, *run("/bot", placed)) == []
-
-
-def test_a_list_that_comes_in_parts_is_not_complete() -> None:
-    mapping = "topics: {/radar: {objects: 'of[*]', name: 't{id}', position: [x, y], shape: {disc: 0.3}}}"
-
-    def part(numbers: Iterable[int], x: float) -> dict[str, object]:
-        return {"of": [{"id": number, "x": x, "y": 5.0 * number} for number in numbers]}
-
-    halves = (part((0, 1) if i % 2 else (2, 3), i / 10) for i in range(20))
-    assert doubts(mapping, *run("/radar", halves)) == ["complete_list"]
-    # detections that are missed now and then
-    flickering = (part((0, 1) if i % 3 == 1 else (0, 1, 2, 3), i / 10) for i in range(20))
-    assert doubts(mapping, *run("/radar", flickering)) == []
+def test_every_assumption_has_a_log_that_contradicts_it_and_one_that_only_looks_like_it() -> None:
+    for contradicts in (True, False):
+        assert {case.assumption for case in CASES if case.contradicts == contradicts} == set(NAMES)
 
 
 def test_an_accepted_contradiction_is_a_remark_and_one_in_vain_is_said(
