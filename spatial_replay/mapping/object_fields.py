@@ -200,7 +200,7 @@ def _best(messages: Sequence[object]) -> Guess | None:
     names = tuple(name for name in best.names if _distinguishes(name, best, messages))
     with suppress(FieldError):
         best = replace(best, bounds_have_size=_have_size(best, messages))
-    if best.size and not any(_values_at(best.size, best, messages)):
+    if best.size and not any(_values_at(best.size[:2], best, messages)):
         best = replace(best, size=(), is_sizeless=True)
     elif best.size:
         best = replace(best, other_outline=_outline_of_sizeless(best, messages))
@@ -290,7 +290,7 @@ def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None
     """Return the path of the corners of objects whose size is 0."""
     with suppress(FieldError):
         for thing in (thing for message in messages for thing in _objects_in(guess, message)):
-            if not any(walk(FieldPath.of(path), thing) for path in guess.size):
+            if not any(walk(FieldPath.of(path), thing) for path in guess.size[:2]):
                 return _outline_in(dict(_iter_fields(thing)))[0]
     return None
 

@@ -179,7 +179,7 @@ def test_sizes_that_are_never_set_are_no_sizes() -> None:
     assert footprint == ShapeMapping("box", ("size.x", "size.y"))
     assert "1 of 2 outlines have no extent" in text
     tracks = [
-        {"id": k, "x": 9.0 * k, "y": 0.0, "size": {"x": w, "y": w}, "footprint": {"points": points}}
+        {"id": k, "x": 9.0 * k, "y": 0.0, "size": {"x": w, "y": w, "z": 1.5}, "footprint": {"points": points}}
         for k, (w, points) in enumerate([(1.0, []), (0.0, [POINT] * 4)])
     ]
     assert "`shape: {polygon: footprint.points}` reads these" in suggested_for([{"objects": tracks}])[0]
