@@ -14,8 +14,11 @@ from operator import itemgetter
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from spatial_replay.bags.decoders import Topic
 from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import Channel, has_our_type
 from spatial_replay.mapping.binding import BY_PLACE, Codes, Namer
 from spatial_replay.mapping.field_paths import (
@@ -41,7 +44,14 @@ from spatial_replay.mapping.message_types import (
 )
 from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in, takes_turns
 from spatial_replay.mapping.reading_plan import doubts_of
-from spatial_replay.mapping.trial import FROM_NORTH, choose_entry, flow_text, readable_messages, yaml_text
+from spatial_replay.mapping.trial import (
+    FROM_NORTH,
+    choose_entry,
+    flow_text,
+    lateness_s,
+    readable_messages,
+    yaml_text,
+)
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
 from spatial_replay.trace.trace import FOREVER
@@ -51,6 +61,8 @@ EXAMPLES = 20
 
 _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
+_ONE_CLOCK_S, _EXACT_S = 5.0, 0.05
+"""Stamps of one clock are recorded within this of each other; delays below the second do not matter."""
 _NO_TIMES: Mapping[str, Sequence[int]] = MappingProxyType({})
 _MOST_SIGNALS = 12
 _TEXTS = frozenset({"name", "label"})
@@ -89,6 +101,7 @@ class TopicSuggestion:
         numbers: paths of possible signals.
         aside: why the entry is not used as it is; empty where it is.
         layout: where the fields of objects are, by the entry.
+        lateness_s: (N,) how much later messages were recorded than their stamps say; None without a clock.
     """
 
     topic: Topic
@@ -101,6 +114,7 @@ class TopicSuggestion:
     numbers: tuple[str, ...] = ()
     aside: str = ""
     layout: MessageLayout | None = None
+    lateness_s: Floats | None = None
 
     @property
     def entry(self) -> str:
@@ -274,7 +288,12 @@ def _with_trial(
     if suggestion.fields is None:
         return suggestion
     fields, remarks = choose_entry(topic, suggestion.fields, examples, times_ns, origin)
-    return replace(suggestion, fields=fields, remarks=(*suggestion.remarks, *map(_comment, remarks)))
+    return replace(
+        suggestion,
+        fields=fields,
+        remarks=(*suggestion.remarks, *map(_comment, remarks)),
+        lateness_s=lateness_s(topic, flow_text(fields), examples, times_ns, origin),
+    )
 
 
 def _origin_lines(
@@ -609,11 +628,39 @@ def _edges(message: object) -> Iterator[tuple[str, str]]:
 
 
 def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Iterator[str]:
-    yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
+    clock, reason = _clock(active)
+    if reason:
+        yield f"# {reason}"
+    yield f"clock: {clock}    # log: when a message was recorded; publish: when sent; header: its own stamp"
     if active:
         topic = yaml_text(_topic_to_sample(active, first_ns).name)
         yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
         yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
+
+
+def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
+    """Return the clock, and why: stamps count if messages of one time were recorded apart."""
+    late = [(suggestion.topic.name, suggestion.lateness_s) for suggestion in active]
+    without = [topic for topic, lateness in late if lateness is None]
+    medians = {topic: float(np.median(lateness)) for topic, lateness in late if lateness is not None}
+    if not medians:
+        return "log", ""
+    first, last = min(medians, key=medians.__getitem__), max(medians, key=medians.__getitem__)
+    apart_s = medians[last] - medians[first]
+    said = f"stamps of {_comment(last)} are {apart_s:.3g} s later recorded than those of {_comment(first)}"
+    widest = max(
+        ((float(np.ptp(lateness)), topic) for topic, lateness in late if lateness is not None),
+        key=itemgetter(0),
+    )
+    if apart_s > _ONE_CLOCK_S:
+        return "log", f"{said}, so they are of two clocks"
+    if without:
+        return "log", f"{_comment(without[0])} has no stamps that advance with its messages"
+    if max(apart_s, widest[0]) <= _EXACT_S:
+        return "log", f"stamps and times of recording advance together, to {max(apart_s, widest[0]):.2g} s"
+    if apart_s >= widest[0]:
+        return "header", said
+    return "header", f"{_comment(widest[1])} is recorded with a delay that varies by {widest[0]:.3g} s"
 
 
 def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:

@@ -18,6 +18,7 @@ import numpy as np
 from spatial_replay.bags.decoders import Topic
 from spatial_replay.bags.reader import Message
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.assumptions import ASSUMPTIONS
 from spatial_replay.mapping.binding import Codes
@@ -53,9 +54,44 @@ def readable_messages(
         UsageError: it reads none of them.
     """
     reasons: list[str] = []
-    mapping = parse_mapping(f"{origin}topics:\n  {yaml_text(topic.name)}: {entry}")
+    reader = _reader(topic, entry, origin, reasons)
+    good = reader.read(np.arange(len(messages)), messages).good
+    reader.finish()
+    if not good.any():
+        raise UsageError(reasons[0])
+    return list(compress(messages, good)), reasons
+
+
+def lateness_s(
+    topic: Topic, entry: str, messages: Sequence[object], times_ns: Sequence[int], origin: str = ""
+) -> Floats | None:
+    """Return how much later each message was recorded than its stamp says, seconds.
+
+    Returns:
+        None if stamps are no clock: some are missing or 0, or they do not advance with the messages.
+    """
+    good = np.ones(len(messages), np.bool_)
+    try:
+        stamps_ns = _reader(topic, entry, f"{origin}clock: header\n", []).stamps(messages, times_ns, good)
+    except UsageError:
+        return None
+    is_clock = good.all() and (stamps_ns > 0).all() and (np.diff(stamps_ns) > 0).all()
+    # in another unit they advance a thousand times as fast; a simulation may be some times as fast
+    advance = np.ptp(stamps_ns) / max(1, np.ptp(times_ns))
+    if not is_clock or (len(messages) > 1 and not 1 / _FASTEST < advance < _FASTEST):
+        return None
+    return (np.asarray(times_ns) - stamps_ns) / 1e9
+
+
+_FASTEST = 20
+"""Seconds of stamps in one second of recording, and the reverse."""
+
+
+def _reader(topic: Topic, entry: str, head: str, reasons: list[str]) -> TopicReader:
+    """Return a reader of decoded messages; it adds why it cannot read some."""
+    mapping = parse_mapping(f"{head}topics:\n  {yaml_text(topic.name)}: {entry}")
     (planned,) = ReadingPlan.of(mapping, [topic]).planned
-    reader = TopicReader(
+    return TopicReader(
         planned,
         mapping,
         lambda topic: lambda message: message,
@@ -64,11 +100,6 @@ def readable_messages(
         decodes_early=False,
         report=lambda topic, time_ns, reason: reasons.append(reason),
     )
-    good = reader.read(np.arange(len(messages)), messages).good
-    reader.finish()
-    if not good.any():
-        raise UsageError(reasons[0])
-    return list(compress(messages, good)), reasons
 
 
 def choose_entry(

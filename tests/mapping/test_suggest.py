@@ -641,6 +641,41 @@ def test_topic_names_are_quoted_if_need_be() -> None:
     assert [each.topic for each in mapping.topics] == [each.name for each in topics]
 
 
+def test_stamps_are_the_clock_if_delays_differ() -> None:
+    kind = "geometry_msgs/msg/PoseStamped"
+    topics = [Topic(name, kind, "json") for name in ("/robot", "/tracker")]
+    seconds = [100.0 + k / 10 for k in range(10)]
+
+    def clock(delay_s: float, unit: float = 1.0, **header: Any) -> tuple[str, str]:
+        delays = {"/robot": 0.002, "/tracker": delay_s}
+        stamps = {
+            name: [
+                dict(zip(("sec", "nanosec"), divmod(round((time - late) * 1e9 * unit), 10**9), strict=True))
+                for time in seconds
+            ]
+            for name, late in delays.items()
+        }
+        pose = {"position": POINT, "orientation": TURN}
+        examples = {
+            name: [
+                {"header": {"frame_id": "map", "stamp": stamp, **header}, "pose": pose} for stamp in listed
+            ]
+            for name, listed in stamps.items()
+        }
+        times_ns = {name: [round(time * 1e9) for time in seconds] for name in delays}
+        text = suggest_mapping("run", topics, examples, times_ns)
+        return parse_mapping(text).clock, text
+
+    name, text = clock(0.302)
+    assert name == "header"
+    assert "stamps of /tracker are 0.3 s later recorded than those of /robot" in text
+    assert clock(0.012)[0] == "log"
+    # another clock, stamps of 0, and stamps in another unit
+    for change in ({"delay_s": 18.0}, {"delay_s": 0.3, "stamp": STAMP}, {"delay_s": 0.3, "unit": 1e-3}):
+        assert clock(**change)[0] == "log"
+    assert "so they are of two clocks" in clock(18.0)[1]
+
+
 def test_the_last_topic_to_start_is_sampled() -> None:
     topics = [Topic(name, "geometry_msgs/msg/PoseStamped", "cdr", 100) for name in ("/a", "/b", "/late")]
     begins = {"/a": [10], "/b": [20], "/late": [10**10]}
