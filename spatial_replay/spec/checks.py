@@ -149,16 +149,19 @@ def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[D
 
     A bounded until is spelt alike here and in R2U2, so it counts only in a text with signs of R2U2.
     """
-    is_of_r2u2 = any(_written(token, source) in _R2U2_SIGNS for token in tokens)
+    signs = (token for token in tokens if token.type in ("AND", "OR"))
+    is_of_r2u2 = any(_written(token, source) in _R2U2_SIGNS for token in signs)
     for place, token in enumerate(tokens):
-        if _written(token, source) == "next" and token.type == "PREFIX":
+        if token.type not in ("PREFIX", "INFIX"):
+            continue
+        if _written(token, source) == "next":
             message = "'next' is read as X, so there has to be a next sample"
             hint = "in rtamt it holds at the last sample, too: write WX for that, X for this"
             yield source.diagnostic("warning", span_of(token), message, hint)
         window = tokens[place + 1 : place + 3]
         is_window = [each.type for each in window] == ["LSQB", "NUMBER"]
         begin = window[1].value if is_window else ""
-        if is_of_r2u2 and token.value in ("U", "R") and token.type == "INFIX" and begin.strip("0").isdigit():
+        if is_of_r2u2 and token.value in ("U", "R") and begin.strip("0").isdigit():
             message = f"the left side of {token.value!r} counts from now, not from its window's beginning"
             hint = f"in R2U2 it counts from there: F[{begin}, {begin}] (a {token.value}[0, ...] b)"
             yield source.diagnostic("warning", span_of(token), message, hint)
@@ -332,7 +335,9 @@ def check_names(
     def report(
         kind: str, name: str, candidates: tuple[str, ...], span: Span, hint: str = "", during: str = ""
     ) -> None:
-        hint = hint or " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates))))
+        # a sum takes a misspelt constant for a signal
+        choices = (*candidates, *specification.constants) if kind == "signal" else candidates
+        hint = hint or " ".join(filter(None, (nearest_hint(name, choices), _listing(kind, candidates))))
         message = f"the {where} never has the {kind} {name!r}" + (during and f" {during}")
         found.append(source.diagnostic("error", span, message, hint))
 

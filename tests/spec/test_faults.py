@@ -459,6 +459,12 @@ def test_names_are_compared_with_those_of_a_log() -> None:
     ]
 
 
+def test_a_misspelt_constant_in_a_sum_is_named() -> None:
+    specification = parse_specification("const limit = 2\nspec s = G (load - limt <= limit)")
+    (remark,) = check_names(specification, [], ["load"])
+    assert remark.hint == "did you mean 'limit'? its signals are load"
+
+
 @pytest.mark.parametrize("given", [3, None, b"a ovlp b"])
 def test_anything_but_a_text_is_a_usage_error(given: Any) -> None:
     with pytest.raises(UsageError, match=r"text is .*; give the text as a str") as caught:
