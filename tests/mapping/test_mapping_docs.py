@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from spatial_replay.mapping.assumptions import ASSUMPTIONS
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.message_types import BUILT_IN
 
@@ -35,3 +36,13 @@ def test_every_key_is_documented() -> None:
 def test_every_built_in_type_is_documented() -> None:
     names = [name.rpartition("/")[2] for name in BUILT_IN]
     assert [name for name in names if not re.search(rf"\b{name}`", PAGE)] == []
+
+
+def test_the_page_lists_every_assumption_as_it_is_measured() -> None:
+    rows = [
+        f"| `{assumption.name}`{', remarked' if assumption.is_remark else ''} | {assumption.assumed}"
+        f" | {assumption.measured} | {assumption.remedy} |"
+        for assumption in ASSUMPTIONS
+    ]
+    page = PAGE.split("### Assumptions\n")[1]
+    assert [line for line in page.splitlines() if line.startswith("| `")] == rows
