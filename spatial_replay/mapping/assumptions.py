@@ -49,11 +49,12 @@ class Assumption:
 
 
 def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
-    """Yield what contradicts the assumptions: doubts, and remarks where the data may be only odd.
+    """Yield contradictions of the assumptions: doubts, and remarks where the data may be only odd.
 
-    A contradiction in many topics is one sentence. A name that the mapping accepts in vain is remarked.
+    A contradiction in many topics is one sentence. A name that the mapping accepts without a contradiction
+    is remarked.
     """
-    in_vain = dict.fromkeys(mapping.accept)
+    uncontradicted = dict.fromkeys(mapping.accept)
     for evidence in log.values():
         evidence.settle()
     for assumption in ASSUMPTIONS:
@@ -65,7 +66,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
         if not clauses:
             continue
         is_accepted = assumption.name in mapping.accept
-        in_vain.pop(assumption.name, None)
+        uncontradicted.pop(assumption.name, None)
         for topics in _group_topics(clauses):
             others = f" (and so in {counted(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
             if len({clauses[topic] for topic in topics}) == 1:
@@ -91,7 +92,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
                 signals=frozenset(signals),
                 is_accepted=is_accepted,
             )
-    for name in in_vain:
+    for name in uncontradicted:
         yield f"{mapping.name}: `accept: [{name}]` has no effect: the messages do not contradict that"
 
 

@@ -17,7 +17,7 @@ class Distribution(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TopicFacts:
-    """What one mapped topic holds, as it was read; numbers that nothing gave are None.
+    """Content of one mapped topic, as it was read; numbers without a measurement are None.
 
     Attributes:
         messages: their number, from `first_ns` to `last_ns` on the clock of the mapping.

@@ -30,7 +30,7 @@ def test_every_assumption_has_a_log_that_contradicts_it_and_one_that_only_looks_
         assert {case.assumption for case in CASES if case.contradicts == contradicts} == set(NAMES)
 
 
-def test_an_accepted_contradiction_is_a_remark_and_one_in_vain_is_said(
+def test_an_accepted_contradiction_is_a_remark_and_another_name_is_remarked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses = [json.dumps({"x": 1.0, "y": 2.0, "yaw": 90.0 * number}).encode() for number in range(5)]
