@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -140,3 +141,23 @@ def test_an_assertion_about_a_log_fails_with_what_explain_says() -> None:
         assert_satisfied(trace, sr.parse_specification("G (cup dist plate >= 100)"))
     with pytest.raises(UsageError):
         assert_satisfied("none.mcap", spec)
+
+
+def test_a_doubtful_result_fails_with_the_contradiction_unless_the_suite_allows_it(
+    pytester: pytest.Pytester, options: list[str]
+) -> None:
+    box = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    objects = [{"name": "cart", "polygon": box, "yaw": 90.0}]
+    lines = (json.dumps({"time_ns": number * 10**9, "objects": objects}) for number in range(3))
+    (pytester.path / "degrees.jsonl").write_text("\n".join(lines))
+    (pytester.path / "stays.spatial").write_text(
+        "region yard = box(-1, -1, 9, 9)\nspec stays = G (cart enclosedin yard)"
+    )
+    case = "{name: turned, logs: degrees.jsonl, specs: stays.spatial}"
+    suite = pytester.path / "table.replay.yaml"
+    for allow, outcome in (("", {"failed": 1}), ("allow: doubtful\n", {"passed": 1})):
+        suite.write_text(f"{allow}cases: [{case}]")
+        result = pytester.runpytest_inprocess(*options)
+        assert result.parseoutcomes() == outcome
+        if "failed" in outcome:
+            result.stdout.fnmatch_lines(["degrees.jsonl: *: doubtful: its angles reach 90*"])

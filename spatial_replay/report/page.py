@@ -53,7 +53,7 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
 def _chip_of(report: RunReport) -> Html:
     verdict = report.replayed.verdict
     deciding = [each.result for each in report.results if each.result.verdict is verdict]
-    return chip(verdict, is_tested=all(each.tested != "nothing" for each in deciding))
+    return chip(verdict, is_sound=all(map(_is_sound, deciding)))
 
 
 def panels(report: RunReport) -> Html:
@@ -111,6 +111,9 @@ def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
     if replayed.faults:
         what = "The log is damaged: verdicts are over what could be read."
         yield _notice("alert", what, replayed.faults)
+    doubts = [doubt.text for doubt in replayed.doubts if not doubt.is_accepted]
+    if doubts:
+        yield _notice("alert", "The log contradicts how it was read; verdicts may be wrong:", doubts)
     if replayed.unreadable:
         verb = "holds" if replayed.unreadable == 1 else "hold"
         what = f"{counted(replayed.unreadable, 'observation')} {verb} no finite number: unknown there."
@@ -180,12 +183,17 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
     marks = [element("span", mark, **{"class": "chip is-vacuous"})] if mark else []
     return element(
         "summary" if each.sentences else "div",
-        chip(result.verdict, is_tested=result.tested != "nothing"),
+        chip(result.verdict, is_sound=_is_sound(result)),
         *marks,
         *_requirement(result.spec.id, result.title, result.spec.title),
         element("span", text(", ".join(numbers)), **{"class": "numbers"}),
         **{"class": "summary"},
     )
+
+
+def _is_sound(result: SpecResult) -> bool:
+    """Return whether a log shows a verdict: something tested it, and it rests on no doubt."""
+    return result.tested != "nothing" and not result.doubts
 
 
 def _mark(result: SpecResult) -> str:
@@ -240,9 +248,9 @@ def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
             yield element("code", text(piece)) if number % 2 else text(piece)
 
 
-def chip(verdict: str, *, is_tested: bool = True) -> Html:
+def chip(verdict: str, *, is_sound: bool = True) -> Html:
     """Return a verdict on its colour, which is that of none where nothing tested it."""
-    return element("span", verdict, **{"class": f"chip is-{verdict if is_tested else 'vacuous'}"})
+    return element("span", verdict, **{"class": f"chip is-{verdict if is_sound else 'vacuous'}"})
 
 
 LIGHT: Final[Mapping[str, str]] = MappingProxyType(
