@@ -123,13 +123,13 @@ class Namer:
         """
         if self.is_constant:
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
-            return [self._codes[_checked(name or self._topic)]] * len(objects)
+            return [self._codes[_check_name(name or self._topic)]] * len(objects)
         if objects and not self._is_prepared:
             # step by step once, because the errors of the fast getter name no fields
             message = messages[0] if messages else None
             self._name(objects[0], indices[0], message)
             self._prepare(objects[0], indices[0], message)
-        known, get = self._code_by_value, self._get
+        code_by_value, get = self._code_by_value, self._get
         of_objects = repeat(None, len(objects)) if messages is None else messages
         rows = zip(objects, indices, of_objects, strict=True)
         if get is None:
@@ -138,13 +138,13 @@ class Namer:
         for row in rows:
             value = get(*row)
             key = value if isinstance(value, str | int | float) else bytes(value)
-            code = known.get(key)
+            code = code_by_value.get(key)
             if code is None:
-                code = known[key] = self._codes[self._name(*row)]
+                code = code_by_value[key] = self._codes[self._name(*row)]
             codes.append(code)
         return codes
 
-    def wanted(self, codes: Sequence[int]) -> list[bool]:
+    def select(self, codes: Sequence[int]) -> list[bool]:
         """Return whether to keep the objects with these codes of names."""
         for code in set(codes).difference(self._is_wanted):
             name = self._codes.by_code[code]
@@ -157,8 +157,8 @@ class Namer:
         """Find a fast way: most templates have one field, so that a name is known by its value."""
         self._is_prepared = True
         fields = [part for part in self._template.parts if not isinstance(part, str)]
-        given = {INDEX, TOPIC}.difference(field_names(example))
-        if all(alternatives[0].text in given for alternatives in fields):
+        built_in = {INDEX, TOPIC}.difference(field_names(example))
+        if all(alternatives[0].text in built_in for alternatives in fields):
             self._get = lambda _, index, message: index
         elif len(fields) == 1 and len(fields[0]) == 1:
             (path,) = fields[0]
@@ -167,8 +167,8 @@ class Namer:
                 return
             *before, last = path.steps
             if path.from_message and isinstance(last, Place) and before:
-                listed = getter(FieldPath(path.text, tuple(before)), message)
-                self._get = lambda _, index, message: listed(message)[index]
+                get_names = getter(FieldPath(path.text, tuple(before)), message)
+                self._get = lambda _, index, message: get_names(message)[index]
             elif not path.from_message:
                 get = getter(path, example)
                 self._get = lambda thing, *_: get(thing)
@@ -177,7 +177,7 @@ class Namer:
         words = (
             p if isinstance(p, str) else self._word(p, thing, index, message) for p in self._template.parts
         )
-        return _checked("".join(words))
+        return _check_name("".join(words))
 
     def _word(
         self, alternatives: tuple[FieldPath, ...], thing: object, index: int | str, message: object
@@ -209,13 +209,13 @@ def class_codes(
     """Return the code of each object's class."""
     if not binding.class_gets:
         return [codes[layout.class_name]] * len(objects)
-    known: dict[Any, int] = {}
+    code_by_value: dict[Any, int] = {}
     result = []
-    for each in objects:
-        value = _first_value(binding.class_gets, each)
-        code = known.get(value)
+    for thing in objects:
+        value = _first_value(binding.class_gets, thing)
+        code = code_by_value.get(value)
         if code is None:
-            code = known[value] = codes[_class_name(layout, value, binding.class_names)]
+            code = code_by_value[value] = codes[_class_name(layout, value, binding.class_names)]
         result.append(code)
     return result
 
@@ -261,7 +261,7 @@ def _text(value: object, path: FieldPath) -> str:
         digits = bytes(value).hex()  # type: ignore[call-overload]
         return str(digits) if digits.strip("0") else ""
     if is_list(value) and len(value) <= _MOST_IN_NAME:
-        return "_".join(_text(each, path) for each in value)
+        return "_".join(_text(part, path) for part in value)
     raise FieldError(f"{path.text}: expected a text or a number, got {type_name(value)}")
 
 
@@ -275,7 +275,7 @@ def _is_uuid(value: object) -> bool:
         return False
 
 
-def _checked(name: str) -> str:
+def _check_name(name: str) -> str:
     if not name or len(name) > _LONGEST_NAME or not name.isprintable():
         raise ContentError(
             f"the name {name[:40]!r} is empty, too long or not printable; give another with `name`"
@@ -363,7 +363,7 @@ class TimeGetter:
         if not self.is_pair:
             unit = self.unit_ns
             return [
-                self._checked(
+                self._check(
                     time * unit
                     if type(time) is int
                     else ns_from_text(time, unit)
@@ -384,7 +384,7 @@ class TimeGetter:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
         return [int(time) for time in (seconds * _SECOND_NS + rest).tolist()]
 
-    def _checked(self, time_ns: int) -> int:
+    def _check(self, time_ns: int) -> int:
         if abs(time_ns) > LATEST_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
         return time_ns
@@ -453,7 +453,7 @@ class _Columns:
         value = walk(path, self.example)
         if not (is_number(value) or _is_numeral(value)):
             raise FieldError(f"{path.text}: expected a number, got {type_name(value)}")
-        texts = [known.text for known in self.paths]
+        texts = [column.text for column in self.paths]
         if path.text in texts:
             return texts.index(path.text)
         self.paths.append(path)
@@ -465,12 +465,12 @@ class _Columns:
     def point(self, path: FieldPath, names: str) -> tuple[int, ...]:
         """Return the columns of a point's coordinates, at least two."""
         value = walk(path, self.example)
-        known = tuple(names) if isinstance(value, Sparse) else field_names(value)
-        if all(name in known for name in names[:2]):
-            return tuple(self.add(below(path, name)) for name in names if name in known)
+        present = tuple(names) if isinstance(value, Sparse) else field_names(value)
+        if all(name in present for name in names[:2]):
+            return tuple(self.add(below(path, name)) for name in names if name in present)
         if is_list(value) and 2 <= len(value) <= len(names):
             return tuple(self.add(below(path, index)) for index in range(len(value)))
-        fields = f"; its fields are {', '.join(known)}" if known else ""
+        fields = f"; its fields are {', '.join(present)}" if present else ""
         zeros = "; if zeros are left out, add `missing: 0`" if isinstance(value, dict) else ""
         raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}{zeros}")
 
@@ -565,8 +565,8 @@ def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout
     """Return a layout without alternatives of which nothing is there, which would all be 0."""
 
     def is_there(paths: Alternatives | str) -> bool:
-        listed = (paths,) if isinstance(paths, str) else paths
-        return any(leads_somewhere(FieldPath.of(path), example) for path in listed)
+        alternatives = (paths,) if isinstance(paths, str) else paths
+        return any(leads_somewhere(FieldPath.of(path), example) for path in alternatives)
 
     def present(alternatives: tuple[_Alternative, ...]) -> tuple[_Alternative, ...]:
         return alternatives if len(alternatives) < 2 else tuple(filter(is_there, alternatives))
@@ -662,12 +662,12 @@ def _polygon(layout: MessageLayout, columns: _Columns) -> tuple[Get | None, bool
 
 
 def _uncertainty(layout: MessageLayout, columns: _Columns) -> tuple[float | int | None, Get | None]:
-    wanted = layout.uncertainty
-    if wanted is None:
+    uncertainty = layout.uncertainty
+    if uncertainty is None:
         return None, None
-    if not wanted.is_covariance:
-        return columns.measure(wanted.measure), None
-    path = FieldPath.of(str(wanted.measure) or layout.covariance or "covariance")
+    if not uncertainty.is_covariance:
+        return columns.measure(uncertainty.measure), None
+    path = FieldPath.of(str(uncertainty.measure) or layout.covariance or "covariance")
     value = walk(path, columns.example)
     if not is_list(value) or len(value) not in (4, 9, 36):
         raise FieldError(f"{path.text}: expected a covariance of 4, 9 or 36 numbers, got {type_name(value)}")

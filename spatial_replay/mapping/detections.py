@@ -65,13 +65,13 @@ class Solids:
     point_start: Integers
     points: Floats
 
-    def repeated(self, owner: int, count: int) -> Solids:
+    def repeat(self, owner: int, count: int) -> Solids:
         """Return the solids of one object, `count` times."""
-        own = np.flatnonzero(self.owner == owner)
-        pieces = np.tile(own, count)
+        indices = np.flatnonzero(self.owner == owner)
+        pieces = np.tile(indices, count)
         sizes = np.diff(self.point_start)[pieces]
         return Solids(
-            owner=np.repeat(np.arange(count, dtype=np.int64), len(own)),
+            owner=np.repeat(np.arange(count, dtype=np.int64), len(indices)),
             kind=self.kind[pieces],
             position=self.position[pieces],
             rotation=self.rotation[pieces],
@@ -245,8 +245,8 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
     points = [_vector(point, get) for point in get(marker, "points") or ()]
     if kind in (6, 7):
         # elements of a list marker; the point, in the marker's frame, is added when solids are put in columns
-        listed = BOX if kind == 6 else SPHERE
-        return [Solid(listed, position, quaternion, scale, (point,)) for point in points]
+        element = BOX if kind == 6 else SPHERE
+        return [Solid(element, position, quaternion, scale, (point,)) for point in points]
     if kind == 11 and len(points) >= 3:
         scaled = [tuple(a * b for a, b in zip(point, scale, strict=True)) for point in points]
         return _triangles((position, quaternion), scaled)
@@ -334,7 +334,7 @@ class Poses:
     rotation: Floats
     yaw: Floats
 
-    def moved(self, transforms: Transforms) -> Poses:
+    def transform(self, transforms: Transforms) -> Poses:
         """Return the same poses in another frame."""
         rotation = transforms.rotation @ self.rotation
         position = np.einsum("nij,nj->ni", transforms.rotation, self.position) + transforms.translation
@@ -378,7 +378,7 @@ class Detections:
     skipped: int = 0
     numbers: Floats | None = None
 
-    def scaled(self, factor: float) -> Detections:
+    def scale(self, factor: float) -> Detections:
         """Return the same objects with lengths times a factor."""
         solids, poses = self.solids, self.poses
         return replace(
@@ -395,7 +395,7 @@ class Detections:
             covariance=None if self.covariance is None else self.covariance * factor**2,
         )
 
-    def repeated(self, index: int, count: int) -> Detections:
+    def repeat(self, index: int, count: int) -> Detections:
         """Return one of the objects `count` times, each in a message of its own, without frame and stamp."""
         same = np.full(count, index, np.int64)
         poses = self.poses
@@ -404,7 +404,7 @@ class Detections:
             name=self.name[same],
             class_code=self.class_code[same],
             poses=select(poses, same),
-            solids=self.solids.repeated(index, count),
+            solids=self.solids.repeat(index, count),
             height=None if self.height is None else self.height[same],
             uncertainty=self.uncertainty[same],
             covariance=None if self.covariance is None else self.covariance[same],
@@ -459,7 +459,7 @@ def detections_from_chunks(
     chunks = [chunk for chunk in chunks if chunk.name]
     if binding is None or not chunks:
         return _no_detections(deleted, skipped)
-    name = _joined(chunk.name for chunk in chunks)
+    name = _join_columns(chunk.name for chunk in chunks)
     numbers = np.empty((len(name), 0))
     if binding.numbers is not None:
         numbers = np.concatenate([chunk.numbers for chunk in chunks])
@@ -469,12 +469,12 @@ def detections_from_chunks(
         poses = _poses(layout, binding, numbers)
         if binding.polygon is not None:
             counts = np.concatenate([chunk.corner_counts for chunk in chunks])
-            own = None
+            object_frames = None
             if layout.shape is not None:
-                own = _placed_shape(layout.shape, poses), poses.rotation
+                object_frames = _origins_of_shape(layout.shape, poses), poses.rotation
             corners = np.concatenate([chunk.corners for chunk in chunks])
             outline_counts = np.concatenate([chunk.outline_counts for chunk in chunks])
-            solids = _polygons(outline_counts, counts, corners, own)
+            solids = _polygons(outline_counts, counts, corners, object_frames)
         else:
             solids = _shapes(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
@@ -483,15 +483,15 @@ def detections_from_chunks(
     return Detections(
         message=np.concatenate([number[chunk.places[chunk.message]] for chunk in chunks]),
         name=name,
-        class_code=_joined(chunk.class_code for chunk in chunks),
+        class_code=_join_columns(chunk.class_code for chunk in chunks),
         frames=list(chain.from_iterable(chunk.frames or () for chunk in chunks)) if has_frames else None,
-        stamp_ns=_joined(chunk.stamps or () for chunk in chunks) if has_stamps else None,
+        stamp_ns=_join_columns(chunk.stamps or () for chunk in chunks) if has_stamps else None,
         poses=poses,
         solids=solids,
         height=_heights(binding, numbers),
         uncertainty=_uncertainty(binding, numbers, len(name)),
         covariance=np.concatenate(spreads) if spreads else None,
-        lifetime_ns=_joined(chunk.lifetimes for chunk in chunks) if layout.stays else None,
+        lifetime_ns=_join_columns(chunk.lifetimes for chunk in chunks) if layout.stays else None,
         is_locked=np.array(locked, np.bool_) if any(locked) else None,
         deleted=deleted,
         skipped=skipped,
@@ -507,7 +507,7 @@ def _no_detections(deleted: list[tuple[int, int]], skipped: int) -> Detections:
     return Detections(none, none, none, poses, solids, numbers, deleted=deleted, skipped=skipped)
 
 
-def _joined(columns: Iterable[Sequence[int]]) -> Integers:
+def _join_columns(columns: Iterable[Sequence[int]]) -> Integers:
     return np.fromiter(chain.from_iterable(columns), np.int64)
 
 
@@ -541,7 +541,7 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
         origin: latitude and longitude.
     """
 
-    def earth_fixed(degrees: Floats) -> Floats:
+    def to_earth_frame(degrees: Floats) -> Floats:
         latitude, longitude = np.radians(degrees[:, :2]).T
         radius = _EQUATOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
         level = radius * np.cos(latitude)
@@ -553,7 +553,7 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     north = np.array(
         [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
     )
-    offsets = earth_fixed(fixes) - earth_fixed(np.array([origin]))
+    offsets = to_earth_frame(fixes) - to_earth_frame(np.array([origin]))
     metres: Floats = offsets @ np.stack([east, north], axis=1)
     is_off = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
     metres[np.flatnonzero(is_off)] = np.nan
@@ -564,7 +564,10 @@ def _heights(binding: Binding, numbers: Floats) -> Floats | None:
     if not binding.height:
         return None
     count = len(numbers)
-    bounds = [numbers[:, each] if isinstance(each, int) else np.full(count, each) for each in binding.height]
+    bounds = [
+        numbers[:, measure] if isinstance(measure, int) else np.full(count, measure)
+        for measure in binding.height
+    ]
     return np.stack(bounds, axis=1)
 
 
@@ -578,7 +581,7 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
     """Return the covariances (R, 3, 3) of positions, times the square of the number of deviations."""
     if binding.covariance is None or layout.uncertainty is None:
         return None
-    rows = np.array([list(binding.covariance(each)) for each in objects], np.float64)
+    rows = np.array([list(binding.covariance(thing)) for thing in objects], np.float64)
     size = {4: 2, 9: 3, 36: 6}[rows.shape[1]]
     # of 6 x 6, the position comes first, as in geometry_msgs
     used = min(size, 3)
@@ -610,7 +613,7 @@ def _listed_solids(listed: list[list[Solid]]) -> tuple[Solids, Poses]:
 def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
     """Return one solid each: the shape of the mapping or of the message; a point without either."""
     shape = layout.shape
-    position = poses.position if shape is None else _placed_shape(shape, poses)
+    position = poses.position if shape is None else _origins_of_shape(shape, poses)
     count = len(position)
     size = np.full((count, 3), np.nan)
     counts, points = np.zeros(count, np.int64), np.empty((0, 3))
@@ -634,7 +637,7 @@ def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floa
     return Solids(owner, kinds, position, poses.rotation, size, starts_from_counts(counts), points)
 
 
-def _placed_shape(shape: ShapeMapping, poses: Poses) -> Floats:
+def _origins_of_shape(shape: ShapeMapping, poses: Poses) -> Floats:
     """Return where the origins (R, 3) of a shape are, with its offset from those of objects."""
     if shape.offset == (0.0, 0.0):
         return poses.position
@@ -642,19 +645,19 @@ def _placed_shape(shape: ShapeMapping, poses: Poses) -> Floats:
 
 
 def _polygons(
-    outline_counts: Integers, counts: Integers, points: Floats, own: tuple[Floats, Floats] | None
+    outline_counts: Integers, counts: Integers, points: Floats, frames: tuple[Floats, Floats] | None
 ) -> Solids:
     """Return polygons with corners in the frame of their message, or in the objects' own.
 
     Args:
         outline_counts: (R,) how many of the polygons make up an object.
-        own: positions (R, 3), rotations (R, 3, 3) of the objects' own frames; None for that of the message.
+        frames: positions (R, 3), rotations (R, 3, 3) of the objects' own frames; None for that of messages.
     """
     count = len(counts)
     owner, kind = np.repeat(np.arange(len(outline_counts)), outline_counts), np.full(count, POLYGON, np.int8)
     position, rotation = np.zeros((count, 3)), no_rotations(count)
-    if own is not None:
-        position, rotation = own[0][owner], own[1][owner]
+    if frames is not None:
+        position, rotation = frames[0][owner], frames[1][owner]
     size = np.full((count, 3), np.nan)
     return Solids(owner, kind, position, rotation, size, starts_from_counts(counts), points)
 

@@ -81,8 +81,8 @@ def _plain(value: Any) -> Any:
         return list(map(_plain, value.values))
     if kind != "google.protobuf.Value":
         return value
-    chosen = value.WhichOneof("kind")
-    return None if chosen in (None, "null_value") else _plain(getattr(value, chosen))
+    field = value.WhichOneof("kind")
+    return None if field in (None, "null_value") else _plain(getattr(value, field))
 
 
 class Sparse(dict[str, Any]):
@@ -135,7 +135,7 @@ def from_protobuf_json(value: object, objects: str) -> object:
         ContentError: it is nested too deeply.
     """
     try:
-        message = _as_defined(value)
+        message = _message_from_json(value)
     except RecursionError:
         raise ContentError("its JSON is nested too deeply") from None
     if objects and isinstance(message, dict):
@@ -146,15 +146,15 @@ def from_protobuf_json(value: object, objects: str) -> object:
 _POINT = MappingProxyType({"x": 0.0, "y": 0.0, "z": 0.0})
 
 
-def _as_defined(value: object) -> object:
+def _message_from_json(value: object) -> object:
     if isinstance(value, list):
         # long lists of numbers are as they are
-        return list(map(_as_defined, value)) if value and isinstance(value[0], dict | list) else value
+        return list(map(_message_from_json, value)) if value and isinstance(value[0], dict | list) else value
     if not isinstance(value, dict):
         return value
     if value.keys() <= {"x", "y", "z", "w"}:
         return {**_POINT, **value}
-    fields = {key: _as_defined(part) for key, part in value.items()}
+    fields = {key: _message_from_json(part) for key, part in value.items()}
     if "position" in fields:
         # an orientation that is not set is a quaternion of zeros in protobuf's own encoding
         fields.setdefault("orientation", {**_POINT, "w": 0.0})
@@ -442,7 +442,7 @@ def enum_names(path: FieldPath, message: object) -> dict[object, str]:
 
 
 def is_set(path: FieldPath, value: object) -> bool:
-    """Return whether a sender set the protobuf fields on a path, as far as their definition tells."""
+    """Return whether a sender set the protobuf fields on a path, as far as their definition says."""
     for step in path.steps:
         if isinstance(step, str) and not isinstance(value, Mapping):
             field = _definition_of(value, step)

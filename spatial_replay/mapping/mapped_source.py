@@ -95,12 +95,12 @@ class MappedSource(FileSource):
         start_ns = start_ns or None
         end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
         reader = open_messages(self.path)
-        topics = tuple(map(self._typed, reader.topics()))
+        topics = tuple(map(self._with_type, reader.topics()))
         by_name = {topic.name: topic for topic in topics}
         plan = self._plan(reader, topics)
         mapped = frozenset(plan.topics)
-        kept = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
-        channels = _foreign_channels(reader, kept)
+        names = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
+        channels = _foreign_channels(reader, names)
         copied = _CopiedMessages(channels)
         read = mapped | copied.topics
         first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
@@ -134,7 +134,9 @@ class MappedSource(FileSource):
             assembler.know_static(open_messages(self.path).iter_messages(static))
         if start_ns is not None and plan.by_log_time and plan.sampled_topic is not None:
             sampled_ns = first_ns([plan.sampled_topic])
-            fallback_topics = {each.topic for each in plan.planned if each.name in plan.fallback_topics}
+            fallback_topics = {
+                planned.topic for planned in plan.planned if planned.name in plan.fallback_topics
+            }
             is_read = sampled_ns is None or sampled_ns >= plan.first_read_ns(start_ns)
             assembler.know_start(None if is_read else sampled_ns, first_ns(fallback_topics))
         as_recorded = self.reading.on_time_jump == "split"
@@ -152,9 +154,9 @@ class MappedSource(FileSource):
             reason = blocks.first_fault or "its messages make none with this mapping"
             raise LogError(f"{self.name} holds no sample: {reason}")
 
-    def _typed(self, topic: Topic) -> Topic:
+    def _with_type(self, topic: Topic) -> Topic:
         """Return a topic; one of ROS that the log says nothing about has the type that the mapping names."""
-        names = (each.type for each in self.mapping.topics if each.topic == topic.name and each.type)
+        names = (entry.type for entry in self.mapping.topics if entry.topic == topic.name and entry.type)
         name = next(names, None)
         if topic.type or name is None or topic.encoding not in ("ros1", "cdr"):
             return topic
@@ -168,7 +170,7 @@ class MappedSource(FileSource):
             LogError: a mapped topic cannot be decoded, or is missing from a damaged log.
             UsageError: the mapping does not fit the log.
         """
-        mapped = {*(each.topic for each in self.mapping.topics), self.mapping.sampling.topic}
+        mapped = {*(entry.topic for entry in self.mapping.topics), self.mapping.sampling.topic}
         reasons = [topic.unreadable for topic in topics if topic.name in mapped and topic.unreadable]
         if reasons:
             texts = [f"{self.name}: {reason}" for reason in reasons]
@@ -265,10 +267,10 @@ class _CopiedMessages:
         if not (times[1:] >= times[:-1]).all():
             waiting = select(waiting, np.argsort(times, kind="stable"))
         ready = len(waiting) if is_all else waiting.count_before(int(trace.times_ns[-1]) + 1)
-        taken, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
+        evaluated, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
-        return taken.raw(self._channels)
+        return evaluated.raw(self._channels)
 
 
 def _first_ns(
@@ -292,7 +294,8 @@ def _foreign_channels(reader: MessageReader, topics: Collection[str]) -> Mapping
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
     """Return remarks on topics that are not mapped and could not be, with their numbers of messages."""
-    unread = [each for each in topics if each.unreadable and each.count != 0 and each.name not in plan.topics]
+    sent = [topic for topic in topics if topic.count != 0 and topic.name not in plan.topics]
+    unread = [topic for topic in sent if topic.unreadable]
     remarks = []
     for topic in unread[:_MOST_UNREAD]:
         count = "an unknown number" if topic.count is None else f"{topic.count}"

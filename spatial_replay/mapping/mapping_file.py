@@ -335,8 +335,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         return [(("topics",), NO_TOPIC)]
     if not isinstance(value, dict) or not isinstance(value.get("topics"), dict):
         return []
-    listed = value.get("shapes")
-    shapes = list(listed) if isinstance(listed, dict) else []
+    shapes_by_name = value.get("shapes")
+    shapes = list(shapes_by_name) if isinstance(shapes_by_name, dict) else []
     faults: list[tuple[Place, str]] = []
     if value.get("fixed_frame", "") is None:
         faults.append((("fixed_frame",), NO_FRAME))
@@ -350,9 +350,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
             faults.append(((*place, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
         outlines = combinations(("polygon", "bounds", "shape"), 2)
-        for one, other in (*outlines, ("orientation", "yaw")):
-            if one in entry and other in entry:
-                faults.append(((*place, other), f"there is {one!r} already; give one of the two"))
+        for key, rival in (*outlines, ("orientation", "yaw")):
+            if key in entry and rival in entry:
+                faults.append(((*place, rival), f"there is {key!r} already; give one of the two"))
         faults += [((*place, *within), text) for within, text in _contradictions_of_turns(entry)]
     tables: list[tuple[Place, Any, str]] = [
         ((), value, "max_age"),
@@ -499,8 +499,8 @@ def _signal(name: str, value: Any) -> SignalMapping:
     if not isinstance(value, dict):
         return SignalMapping(name, value)
     names: dict[str, float] = {}
-    for key, other in value.get("names", {}).items():
-        text, number = (other, float(key)) if isinstance(other, str) else (key, float(other))
+    for key, label in value.get("names", {}).items():
+        text, number = (label, float(key)) if isinstance(label, str) else (key, float(label))
         if names.setdefault(text, number) != number:
             raise UsageError(
                 f"names of the signal {name!r}: two numbers are called {text!r}; give each its own name"

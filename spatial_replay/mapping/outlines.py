@@ -60,17 +60,17 @@ def outlines_from_lists(
         few = counts < _LEAST_CORNERS
     if not few.any():
         return counts, points, 0
-    kept = np.repeat(~few, counts)
+    is_enough = np.repeat(~few, counts)
     at = starts_from_counts(np.where(few, 0, counts))[:-1][few]
-    points = np.insert(points[kept], at, np.nan, axis=0)
+    points = np.insert(points[is_enough], at, np.nan, axis=0)
     return np.where(few, 1, counts), points, int(np.count_nonzero(few))
 
 
 def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     """Return the counts (R,) and the corners (V, 3) of lists of points, of pairs, or of x, y, x, y …."""
-    example = next((each[0] for each in lists if len(each)), None)
+    example = next((corners[0] for corners in lists if len(corners)), None)
     flat = list(chain.from_iterable(lists))
-    counts = np.array([len(each) for each in lists], np.int64)
+    counts = np.array([len(corners) for corners in lists], np.int64)
     names = field_names(example)
     if "x" in names and "y" in names:
         axes = "xyz" if "z" in names else "xy"

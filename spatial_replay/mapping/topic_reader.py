@@ -187,8 +187,8 @@ class Extractor:
         time = self._time
         if time is None or not time.path.from_message:
             if self._time_of_empty is None:
-                own = [each for each in self.layout.stamp if FieldPath.of(each.field).from_message]
-                self._time_of_empty = bind_time(own, message, message)
+                stamps = [stamp for stamp in self.layout.stamp if FieldPath.of(stamp.field).from_message]
+                self._time_of_empty = bind_time(stamps, message, message)
             time = self._time_of_empty
         return None if time is None else time.nanoseconds([message])[0]
 
@@ -214,7 +214,7 @@ class Extractor:
         elif self.layout.solids == "scene":
             deleted = self._deleted_entities(messages, objects)
         if self.namer.is_filtering:
-            objects = objects.where(self.namer.wanted(objects.name))
+            objects = objects.where(self.namer.select(objects.name))
         chunk = DetectionChunk(places, deleted)
         if objects.values:
             if self._binding is None:
@@ -222,8 +222,8 @@ class Extractor:
                 self._binding = bind(self.layout, example, message, needs_frame=self._needs_frame)
                 self._bind_time(example, message)
             self._fill(chunk, self._binding, messages, objects)
-            paths = [FieldPath.of(each) for each in self.unseen]
-            if any(leads_somewhere(path, each) for path in paths for each in objects.values):
+            paths = list(map(FieldPath.of, self.unseen))
+            if any(leads_somewhere(path, thing) for path in paths for thing in objects.values):
                 self.unseen = ()
         return chunk
 
@@ -234,7 +234,7 @@ class Extractor:
             detections = self._with_one_class(detections)
         is_in_degrees = self.layout.origin is not None or self.layout.corner_origin is not None
         return (
-            detections if is_in_degrees or self.layout.scale == 1.0 else detections.scaled(self.layout.scale)
+            detections if is_in_degrees or self.layout.scale == 1.0 else detections.scale(self.layout.scale)
         )
 
     def _with_one_class(self, detections: Detections) -> Detections:
@@ -261,14 +261,14 @@ class Extractor:
         cornerless = 0
         if self.layout.solids:
             get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self.layout.solids]
-            solids = [solids_of(each, get) for each in objects.values]
-            chunk.solids = [each for each in solids if each]
+            solids = [solids_of(thing, get) for thing in objects.values]
+            chunk.solids = list(filter(None, solids))
             chunk.skipped = len(solids) - len(chunk.solids)
-            objects = objects.where([bool(each) for each in solids])
+            objects = objects.where(list(map(bool, solids)))
             if self.layout.stays:
-                chunk.locked = [bool(get(each, "frame_locked")) for each in objects.values]
+                chunk.locked = [bool(get(thing, "frame_locked")) for thing in objects.values]
         elif binding.polygon is not None:
-            corners = [binding.polygon(each) for each in objects.values]
+            corners = list(map(binding.polygon, objects.values))
             if self.layout.is_bounds and not self.layout.bounds_have_size:
                 self._count_corners(corners)
             if binding.has_rings:
@@ -363,8 +363,8 @@ class Extractor:
                 for name in gone:
                     self._scene_stamps_ns.pop(name, None)
                 deleted += [(number, name) for name in gone]
-            own = slice(starts[number], starts[number + 1])
-            self._scene_stamps_ns.update(zip(entities.name[own], stamps[own], strict=True))
+            reported = slice(starts[number], starts[number + 1])
+            self._scene_stamps_ns.update(zip(entities.name[reported], stamps[reported], strict=True))
         return deleted
 
     def _bind_time(self, example: object, message: object) -> None:
@@ -406,7 +406,7 @@ class Extractor:
             if binding.own_stamp is not None:
                 own_stamps = binding.own_stamp.nanoseconds(objects.values)
                 # a stamp of 0 was never set
-                chunk.stamps = [own or outer for own, outer in zip(own_stamps, chunk.stamps, strict=True)]
+                chunk.stamps = [stamp or outer for stamp, outer in zip(own_stamps, chunk.stamps, strict=True)]
             chunk.noted_stamps = list(zip(chunk.places.tolist(), stamps, strict=True))
         else:
             chunk.stamps = self._time.nanoseconds(objects.values)
@@ -433,7 +433,7 @@ def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int,
     if not objects.values:
         return objects, deleted
     get = lenient_getter(style_of(objects.values[0]))
-    actions = [get(each, "action") for each in objects.values]
+    actions = [get(marker, "action") for marker in objects.values]
     if not any(actions):
         return objects, deleted
     for action, message, name in zip(actions, objects.message, objects.name, strict=True):
@@ -643,9 +643,9 @@ class TopicReader:
             if not is_bound:
                 raise self._misfit_error(first)
         if self.extractor is not None and self.extractor.is_bound and self.extractor.unseen:
-            listed = ", ".join(self.extractor.unseen)
+            paths = ", ".join(self.extractor.unseen)
             raise self._misfit_error(
-                f"none of its messages has {listed}; with `missing: 0` it would be 0 in all"
+                f"none of its messages has {paths}; with `missing: 0` it would be 0 in all"
             )
 
     def _read_each(
@@ -703,7 +703,7 @@ class TopicReader:
     def _signal_values(self, message: object) -> list[float]:
         if self._signals is None:
             try:
-                self._signals = [self._bind_signal(each, message) for each in self._signal_fields]
+                self._signals = [self._bind_signal(signal, message) for signal in self._signal_fields]
             except FieldError as error:
                 self._count_misfit("signals", error)
                 raise
@@ -736,9 +736,9 @@ class TopicReader:
             if not (numbers and isinstance(value, str)):
                 return _number(value)
             if value not in numbers:
-                known = self.unnamed.setdefault(signal.name, {})
-                if len(known) < _MOST_UNNAMED:
-                    known.setdefault(value[:_LONGEST_UNNAMED])
+                texts = self.unnamed.setdefault(signal.name, {})
+                if len(texts) < _MOST_UNNAMED:
+                    texts.setdefault(value[:_LONGEST_UNNAMED])
             return numbers.get(value, nan)
 
         return number_of
@@ -833,7 +833,7 @@ class PendingMessages:
     @property
     def first_ns(self) -> int | None:
         """The time of the first message that waits."""
-        return min((int(each[0].min()) for each in self._columns if len(each[0])), default=None)
+        return min((int(times_ns.min()) for times_ns, *_ in self._columns if len(times_ns)), default=None)
 
     @property
     def times_ns(self) -> Integers:

@@ -231,7 +231,7 @@ def rows_from_detections(
     unknown = np.zeros(count, np.bool_)
     covariance = detections.covariance
     if transforms is not None:
-        poses, solids = poses.moved(transforms), _moved(solids, transforms)
+        poses, solids = poses.transform(transforms), _moved(solids, transforms)
         unknown = ~transforms.known
         if covariance is not None:
             turn = transforms.rotation
@@ -607,7 +607,7 @@ class Tracker:
         self._unplaced_at[topic].append(times_ns[~found.known])
         # while nothing moves, one observation is enough
         changed = _changes(found)
-        repeated, moved = detections.repeated(index, len(changed)), found.select(changed)
+        repeated, moved = detections.repeat(index, len(changed)), found.select(changed)
         # faults were reported when it arrived
         rows = rows_from_detections(repeated, moved, mapping.axes, self.concave, lambda index, what: None)
         return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]

@@ -76,7 +76,7 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
         document.faults.append((1, f"the file is larger than {largest // 1024} KiB; {what} is not"))
         return document
     try:
-        if fault := _unsupported(yaml.parse(text, Loader=yaml.SafeLoader), what):
+        if fault := _find_unsupported(yaml.parse(text, Loader=yaml.SafeLoader), what):
             document.faults.append(fault)
             return document
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -103,7 +103,7 @@ def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
     return "; put patterns in quotes: 'logs/run-[0-3]*.mcap'"
 
 
-def _unsupported(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
+def _find_unsupported(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
     """Find the first feature that such files do not need and that could make a short text mean much."""
     import yaml
 
@@ -127,7 +127,7 @@ def _value(node: yaml.Node, place: Place, document: Document) -> Value:
 
     document.lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
-        return [_value(each, (*place, index), document) for index, each in enumerate(node.value)]
+        return [_value(item, (*place, index), document) for index, item in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
         return _table(node, place, document)
     if not isinstance(node, yaml.ScalarNode) or node.style is not None:
@@ -245,7 +245,7 @@ def faults_by_place(
 
     # one error for each place; a contradiction says more than the schema
     errors = Draft202012Validator(schema).iter_errors(document.value)
-    violations = [fault for error in errors for fault in _described(error)]
+    violations = [fault for error in errors for fault in _faults_in_words(error)]
     return dict(violations + contradictions(document))
 
 
@@ -264,25 +264,28 @@ def _text_from_place(place: Place) -> str:
     return f"{text}: " if text else ""
 
 
-def _described(error: Any) -> Iterator[tuple[Place, str]]:
+def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
     """Iterate over the places of a violation of the schema, with what belongs there."""
     place: Place = tuple(error.absolute_path)
     keyword = error.validator
     if keyword == "anyOf" and isinstance(error.instance, dict | list):
         branches: dict[int, list[Any]] = {}
-        for each in error.context:
-            branches.setdefault(each.schema_path[0], []).append(each)
+        for violation in error.context:
+            branches.setdefault(violation.schema_path[0], []).append(violation)
         for branch in branches.values():
             # not an alternative that failed because the whole value has another type
-            if not any(each.validator == "type" and len(each.absolute_path) == len(place) for each in branch):
-                for each in branch:
-                    yield from _described(each)
+            if not any(
+                violation.validator == "type" and len(violation.absolute_path) == len(place)
+                for violation in branch
+            ):
+                for violation in branch:
+                    yield from _faults_in_words(violation)
                 return
     if keyword == "additionalProperties" and isinstance(error.instance, dict):
-        known = list(error.schema.get("properties", {}))
+        keys = list(error.schema.get("properties", {}))
         for key in error.instance:
-            if key not in known:
-                hint = nearest_hint(key, known) or f"known are {', '.join(known)}"
+            if key not in keys:
+                hint = nearest_hint(key, keys) or f"known are {', '.join(keys)}"
                 yield (*place, key), f"unknown key; {hint}"
     elif keyword == "required":
         missing = [key for key in error.validator_value if key not in error.instance]
@@ -290,10 +293,13 @@ def _described(error: Any) -> Iterator[tuple[Place, str]]:
     elif "propertyNames" in error.absolute_schema_path:
         yield place, "a name is empty; give it a name"
     else:
-        wanted = error.schema.get("description", _around(error))
+        description = error.schema.get("description", _around(error))
         is_word = keyword == "enum" and isinstance(error.instance, str)
         hint = nearest_hint(error.instance, map(str, error.validator_value)) if is_word else ""
-        yield place, "; ".join(filter(None, (f"expected {wanted}", f"got {_shown(error.instance)}", hint)))
+        yield (
+            place,
+            "; ".join(filter(None, (f"expected {description}", f"got {_in_words(error.instance)}", hint))),
+        )
 
 
 def _around(error: Any) -> str:
@@ -305,7 +311,7 @@ def _around(error: Any) -> str:
     return fallback if parent is None else str(parent.schema["description"])
 
 
-def _shown(value: object) -> str:
+def _in_words(value: object) -> str:
     """Return a short text for a value."""
     if isinstance(value, dict):
         return f"keys {', '.join(map(str, value))[:60]}" if value else "{}"
