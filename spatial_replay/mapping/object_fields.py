@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import hypot, inf
 
 from spatial_replay.mapping.field_paths import (
     INDEX,
@@ -107,7 +108,7 @@ class Guess:
         other_outline: of the corners of objects whose size is 0, beside others with a size.
         plane: of the name of the floor or map that an object is on, if these differ.
         has_zeros_left_out: whether some objects lack coordinates that others have.
-        others: of further lists whose elements look like objects.
+        others: further lists whose elements look like objects.
         is_plan: whether the places are those to go to.
     """
 
@@ -128,8 +129,14 @@ class Guess:
     other_outline: str | None = None
     plane: str | None = None
     has_zeros_left_out: bool = False
-    others: tuple[str, ...] = ()
+    others: tuple[Guess, ...] = ()
     is_plan: bool = False
+
+    @property
+    def is_body(self) -> bool:
+        """Whether it has a name and a turn, a size or an outline, as objects beside others have."""
+        has_extent = bool(self.size or self.polygon or self.bounds or self.orientation or self.yaw)
+        return bool(self.names) and has_extent and not self.is_plan
 
     @property
     def has_compass(self) -> bool:
@@ -191,22 +198,32 @@ def _best(messages: Sequence[object]) -> Guess | None:
     if not guesses:
         return None
     # an outline at a pose near the origin may be in either frame, which another message decides
-    best = max(guesses, key=lambda guess: (guess.score, guess.is_own))
-    if best.names == (INDEX,):
+    best = _with_evidence(max(guesses, key=lambda guess: (guess.score, guess.is_own)), messages)
+    if best.objects is None:
         return best
-    if isinstance(best.position, tuple) and geodetic_order(best.position):
+    lists = {candidate.objects: candidate for guess in guesses for candidate in (guess, *guess.others)}
+    further = (guess for path, guess in lists.items() if path not in (None, best.objects))
+    return replace(best, others=tuple(_with_evidence(guess, messages) for guess in further))
+
+
+def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
+    """Return a guess after a look at the values of its fields in all messages."""
+    if guess.names == (INDEX,):
+        return guess
+    if isinstance(guess.position, tuple) and geodetic_order(guess.position):
         # the frame of a fix is that of its receiver
-        best = replace(best, names=(*best.names, "frame_id"))
-    names = tuple(name for name in best.names if _distinguishes(name, best, messages))
+        guess = replace(guess, names=(*guess.names, "frame_id"))
+    names = tuple(name for name in guess.names if _distinguishes(name, guess, messages))
     with suppress(FieldError):
-        best = replace(best, bounds_have_size=_have_size(best, messages))
-    if best.size and not any(_values_at(best.size[:2], best, messages)):
-        best = replace(best, size=(), is_sizeless=True)
-    elif best.size:
-        best = replace(best, other_outline=_outline_of_sizeless(best, messages))
-    if best.plane is not None and len(set(_values_at((best.plane,), best, messages))) < 2:
-        best = replace(best, plane=None)
-    return replace(best, names=names or tuple(_names_beside(best, messages)))
+        guess = replace(guess, bounds_have_size=_have_size(guess, messages))
+    if guess.size and not any(_values_at(guess.size[:2], guess, messages)):
+        guess = replace(guess, size=(), is_sizeless=True)
+    elif guess.size:
+        guess = replace(guess, other_outline=_outline_of_sizeless(guess, messages))
+    if guess.plane is not None:
+        planes = {value for value in _values_at((guess.plane,), guess, messages) if isinstance(value, str)}
+        guess = replace(guess, plane=guess.plane if len(planes) > 1 else None)
+    return replace(guess, names=names or tuple(_names_beside(guess, messages)))
 
 
 def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
@@ -268,7 +285,8 @@ def _guess(message: object) -> Guess | None:
     )
     if lists and (itself is None or (itself.polygon is None and not lists[0][0].is_plan)):
         best, path = lists[0]
-        return replace(best, objects=path, others=tuple(path for _, path in lists[1:]))
+        others = tuple(replace(guess, objects=path) for guess, path in lists[1:])
+        return replace(best, objects=path, others=others)
     return itself
 
 
@@ -301,6 +319,37 @@ def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -
         for path in paths:
             with suppress(FieldError):
                 yield from [walk(FieldPath.of(path), thing) for thing in _objects_in(guess, message)]
+
+
+def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> bool:
+    """Return whether most objects of the second list are where some of the first are.
+
+    Two lists then have the same objects, such as detections and tracks.
+    """
+    near = count = 0
+    with suppress(FieldError, TypeError):
+        for message in messages:
+            places = [_place_of(first, thing) for thing in _objects_in(first, message)]
+            for thing in _objects_in(second, message):
+                place = _place_of(second, thing)
+                count += 1
+                near += any(hypot(x - place[0], y - place[1]) < _SAME_PLACE for x, y, *_ in places)
+    return 2 * near > count
+
+
+_SAME_PLACE = 0.2
+"""Two objects in two lists are nearer only if they are one."""
+
+
+def _place_of(guess: Guess, thing: object) -> tuple[float, ...]:
+    """Return the position of an object, or the first number of its outline or bounds."""
+    if isinstance(guess.position, tuple):
+        return tuple(float(walk(FieldPath.of(path), thing)) for path in guess.position)  # type: ignore[arg-type]
+    if guess.position is not None:
+        return _point(walk(FieldPath.of(guess.position), thing)) or (inf, inf)
+    if guess.bounds is not None:
+        return _box_at(guess.bounds, thing) or (inf, inf)
+    return next(_corners_in(walk(FieldPath.of(str(guess.polygon)), thing)), (inf, inf))
 
 
 def _objects_in(guess: Guess, message: object) -> Iterator[object]:

@@ -42,7 +42,14 @@ from spatial_replay.mapping.message_types import (
     layout_of_topic,
     short_type,
 )
-from spatial_replay.mapping.object_fields import Guess, frame_of, guess_objects, signals_in, takes_turns
+from spatial_replay.mapping.object_fields import (
+    Guess,
+    frame_of,
+    guess_objects,
+    share_places,
+    signals_in,
+    takes_turns,
+)
 from spatial_replay.mapping.reading_plan import doubts_of
 from spatial_replay.mapping.trial import (
     FROM_NORTH,
@@ -65,6 +72,7 @@ _ONE_CLOCK_S, _EXACT_S = 5.0, 0.05
 """Stamps of one clock are recorded within this of each other; delays below the second do not matter."""
 _NO_TIMES: Mapping[str, Sequence[int]] = MappingProxyType({})
 _MOST_SIGNALS = 12
+_MOST_LISTS = 6
 _TEXTS = frozenset({"name", "label"})
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
 """Topics about programs rather than objects, by the last part of their names."""
@@ -92,6 +100,8 @@ class TopicSuggestion:
 
     Attributes:
         fields: its entry in a mapping, by key, in YAML's flow style; None if nothing looks like an object.
+        path: of the list of objects.
+        further: suggestions for further lists of objects in its messages.
         name: the template of its objects' names, by default or as in the entry.
         remarks: what a reader should know or change.
         is_transforms: whether it carries transforms. They are suggested as objects only if there are no
@@ -115,11 +125,20 @@ class TopicSuggestion:
     aside: str = ""
     layout: MessageLayout | None = None
     lateness_s: Floats | None = None
+    path: str = ""
+    further: tuple[TopicSuggestion, ...] = ()
 
     @property
     def entry(self) -> str:
         """The entry in YAML's flow style; empty if nothing looks like an object."""
-        return "" if self.fields is None else flow_text(self.fields)
+        entries = ", ".join(self.entries)
+        return f"[{entries}]" if self.further else entries
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The entry of each list of objects; none if nothing looks like one."""
+        suggestions = (self, *self.further)
+        return tuple(flow_text(part.fields) for part in suggestions if part.fields is not None)
 
     @property
     def signals(self) -> str:
@@ -141,15 +160,13 @@ def suggest_topics(
         examples: some decoded messages of each topic, by its name.
         times_ns: when each of these was recorded; by default, each second.
     """
-    return tuple(
-        _with_trial(
-            _suggestion(topic, messages),
-            messages,
-            times_ns.get(topic.name) or [second * 10**9 for second in range(len(messages))],
-        )
-        for topic in topics
-        for messages in [examples.get(topic.name, ())]
-    )
+    suggestions = []
+    for topic in topics:
+        messages = examples.get(topic.name, ())
+        times = times_ns.get(topic.name) or [second * 10**9 for second in range(len(messages))]
+        lists = [_with_trial(entry, messages, times) for entry in _suggestions(topic, messages)]
+        suggestions.append(_join_lists(lists))
+    return tuple(suggestions)
 
 
 def suggest_mapping(
@@ -225,7 +242,12 @@ def suggest_mapping(
 
 def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
     yield from (f"  # {text}" for text in (_description(suggestion.topic), *suggestion.remarks))
-    yield f"  {yaml_text(suggestion.topic.name)}: {suggestion.entry or suggestion.signals}"
+    topic = yaml_text(suggestion.topic.name)
+    if suggestion.further:
+        yield f"  {topic}:"
+        yield from (f"    - {entry}" for entry in suggestion.entries)
+    else:
+        yield f"  {topic}: {suggestion.entry or suggestion.signals}"
 
 
 def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
@@ -241,9 +263,13 @@ def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[s
 
 def _with_distinct_names(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
     """Return suggestions with the topic in those names that several topics share."""
-    shared = Counter(suggestion.name for suggestion in active)
+    lists = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in active}
+    shared = Counter(part.name for parts in lists.values() for part in parts)
     return [
-        _with_own_name(suggestion) if shared[suggestion.name] > 1 else suggestion for suggestion in active
+        _with_prefix(suggestion, _topic_words(suggestion.topic.name))
+        if any(shared[part.name] > 1 for part in lists[suggestion.topic.name])
+        else suggestion
+        for suggestion in active
     ]
 
 
@@ -251,13 +277,14 @@ def _with_frame_remark(suggestion: TopicSuggestion) -> TopicSuggestion:
     return suggestion if suggestion.frames else replace(suggestion, remarks=(*suggestion.remarks, _FRAMELESS))
 
 
-def _with_own_name(suggestion: TopicSuggestion) -> TopicSuggestion:
-    prefix = _topic_words(suggestion.topic.name)
+def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
+    """Return a suggestion with a word before the names of its objects."""
     name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
     fields = {**(suggestion.fields or {}), "name": yaml_text(name)}
     # of a list, its path comes first
     ordered = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
-    return replace(suggestion, fields=dict(ordered))
+    further = tuple(_with_prefix(part, prefix) for part in suggestion.further)
+    return replace(suggestion, fields=dict(ordered), name=name, further=further)
 
 
 def _with_trial(
@@ -354,37 +381,73 @@ def _axes_lines(axes: _Axes) -> Iterator[str]:
         yield "axes: {y: down}"
 
 
-def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
+def _suggestions(topic: Topic, examples: Sequence[object]) -> list[TopicSuggestion]:
+    """Return a suggestion for each list of objects in the messages of a topic; at least one."""
     is_ours = has_our_type(Channel(topic.name, topic.encoding, topic.schema))
     if is_ours or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
-        return TopicSuggestion(topic)
+        return [TopicSuggestion(topic)]
     kind = short_type(topic.type)
     if topic.unreadable is not None:
-        return TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
+        return [TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))]
     if kind in TRANSFORM_TYPES:
-        return _of_transforms(topic, examples)
+        return [_of_transforms(topic, examples)]
     if kind in BUILT_IN:
-        reading = BUILT_IN[kind]
-        has_outline = bool(reading.polygon or reading.sizes or reading.solids)
-        name = reading.name.replace("{topic}", name_from_topic(topic.name))
-        fields: Mapping[str, str] = {} if has_outline else _POINT
-        if reading.name == "{topic}" and takes_turns(_children(examples)):
-            # such as the odometry of several robots on one topic
-            name = "{child_frame_id}"
-            fields = {"name": yaml_text(name), **fields}
-        remarks = () if has_outline else _SIZELESS
-        if _is_by_place(topic, reading, examples):
-            remarks = (*remarks, BY_PLACE)
-        return _with_frames(topic, reading, examples, fields, name, remarks)
+        return [_of_known_type(topic, BUILT_IN[kind], examples)]
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
-        return TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())
+        return [TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())]
+    bodies = [other for other in guess.others if other.is_body and not share_places(guess, other, examples)]
+    lists = [replace(guess, others=tuple(other for other in guess.others if other not in bodies)), *bodies]
+    return [_of_guess(topic, guess, examples) for guess in lists[:_MOST_LISTS]]
+
+
+def _of_known_type(topic: Topic, reading: MessageLayout, examples: Sequence[object]) -> TopicSuggestion:
+    has_outline = bool(reading.polygon or reading.sizes or reading.solids)
+    name = reading.name.replace("{topic}", name_from_topic(topic.name))
+    fields: Mapping[str, str] = {} if has_outline else _POINT
+    if reading.name == "{topic}" and takes_turns(_children(examples)):
+        # such as the odometry of several robots on one topic
+        name = "{child_frame_id}"
+        fields = {"name": yaml_text(name), **fields}
+    remarks = () if has_outline else _SIZELESS
+    if _is_by_place(topic, reading, examples):
+        remarks = (*remarks, BY_PLACE)
+    return _with_frames(topic, reading, examples, fields, name, remarks)
+
+
+def _of_guess(topic: Topic, guess: Guess, examples: Sequence[object]) -> TopicSuggestion:
     name = _name(topic, guess)
     entry = TopicMapping(topic.name, objects=guess.objects, position=guess.position)
     layout = layout_of_topic(topic.type, entry)
     suggestion = _with_frames(topic, layout, examples, _fields(name, guess), name, _remarks(guess))
     aside = _OF_PLANS if guess.is_plan else ""
-    return replace(suggestion, axes="image" if guess.is_in_pixels else suggestion.axes, aside=aside)
+    axes = "image" if guess.is_in_pixels else suggestion.axes
+    return replace(suggestion, axes=axes, aside=aside, path=guess.objects or "")
+
+
+def _join_lists(lists: Sequence[TopicSuggestion]) -> TopicSuggestion:
+    """Return one suggestion for a topic, with the entries of further lists in its messages."""
+    first, *others = lists
+    further = [
+        suggestion
+        for suggestion in others
+        if not suggestion.aside and suggestion.axes == first.axes and suggestion.fields is not None
+    ]
+    if first.aside or not further:
+        return first
+    shared = Counter(suggestion.name for suggestion in (first, *further))
+    further = [
+        _with_prefix(suggestion, _topic_words(str(suggestion.path).removesuffix("[*]").replace(".", "/")))
+        if shared[suggestion.name] > 1
+        else suggestion
+        for suggestion in further
+    ]
+    return replace(
+        first,
+        further=tuple(further),
+        remarks=(*first.remarks, *(remark for suggestion in further for remark in suggestion.remarks)),
+        frames=first.frames.union(*(suggestion.frames for suggestion in further)),
+    )
 
 
 def _with_frames(
@@ -550,7 +613,8 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
     sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
     if guess.is_sizeless:
         sizeless = (f"its sizes are 0 in all messages looked at: {_RADIUS} is a guess",)
-    others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
+    paths = [str(other.objects) for other in guess.others[:6]]
+    others = (f"other lists that look like objects: {', '.join(paths)}",) if paths else ()
     if isinstance(guess.bounds, str) and "xy" not in guess.bounds:
         sizeless = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
     indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()

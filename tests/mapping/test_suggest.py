@@ -185,6 +185,25 @@ def test_sizes_that_are_never_set_are_no_sizes() -> None:
     assert "`shape: {polygon: footprint.points}` reads these" in suggested_for([{"objects": tracks}])[0]
 
 
+def test_each_list_of_objects_in_a_message_has_an_entry() -> None:
+    def thing(number: int, x: float, **more: Any) -> dict[str, Any]:
+        return {"id": number, "x": x, "y": 0.0, "length": 1.0, "width": 1.0, **more}
+
+    cars = [thing(1, 0.0), thing(2, 9.0)]
+    message = {"cars": cars, "walkers": [thing(1, 5.0, yaw=0.5)], "signs": [{"id": 4, "x": 1.0, "y": 2.0}]}
+    text = suggest_mapping("run", [Topic("/state", "own/State", "json")], {"/state": [message]})
+    lists = {topic.objects: topic.name for topic in parse_mapping(text).topics}
+    assert lists == {"cars[*]": "car{id}", "walkers[*]": "walker{id}"}
+    assert "other lists that look like objects: signs[*]" in text
+    # a list of the same objects is none of its own; lists of one name have that of what holds them
+    for other, names in (
+        ({"detections": cars, "tracks": cars}, ["detection{id}"]),
+        ({"left": {"tracks": cars}, "right": {"tracks": [thing(1, 30.0)]}}, ["track{id}", "right_track{id}"]),
+    ):
+        text = suggest_mapping("run", [Topic("/state", "own/State", "json")], {"/state": [other]})
+        assert sorted(str(topic.name) for topic in parse_mapping(text).topics) == sorted(names)
+
+
 def test_floors_are_named() -> None:
     def text(*levels: str) -> str:
         robots = [{"name": f"r{k}", "x": 1.0, "y": 2.0, "level_name": name} for k, name in enumerate(levels)]
