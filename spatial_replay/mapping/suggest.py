@@ -437,7 +437,7 @@ def _join_lists(lists: Sequence[TopicSuggestion]) -> TopicSuggestion:
         return first
     shared = Counter(suggestion.name for suggestion in (first, *further))
     further = [
-        _with_prefix(suggestion, _topic_words(str(suggestion.path).removesuffix("[*]").replace(".", "/")))
+        _with_prefix(suggestion, _topic_words(suggestion.path.rpartition(".")[0].replace(".", "/")))
         if shared[suggestion.name] > 1
         else suggestion
         for suggestion in further
