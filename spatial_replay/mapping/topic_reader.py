@@ -82,7 +82,7 @@ from spatial_replay.mapping.outlines import (
     outlines_from_lists,
     outlines_from_rings,
     points_from_lists,
-    rows_from_tuples,
+    read_rows,
 )
 from spatial_replay.mapping.reading_plan import PlannedTopic
 from spatial_replay.mapping.transforms import LEAST_STEP_NS, TransformReader
@@ -285,8 +285,7 @@ class Extractor:
                 chunk.corners[:, :2] = local_metres(fixes, self.layout.corner_origin)
         values = objects.values
         if binding.numbers is not None:
-            rows = map(binding.numbers, values)
-            chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+            chunk.numbers = read_rows(binding.numbers, values, binding.width, binding.style)
             self._forget_unset(binding, chunk.numbers, values)
             if self.layout.invalid:
                 chunk.numbers[np.isin(chunk.numbers, self.layout.invalid)] = nan
