@@ -123,6 +123,8 @@ class Extractor:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
         """Outlines with too few corners, whose objects are unknown."""
+        self.stamp_faults: list[str] = []
+        """Why fields that look like stamps are no times."""
         self.unset: Counter[str] = Counter()
         """Objects that do not set a field of protobuf, by its path."""
         self._scene_stamps_ns: dict[int, int] = {}
@@ -368,7 +370,7 @@ class Extractor:
 
     def _bind_time(self, example: object, message: object) -> None:
         if not self._is_time_bound:
-            self._time = bind_time(self.layout.stamp, example, message)
+            self._time = bind_time(self.layout.stamp, example, message, self.stamp_faults)
             self._is_time_bound = True
 
     def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
@@ -749,7 +751,7 @@ class TopicReader:
             if self.extractor is not None:
                 time_ns = self.extractor.stamp(message)
                 if self.extractor.lacks_stamp:
-                    raise self._misfit_error(_NO_STAMP)
+                    raise self._misfit_error(next(iter(self.extractor.stamp_faults), _NO_STAMP))
                 return time_ns
             if not self._is_time_bound:
                 entry = self.planned.mapping
