@@ -870,12 +870,8 @@ async def monitor(
             topic_timeout_s=topic_timeout_s,
             start_within_s=start_within_s,
         )
-        try:
-            async for update in session.updates():
-                yield update
-        finally:
-            # the log of a run that is left has its doubts, too
-            session.close()
+        async for update in session.updates():
+            yield update
         if session.failure is not None:
             raise session.failure
 

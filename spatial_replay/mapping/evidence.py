@@ -126,6 +126,9 @@ class Arrivals:
         self.longest_still_s, self.still_ns, self.stamps_vary = 0.0, 0, False
         self._first_log_ns = self._last_log_ns = self._first_publish_ns = 0
         self._publisher: int | None = None
+        self._waiting: list[tuple[Integers, ...]] = []
+        self._waiting_messages = 0
+        self._waiting_stamps: list[tuple[Integers, ...]] = []
         self._stamp_ns: int | None = None
         self._since_ns = 0
 
@@ -133,15 +136,37 @@ class Arrivals:
         """Add messages in the order of arrival, all (N,)."""
         if not len(times_ns):
             return
-        if self.first_ns is None or self.last_ns is None:
-            self.first_ns = self.last_ns = int(times_ns[0])
+        if self.first_ns is None:
+            self.first_ns = int(times_ns[0])
+        self.messages += len(times_ns)
+        self._waiting.append((times_ns, log_ns, publish_ns, channels))
+        self._waiting_messages += len(times_ns)
+        if self._waiting_messages >= _ROWS_AT_ONCE:
+            self.settle()
+
+    def settle(self) -> None:
+        """Measure the messages and stamps that wait."""
+        self._waiting_messages = 0
+        if self._waiting:
+            self._measure(*map(np.concatenate, zip(*self._waiting, strict=True)))
+            self._waiting = []
+        if self._waiting_stamps:
+            self._measure_stamps(*map(np.concatenate, zip(*self._waiting_stamps, strict=True)))
+            self._waiting_stamps = []
+
+    def _measure(
+        self, times_ns: Integers, log_ns: Integers, publish_ns: Integers, channels: Integers
+    ) -> None:
+        is_first = self.last_ns is None
+        if self.last_ns is None:
+            self.last_ns = int(times_ns[0])
             self._first_log_ns, self._first_publish_ns = int(log_ns[0]), int(publish_ns[0])
             self._publisher = int(channels[0])
             self.publishers.add(self._publisher)
         self.log_varies = self.log_varies or bool((log_ns != self._first_log_ns).any())
         self.publish_varies = self.publish_varies or bool((publish_ns != self._first_publish_ns).any())
         since = np.append(self.last_ns, times_ns)
-        passed = slice(0 if self.messages else 1, None)
+        passed = slice(int(is_first), None)
         self.period_s.add(np.diff(since)[passed] / 1e9, times_ns[passed])
         log_since = np.append(self._last_log_ns, log_ns)
         self.log_period_s.add(np.diff(log_since)[passed] / 1e9)
@@ -152,11 +177,13 @@ class Arrivals:
                 self.returns += channel in self.publishers
                 self.publishers.add(channel)
         self._publisher = int(channels[-1])
-        self.messages += len(times_ns)
         self.last_ns = int(times_ns[-1])
 
     def add_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
         """Add the stamps of some messages, in order, and when these were recorded."""
+        self._waiting_stamps.append((stamps_ns, log_ns))
+
+    def _measure_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
         is_set = stamps_ns != 0
         stamps_ns, log_ns = stamps_ns[is_set], log_ns[is_set]
         if not len(stamps_ns):
@@ -271,8 +298,11 @@ class Motions:
         if distance[at] > (self.jump.amount if self.jump is not None else 0.0):
             self.jump = Moment(self._name(later[at]), int(times_ns[at]), float(distance[at]))
             self.jump_s = float(seconds[at])
+        moves = (distance > 0) & np.isfinite(later[:, _TURN])
+        if not moves.any():
+            return
         # noise has no course, so short steps are left out
-        moves = (distance >= self.speed.median / 2 * seconds) & (distance > 0) & np.isfinite(later[:, _TURN])
+        moves &= distance >= self.speed.median / 2 * seconds
         if not moves.any():
             return
         course = np.arctan2(step[moves, 1], step[moves, 0])
@@ -296,6 +326,9 @@ class Motions:
         leap = np.hypot(gone[:, 0], gone[:, 1])
         took = np.diff(reports[:, _SECONDS], prepend=0.0)
         leap = np.where(leap > np.fmax(reports[:, _SIZE], 0.0), leap, 0.0)
+        self.chances += int(np.count_nonzero((after > 1) & (name[after] == name[after - 2])))
+        if not leap[after].any():
+            return
         least, is_back = leap[after], np.zeros(len(after), np.bool_)
         for steps in range(2, _MOST_LEAPS + 1):
             before = np.maximum(after - steps, 0)
@@ -303,8 +336,6 @@ class Motions:
             apart = place[after] - place[before]
             is_same = (name[before] == name[after]) & (after >= steps)
             is_back |= is_same & (np.hypot(apart[:, 0], apart[:, 1]) < least / 4)
-            if steps == 2:
-                self.chances += int(np.count_nonzero(is_same & np.isfinite(leap[after])))
         is_slow = is_back & (took[after] >= 1.0) & (leap[after] < _FAST * took[after])
         self.returns += int(np.count_nonzero(is_back))
         self.slow_returns += int(np.count_nonzero(is_slow))
@@ -496,7 +527,8 @@ class TopicEvidence:
             self._measure_signals()
 
     def settle(self) -> None:
-        """Measure the objects and signals that wait, after the last of them."""
+        """Measure all that waits, after the last of it."""
+        self.arrivals.settle()
         self._measure()
         self._measure_signals()
         self._measure_motions(self._reports_rows)

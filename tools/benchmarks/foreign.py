@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from spatial_replay.mapping.evidence import Arrivals, TopicEvidence
 from spatial_replay.sources.open_log import open_source
 
 SECOND = 1_000_000_000
@@ -144,6 +146,48 @@ def bench_foreign_reading(measure: Any) -> None:
                 limit_s=bare_s / SHARE,
                 reference_s=bare_s,
             )
+
+
+@contextmanager
+def _unmeasured() -> Iterator[None]:
+    """Read without evidence: its methods do nothing."""
+    methods = [(Arrivals, "add"), (Arrivals, "add_stamps")]
+    methods += [(TopicEvidence, name) for name in ("add_objects", "add_signals", "settle")]
+    replaced = [(owner, name, getattr(owner, name)) for owner, name in methods]
+    try:
+        for owner, name in methods:
+            setattr(owner, name, lambda *_: None)
+        yield
+    finally:
+        for owner, name, method in replaced:
+            setattr(owner, name, method)
+
+
+def bench_foreign_evidence(measure: Any) -> None:
+    """Reading with evidence beside reading without, in processor time: the median of pairs."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        ros, protobuf = folder / "ros.yaml", folder / "protobuf.yaml"
+        ros.write_text(ROS_MAPPING)
+        protobuf.write_text(PROTOBUF_MAPPING)
+        logs = (
+            ("ROS 2 MCAP, poses", _write_ros2(folder / "mcap", StoragePlugin.MCAP), ros),
+            ("protobuf MCAP, lists", _write_protobuf(folder / "a.mcap"), protobuf),
+        )
+        for kind, path, mapping in logs:
+            _mapped(path, mapping)
+            ratios = []
+            for _ in range(7):
+                with _unmeasured():
+                    without_s = _processor_s(path, mapping)
+                ratios.append(_processor_s(path, mapping) / without_s)
+            measure.ratio(kind, statistics.median(ratios), 1.1)
+
+
+def _processor_s(path: Path, mapping: Path) -> float:
+    start = time.process_time()
+    _mapped(path, mapping)
+    return time.process_time() - start
 
 
 def _write_large(path: Path, size: int) -> Path:
