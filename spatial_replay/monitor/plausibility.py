@@ -132,7 +132,7 @@ class LogNumbers:
         )
         self._ranges = {
             _key(each, bound): ThresholdRange(each, bound)
-            for each, bound in _bound_nodes(specification)
+            for each, bound in bound_nodes(specification)
             if isinstance(each, Atom) and _compared(each) is not None
         }
 
@@ -166,7 +166,7 @@ class LogNumbers:
             number = replace(seen.atom, expression=_compared(seen.atom) or seen.atom.expression)
             # one by one, so that each has as many bindings as in a replay
             least, greatest, all_hold, any_holds = (
-                leaf_values(scene, [_over(quantifier, seen.bound, atom)], {})[:, 0]
+                leaf_values(scene, [over_bindings(quantifier, seen.bound, atom)], {})[:, 0]
                 for atom in (number, seen.atom)
                 for quantifier in ("forall", "exists")
             )
@@ -219,7 +219,7 @@ def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
     if log.rate is None:
         return []
     lines: dict[str, None] = {}
-    for node, _ in _bound_nodes(specification):
+    for node, _ in bound_nodes(specification):
         bound = node.bound if isinstance(node, Temporal) else None
         if bound is not None and bound.unit == "samples":
             upper = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
@@ -274,7 +274,7 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
             )
             hint = "atoms about it are unknown there, and so may be a verdict"
             found[part.shown] = source.diagnostic("warning", span, message, hint)
-    for node, bound in _bound_nodes(specification):
+    for node, bound in bound_nodes(specification):
         doubts: Iterator[tuple[str, str]] = iter(())
         key = ""
         if isinstance(node, Atom):
@@ -376,7 +376,7 @@ def _key(atom: Atom, bound: tuple[Quantified, ...]) -> tuple[str, ...]:
     return (atom.text, *(f"{each.variables} {each.group}" for each in bound))
 
 
-def _over(
+def over_bindings(
     quantifier: Literal["forall", "exists"], bound: tuple[Quantified, ...], atom: Atom
 ) -> Atom | Quantified:
     """Return an atom for all objects that its variables may stand for, or for some."""
@@ -386,7 +386,7 @@ def _over(
     return formula
 
 
-def _bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
+def bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
     """Yield every node, with the quantifiers that bind variables of it, from the outside in."""
     for spec in specification.results:
         for node, around in iter_bound(spec.formula):

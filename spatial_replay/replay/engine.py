@@ -45,6 +45,7 @@ from spatial_replay.logs.messages import (
 )
 from spatial_replay.monitor.departures import Departure, Departures
 from spatial_replay.monitor.doubtful import doubts_of_instances
+from spatial_replay.monitor.heights import HeightComparisons
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stillness import Stillness
@@ -212,6 +213,7 @@ class Replay:
         self._images: set[str] = set()
         self._names = LogNames()
         self._stillness = Stillness()
+        self._heights = HeightComparisons(self.files)
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
         self._start_ns, self._is_beside = LATEST_NS, False
@@ -330,6 +332,7 @@ class Replay:
         self._faults += trace.faults
         self._names.add(trace)
         self._stillness.add(trace)
+        self._heights.add(trace)
         for departures in self._departures:
             departures.add(trace)
         own = trace.without_filling()
@@ -379,6 +382,7 @@ class Replay:
                 *self._empty_ends(first_ns),
                 *(departure.message for departure in left),
                 *self._stillness.remarks(),
+                *counted_from(self._heights.remarks(), first_ns),
             ),
             missing=missing,
             dropped=dropped,

@@ -470,3 +470,39 @@ def test_an_object_that_never_changes_by_a_bit_while_its_kind_moves_is_remarked(
     assert run(["replay", "still.jsonl", "--spec", "G (stuck dist stuck <= 1)"]) == 0
     said = "stuck never changes by a bit in 30 reports, while all other objects"
     assert (said in capsys.readouterr().err) is is_remarked
+
+
+@pytest.mark.parametrize(
+    ("bottom", "formula", "is_remarked"),
+    [
+        (0.05, "G (robot dist zone >= 0.03)", True),
+        (0.05, "G (forall r in class robot: r farfrom[0.03] zone)", True),
+        (0.05, "G not (robot ovlp zone)", True),
+        # too near also in space, apart also from above, and on one level
+        (0.05, "G (robot dist zone >= 0.21)", False),
+        (0.05, "G (robot dist post >= 0.2)", False),
+        (0.0, "G (robot dist zone >= 0.03)", False),
+    ],
+)
+def test_a_comparison_that_heights_decide_is_remarked(
+    folder: Path, capsys: pytest.CaptureFixture[str], bottom: float, formula: str, is_remarked: bool
+) -> None:
+    def box(name: str, x: float, low: float, high: float) -> dict[str, object]:
+        corners = [[x - 0.5, -0.5], [x + 0.5, -0.5], [x + 0.5, 0.5], [x - 0.5, 0.5]]
+        return {"name": name, "class": name, "polygon": corners, "height": [low, high]}
+
+    samples = [
+        {
+            "time_ns": k * 10**8,
+            "objects": [
+                box("robot", k / 10, bottom, 0.5),
+                box("zone", 2.0, 0.0, 0.01),
+                box("post", 9.0, 0.0, 2.0),
+            ],
+        }
+        for k in range(30)
+    ]
+    (folder / "heights.jsonl").write_text("\n".join(map(json.dumps, samples)))
+    run(["replay", "heights.jsonl", "--spec", formula])
+    said = "because of heights: seen from above it"
+    assert (said in capsys.readouterr().err) is is_remarked

@@ -1,0 +1,113 @@
+"""Comparisons of distances that heights decide: one object is above another, and not beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.plausibility import bound_nodes, over_bindings
+from spatial_replay.spec.formula import Atom, Outline, Quantified, SignedDistance, Specification
+from spatial_replay.spec.walks import iter_expressions, looks_back, terms_of
+from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.trace.trace import Trace
+
+_MOST_SAMPLES: Final = 64
+"""Samples of a block to compare, spread over those in which one object may be above another."""
+
+
+@dataclass(slots=True)
+class _Comparison:
+    """A comparison of a distance, and in how many samples heights decide it.
+
+    Attributes:
+        holds: whether it holds in the first of them, which is at `first_ns`.
+    """
+
+    atom: Atom
+    bound: tuple[Quantified, ...]
+    first_ns: int = 0
+    holds: bool = False
+    count: int = 0
+    compared: int = 0
+
+
+class HeightComparisons:
+    """Comparisons whose truth is another one seen from above, collected block by block."""
+
+    def __init__(self, specifications: Sequence[Specification]) -> None:
+        """Start before the first sample."""
+        self._comparisons = [
+            (specification, list(_comparisons_of(specification))) for specification in specifications
+        ]
+
+    def add(self, trace: Trace) -> None:
+        """Add the next samples."""
+        for specification, comparisons in self._comparisons:
+            samples = _samples_with_one_above(trace, specification) if comparisons else np.empty(0, np.int64)
+            if not len(samples):
+                continue
+            trace_then = trace.take(samples[:: 1 + len(samples) // _MOST_SAMPLES]).compact()
+            scenes = (
+                TraceScene(trace_then, specification.regions),
+                TraceScene(_without_heights(trace_then), _flat(specification)),
+            )
+            for comparison in comparisons:
+                formula = over_bindings("forall", comparison.bound, comparison.atom)
+                in_space, from_above = (leaf_values(scene, [formula], {})[0, 0] >= 0 for scene in scenes)
+                differing = np.flatnonzero(in_space != from_above)
+                comparison.compared += len(in_space)
+                if len(differing) and not comparison.count:
+                    comparison.first_ns = int(trace_then.times_ns[differing[0]])
+                    comparison.holds = bool(in_space[differing[0]])
+                comparison.count += len(differing)
+
+    def remarks(self) -> Iterator[Sentence]:
+        """Yield a sentence on each comparison that heights decide."""
+        for comparison in (comparison for _, listed in self._comparisons for comparison in listed):
+            if comparison.count:
+                holds, not_so = ("holds", "does not") if comparison.holds else ("fails", "holds")
+                share = f"in {comparison.count:,} of {counted(comparison.compared, 'sample')} looked at"
+                yield Sentence(
+                    f"`{comparison.atom.text}` {holds} at ",
+                    Instant(comparison.first_ns, 0),
+                    f" because of heights: seen from above it {not_so} ({share})",
+                )
+
+
+def _comparisons_of(specification: Specification) -> Iterator[_Comparison]:
+    comparisons: dict[str, _Comparison] = {}
+    for node, bound in bound_nodes(specification):
+        parts = list(iter_expressions(node.expression)) if isinstance(node, Atom) else []
+        has_distance = any(isinstance(part, SignedDistance) for part in parts)
+        if isinstance(node, Atom) and has_distance and not any(map(looks_back, terms_of(node.expression))):
+            comparisons.setdefault(node.text, _Comparison(node, bound))
+    yield from comparisons.values()
+
+
+def _samples_with_one_above(trace: Trace, specification: Specification) -> Integers:
+    """Return the samples in which an object, or a region, is wholly above another."""
+    batch = trace.footprints
+    if not len(batch.bottom) or np.isnan(batch.bottom).all():
+        return np.empty(0, np.int64)
+    rows = np.where(trace.rows >= 0, trace.rows, len(batch.bottom))
+    heights = [outline.height for outline in specification.regions.values() if outline.height is not None]
+    highest = np.append(np.where(np.isnan(batch.bottom), -np.inf, batch.bottom), -np.inf)[rows].max(axis=1)
+    lowest = np.append(np.where(np.isnan(batch.top), np.inf, batch.top), np.inf)[rows].min(axis=1)
+    highest = np.maximum(highest, max((bottom for bottom, _ in heights), default=-np.inf))
+    lowest = np.minimum(lowest, min((top for _, top in heights), default=np.inf))
+    return np.flatnonzero(highest > lowest)
+
+
+def _without_heights(trace: Trace) -> Trace:
+    none = np.full(len(trace.footprints.bottom), np.nan)
+    return replace(trace, footprints=replace(trace.footprints, bottom=none, top=none))
+
+
+def _flat(specification: Specification) -> dict[str, Outline]:
+    return {name: replace(outline, height=None) for name, outline in specification.regions.items()}
