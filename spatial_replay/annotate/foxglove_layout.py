@@ -431,15 +431,17 @@ _Details = list[tuple[str, Panel]]
 
 def _details(contents: LayoutContents) -> _Details:
     """Return the panels that are in tabs, those of violations first."""
-    trees, planned_for = contents.trees, contents.planned_for
+    trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
+    # the seconds in both tables are not those of the axes
+    clock = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
     shown = list[tuple[str, str, str, str]]()
     if trees:
-        shown.append(("violated", "Table!violated", "Violated results", f"{STANDING}.violated"))
+        shown.append(("violated", "Table!violated", f"Violated results{clock}", f"{STANDING}.violated"))
     if trees and RECENT_EVENTS in contents.topics:
-        shown.append(("events", "Table!events", "Events", f"{RECENT_EVENTS}.events"))
+        shown.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
     if trees:
         sources = f"{SPECIFICATION}.files[:].source"
-        title = "Specification" if contents.zero is None else f"Specification; {contents.zero}"
+        title = "Specification" if zero is None else f"Specification; {zero}"
         shown.append(("specification", "RawMessages!specification", title, sources))
     if any(contents.has_states):
         title = trees[contents.has_states.index(True)].title

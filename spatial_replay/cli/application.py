@@ -138,8 +138,8 @@ class LazyCommands(click.Group):
 @click.group(
     cls=LazyCommands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Exit codes: 0 satisfied, 1 violated, 4 unknown or untested; 2 usage error or invalid "
-    "specification, 3 damaged log, 70 internal or system error, 130 interrupted.",
+    epilog="Exit codes: 0 satisfied, 1 violated, 4 unknown, untested or doubtful; 2 usage error or "
+    "invalid specification, 3 damaged log, 70 internal or system error, 130 interrupted.",
 )
 @click.version_option(__version__, "-V", "--version", prog_name=PROGRAM, message="%(prog)s %(version)s")
 def application() -> None:

@@ -284,7 +284,10 @@ def _compare_with_log(
     missing = sum(diagnostic.severity == "error" for diagnostic in unknown)
     if not strict_names:
         unknown = tuple(replace(diagnostic, severity="warning") for diagnostic in unknown)
-    doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source, ends, zero_ns))
+    doubtful = (
+        *plausibility_warnings(specification, numbers, zero_ns),
+        *evaluation.warnings(source, ends, zero_ns),
+    )
     counts = [counted(missing, "name") + " that it never has"] if missing else []
     others = len(unknown) - missing + len(doubtful)
     counts += [counted(others, "other warning" if missing else "warning")] if others else []
@@ -381,7 +384,8 @@ def _document(
         "thresholds": [
             {
                 "atom": atom_range.atom.text,
-                **json_fields(atom_range, "objects", "known", "holding", "failing", "least", "greatest"),
+                **json_fields(atom_range, "objects", "known", "holding", "failing", "empty"),
+                **json_fields(atom_range, "least", "greatest"),
                 **({} if atom_range.least <= atom_range.greatest else {"least": None, "greatest": None}),
             }
             for atom_range in compared.ranges

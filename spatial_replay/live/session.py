@@ -870,8 +870,12 @@ async def monitor(
             topic_timeout_s=topic_timeout_s,
             start_within_s=start_within_s,
         )
-        async for update in session.updates():
-            yield update
+        try:
+            async for update in session.updates():
+                yield update
+        finally:
+            # the log of a run that is left has its doubts, too
+            session.close()
         if session.failure is not None:
             raise session.failure
 

@@ -689,8 +689,13 @@ def _frame(
     return None
 
 
-def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> TimeGetter | None:
+def bind_time(
+    stamps: Sequence[Stamp], example: object, message: object, faults: list[str] | None = None
+) -> TimeGetter | None:
     """Bind the first stamp that exists and is a time; None if none does.
+
+    Args:
+        faults: gets why those that exist are no times, if there are several.
 
     Raises:
         FieldError: the only stamp does not exist, or is not a time.
@@ -702,9 +707,11 @@ def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> Time
             continue
         try:
             return _time_getter(stamp, path, root)
-        except FieldError:
+        except FieldError as error:
             if len(stamps) == 1:
                 raise
+            if faults is not None:
+                faults.append(str(error))
     return None
 
 

@@ -1,13 +1,14 @@
 """Outlines in messages: lists of corners, or rings with holes, in; corners in columns out.
 
-Rings are those of GeoJSON (RFC 7946: an outer ring, then holes, in a list; a `MultiPolygon` lists polygons),
-or of a message with the fields `outer` and `inner`, such as polygon_msgs/ComplexPolygon2D.
+Rings are those of GeoJSON (RFC 7946): a list of an outer ring and holes; a `MultiPolygon` lists polygons.
+polygon_msgs/ComplexPolygon2D has them in the fields `outer` and `inner`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from itertools import chain
 from typing import Any
 
@@ -19,6 +20,7 @@ from spatial_replay.geometry.outline import convex_pieces
 from spatial_replay.mapping.field_paths import (
     ContentError,
     FieldPath,
+    Get,
     Style,
     field_names,
     get_field,
@@ -75,7 +77,7 @@ def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     if "x" in names and "y" in names:
         axes = "xyz" if "z" in names else "xy"
         get = tuple_getter([FieldPath.of(axis) for axis in axes], example)
-        rows = rows_from_tuples(map(get, flat), len(flat), len(axes), style_of(example))
+        rows = read_rows(get, flat, len(axes), style_of(example))
         return counts, rows if len(axes) == 3 else np.column_stack([rows, np.zeros(len(flat))])
     if example is None or hasattr(example, "__len__"):
         pairs = np.array([(point[0], point[1]) for point in flat], np.float64).reshape(-1, 2)
@@ -86,16 +88,19 @@ def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     return counts // 2, np.column_stack([pairs, np.zeros(len(pairs))])
 
 
-def rows_from_tuples(tuples: Iterable[Sequence[Any]], count: int, width: int, style: Style) -> Floats:
-    """Return the numbers (count, width) in tuples, NaN for the null of JSON."""
-    if style == "keys":
-        return np.array(list(tuples), np.float64).reshape(count, width)
-    rows = list(tuples)
-    try:
-        # faster, but it does not take None, for an element that a list lacks
-        return np.fromiter(chain.from_iterable(rows), np.float64, count * width).reshape(count, width)
-    except TypeError:
-        return np.array(rows, np.float64).reshape(count, width)
+def read_rows(get: Get, things: Sequence[object], width: int, style: Style) -> Floats:
+    """Return the numbers (N, width) of things, NaN for the null of JSON and for what a list lacks.
+
+    Args:
+        get: returns the numbers of one thing.
+    """
+    count = len(things)
+    if style == "attributes":
+        # faster than a list of tuples, but it does not take None
+        with suppress(TypeError):
+            numbers = chain.from_iterable(map(get, things))
+            return np.fromiter(numbers, np.float64, count * width).reshape(count, width)
+    return np.array(list(map(get, things)), np.float64).reshape(count, width)
 
 
 def features_in(message: object) -> dict[str, object]:

@@ -82,7 +82,7 @@ from spatial_replay.mapping.outlines import (
     outlines_from_lists,
     outlines_from_rings,
     points_from_lists,
-    rows_from_tuples,
+    read_rows,
 )
 from spatial_replay.mapping.reading_plan import PlannedTopic
 from spatial_replay.mapping.transforms import LEAST_STEP_NS, TransformReader
@@ -123,6 +123,8 @@ class Extractor:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
         """Outlines with too few corners, whose objects are unknown."""
+        self.stamp_faults: list[str] = []
+        """Why fields that look like stamps are no times."""
         self.unset: Counter[str] = Counter()
         """Objects that do not set a field of protobuf, by its path."""
         self._scene_stamps_ns: dict[int, int] = {}
@@ -285,8 +287,7 @@ class Extractor:
                 chunk.corners[:, :2] = local_metres(fixes, self.layout.corner_origin)
         values = objects.values
         if binding.numbers is not None:
-            rows = map(binding.numbers, values)
-            chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+            chunk.numbers = read_rows(binding.numbers, values, binding.width, binding.style)
             self._forget_unset(binding, chunk.numbers, values)
             if self.layout.invalid:
                 chunk.numbers[np.isin(chunk.numbers, self.layout.invalid)] = nan
@@ -369,7 +370,7 @@ class Extractor:
 
     def _bind_time(self, example: object, message: object) -> None:
         if not self._is_time_bound:
-            self._time = bind_time(self.layout.stamp, example, message)
+            self._time = bind_time(self.layout.stamp, example, message, self.stamp_faults)
             self._is_time_bound = True
 
     def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
@@ -750,7 +751,7 @@ class TopicReader:
             if self.extractor is not None:
                 time_ns = self.extractor.stamp(message)
                 if self.extractor.lacks_stamp:
-                    raise self._misfit_error(_NO_STAMP)
+                    raise self._misfit_error(next(iter(self.extractor.stamp_faults), _NO_STAMP))
                 return time_ns
             if not self._is_time_bound:
                 entry = self.planned.mapping

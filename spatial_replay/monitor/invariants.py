@@ -158,7 +158,7 @@ class _Invariant(NamedTuple):
 def _intervals_of(
     evidence: Evidence, done: OfflineNodes, invariant: _Invariant, most: int
 ) -> ViolatedInvariant:
-    begins, ends = windows_of(invariant.operator, done.times_ns)
+    begins, ends = windows_of(invariant.operator, done.times_ns, np.array([0]))
     is_asked = np.zeros(len(done.times_ns), np.bool_)
     is_asked[begins[0] : ends[0]] = True
     low, high = done.judged_ends(invariant.operand)

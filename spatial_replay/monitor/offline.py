@@ -481,20 +481,27 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
     return np.arange(count) < bisect_left(times_ns, span_ns + 1)
 
 
-def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integers]:
-    """Return the first sample (T,) in an operator's window at each sample, and the one after the last."""
+def windows_of(
+    formula: Temporal, times_ns: Integers, samples: Integers | None = None
+) -> tuple[Integers, Integers]:
+    """Return the first sample (T,) in an operator's window at each sample, and the one after the last.
+
+    Args:
+        samples: indices of those whose windows are wanted; None for all.
+    """
     count = len(times_ns)
-    here = np.arange(count, dtype=np.int64)
+    indices = np.arange(count, dtype=np.int64)
     is_ahead = formula.operator in FUTURE_OPERATORS
     bound = formula.bound or Bound(0, None, "samples")
     if formula.operator in ("X", "WX", "Y"):
         bound = Bound(1, 1, "samples")
     # as distances from the first sample, and no further than the last: sums stay below 64 bits
-    places = here if bound.unit == "samples" else times_ns - times_ns[0]
+    places = indices if bound.unit == "samples" else times_ns - times_ns[0]
     furthest = int(places[-1]) + 1
     near = min(bound.lower, furthest)
     far = furthest if bound.upper is None else min(bound.upper, furthest)
-    low, high = (places + near, places + far) if is_ahead else (places - far, places - near)
+    own = places if samples is None else places[samples]
+    low, high = (own + near, own + far) if is_ahead else (own - far, own - near)
     if bound.unit == "samples":
         return np.clip(low, 0, count), np.clip(high + 1, 0, count)
     begin = np.searchsorted(places, low, side="left").astype(np.int64)

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.atoms.terms import TraceScene, look_back, tail
 from spatial_replay.monitor.witness.evidence import NamedPart, is_missing, named_parts
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import format_bound, format_number, format_term
@@ -58,6 +58,7 @@ class ThresholdRange:
             if it is never known, or a text.
         known, holding, failing: samples in which it is known, in which the atom holds, and in which it fails,
             whatever objects the variables stand for.
+        empty: samples in which no object is in the groups of the variables, so that it holds for all.
         samples: how many there are.
     """
 
@@ -68,6 +69,7 @@ class ThresholdRange:
     known: int = 0
     holding: int = 0
     failing: int = 0
+    empty: int = 0
     samples: int = 0
 
     @property
@@ -91,16 +93,26 @@ class ThresholdRange:
         """The atom, and what its variables stand for."""
         return self.atom.text if self.objects is None else f"{self.atom.text} for {self.objects}"
 
+    @property
+    def _words_of_empty(self) -> str:
+        """What it is where its groups are empty."""
+        quantifiers = {quantified.quantifier for quantified in self.bound}
+        if len(quantifiers) > 1:
+            return "has no object"
+        return f"has no object, and so is {'-inf' if quantifiers == {'exists'} else '+inf'},"
+
     def __str__(self) -> str:
-        if not self.known:
-            return f"{self.text}: {'without an object or ' if self.bound else ''}unknown in every sample"
         is_number = self.least <= self.greatest
         parts = [f"goes from {self.least:.4g} to {self.greatest:.4g}"] if is_number else []
-        if unknown := self.samples - self.known:
-            parts.append(f"is unknown in {unknown:,} of {counted(self.samples, 'sample')}")
+        unknown = self.samples - self.known - self.empty
+        for count, words in ((unknown, "is unknown"), (self.empty, self._words_of_empty)):
+            share = f"{count:,} of {counted(self.samples, 'sample')}"
+            parts += [f"{words} in {'every sample' if count == self.samples else share}"] if count else []
+        if not self.known:
+            return f"{self.text}: {', '.join(parts)}"
         samples = counted(self.known, "sample")
         if self.holds != "sometimes":
-            parts.append(f"{self.holds} holds{' in the others' if unknown else ''}")
+            parts.append(f"{self.holds} holds{' in the others' if unknown or self.empty else ''}")
         elif self.bound:
             parts.append(f"holds for all in {self.holding:,} and for none in {self.failing:,} of {samples}")
         else:
@@ -125,6 +137,8 @@ class LogNumbers:
         self._pauses = Pauses()
         self.times_ns = (0, 0)
         self._regions = specification.regions
+        self._reach = look_back([spec.formula for spec in specification.results])
+        self._past: Trace | None = None
         # by part: how many samples lack it, and the first of them
         self.missing: dict[NamedPart, tuple[int, int]] = {}
         self._parts = list(
@@ -161,7 +175,10 @@ class LogNumbers:
         self._add_ranges(trace)
 
     def _add_ranges(self, trace: Trace) -> None:
-        scene = TraceScene(trace, self._regions)
+        past = None if self._past is None or not self._reach else tail(self._past, self._reach)
+        around = trace if past is None else Trace.concatenate([past, trace])
+        self._past = around
+        scene = TraceScene(around, self._regions, len(around) - len(trace))
         for key, seen in self._ranges.items():
             number = replace(seen.atom, expression=_compared(seen.atom) or seen.atom.expression)
             # one by one, so that each has as many bindings as in a replay
@@ -175,8 +192,9 @@ class LogNumbers:
             known = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
             for ends in (all_hold, any_holds) if is_text else (least, greatest):
                 known &= ends[0] == ends[min(1, len(ends) - 1)]
-            if not known.any():
-                continue
+            # `forall` of nothing is +inf, `exists` -inf
+            is_empty = (all_hold == np.inf).all(axis=0) & (any_holds == -np.inf).all(axis=0)
+            known &= ~is_empty
             numbers = known & (not is_text)
             self._ranges[key] = replace(
                 seen,
@@ -185,6 +203,7 @@ class LogNumbers:
                 known=seen.known + int(known.sum()),
                 holding=seen.holding + int((all_hold[0, known] >= 0.0).sum()),
                 failing=seen.failing + int((any_holds[0, known] < 0.0).sum()),
+                empty=seen.empty + int(is_empty.sum()),
             )
 
     @property
@@ -251,8 +270,14 @@ def _nested(windows: _Windows) -> str:
     return " of ".join(f"{node.operator}{format_bound(bound)}" for node, bound in windows)
 
 
-def plausibility_warnings(specification: Specification, log: LogNumbers) -> tuple[Diagnostic, ...]:
-    """Return a warning for each region, number and window that hardly fits what the log holds."""
+def plausibility_warnings(
+    specification: Specification, log: LogNumbers, zero_ns: int
+) -> tuple[Diagnostic, ...]:
+    """Return a warning for each region, number and window that hardly fits what the log holds.
+
+    Args:
+        zero_ns: the time that texts count from.
+    """
     source = SourceText.of(specification.source, specification.filename)
     found: dict[str, Diagnostic] = {}
     for name, outline in specification.regions.items():
@@ -268,7 +293,7 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
         span = next(each.span for each in named if part in named_parts(each))
         # one that the log never has is an error of names
         if count < log.samples:
-            at = time_text(first_ns, log.times_ns[0])
+            at = time_text(first_ns, zero_ns)
             message = (
                 f"{part.shown} is missing in {count:,} of {counted(log.samples, 'sample')}, first at {at}"
             )

@@ -332,7 +332,7 @@ class SpecResult(Displayed):
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
 
-        Its columns are `seconds` since the first sample evaluated, and for each node `NAME value`, `NAME
+        Its columns are `seconds` since the log's first sample, and for each node `NAME value`, `NAME
         now`, `NAME lower` and `NAME upper`. NAME is the spec's name, or else the node's id and text.
 
         Raises:

@@ -329,7 +329,7 @@ def _of_result(result: SpecResult) -> Any:
         raise UsageError(
             f"the numbers of each sample of {result.title!r} were not kept; evaluate() keeps them"
         )
-    columns = {"seconds": (result.times_ns - result.times_ns[:1]) / 1e9}
+    columns = {"seconds": (result.times_ns - result.evidence.first_ns()) / 1e9}
     names = [node.name or f"{node.id}: {node.text}" for node in result.nodes]
     for name, node in zip(names, result.nodes, strict=True):
         title = name if names.count(name) == 1 else f"{node.id}: {name}"
@@ -391,7 +391,7 @@ def _first_satisfied_text(result: SpecResult) -> str:
     if result.verdict is Verdict.UNKNOWN:
         return "not known"
     at_ns = result.first_satisfied_ns
-    return "never" if at_ns is None else f"{(at_ns - int(result.times_ns[0])) / 1e9:.3f} s"
+    return "never" if at_ns is None else time_text(at_ns, result.evidence.first_ns())
 
 
 def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
@@ -475,7 +475,7 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
         UsageError: matplotlib is not installed.
     """
     ax = new_panel((_WIDTH, 0.4 + _HEIGHT)) if ax is None else ax
-    seconds = (result.times_ns - result.times_ns[0]) / 1e9
+    seconds = (result.times_ns - result.evidence.first_ns()) / 1e9
     curves = _curves(result)
     low, high = _limits([curve.values for curve in curves])
     _, _, lower, upper = result.series[0]

@@ -268,7 +268,7 @@ def draw_runs(diff: LogDiff) -> tuple[Axes, ...]:
 
 def _before_and_after(diff: SpecDiff, names: tuple[str, str]) -> _Pair:
     results = diff.old, diff.new
-    first_ns = diff.old.times_ns[0] if len(diff.old.times_ns) else 0
+    first_ns = diff.old.evidence.first_ns()
     old_s, new_s = ((result.times_ns - first_ns) / 1e9 for result in results)
     return _Pair(diff.title, names, (old_s, new_s), (diff.old.series[0, 0], diff.new.series[0, 0]))
 

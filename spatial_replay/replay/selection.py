@@ -495,10 +495,13 @@ class Selection:
         if not spans:
             return LogError("; ".join([f"{name} has no sample", *faults[:1]]))
         first_ns, last_ns = spans[0][0], spans[-1][1]
+        named_ns = named_zero_ns(self.source)
+        from_ns = first_ns if named_ns is None else named_ns
         pauses = " and pause there" if first_ns < self.window.start_ns < last_ns else ""
         return UsageError(
-            f"{name} has no sample in the requested window; its samples are from 0.000 s to "
-            f"{time_text(last_ns, first_ns)} ({first_ns} to {last_ns} ns on its clock){pauses}"
+            f"{name} has no sample in the requested window; its samples are from "
+            f"{time_text(first_ns, from_ns)} to {time_text(last_ns, from_ns)} "
+            f"({first_ns} to {last_ns} ns on its clock){pauses}"
         )
 
     def _missing_names(self, names: LogNames) -> list[Diagnostic]:

@@ -23,13 +23,14 @@ from spatial_replay.logs.messages import AUTOMATON, ROBUSTNESS, SPECIFICATION, S
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification, SpecificationResult
+from spatial_replay.replay.selection import named_zero_ns
 from spatial_replay.text import counted_from, cut
 
 Quantity: TypeAlias = Literal["value", "now", "lower", "upper"]
 TIME = "time_ns"
 """The title of the column of times."""
 SECONDS = "seconds"
-"""The title of the column of seconds since the first row."""
+"""The title of the column of seconds since the zero of the log."""
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 
 _LONGEST_TEXT: Final = 60
@@ -48,7 +49,7 @@ class TableRows:
 
     Attributes:
         times_ns: (T,) int64.
-        seconds: (T,), since the first row of the table.
+        seconds: (T,), since the zero that the log names, or else the first row.
         numbers: (T, nodes); NaN where a node has no number, or no sample.
         states: for each automaton, the states that it may be in after each sample: "2", "1|2" or "".
     """
@@ -81,15 +82,15 @@ def export_table(
     writer = _WRITERS[output.suffix.lower()]
     titles, automata = _titles(source)
     faults: list[str] = []
-    rows, first_ns = 0, 0
+    rows, first_ns = 0, named_zero_ns(source)
     columns = [TIME, SECONDS, *titles.values()], list(automata.values())
     with replacing(output, inputs) as stream, writer(stream, *columns) as write:
         for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
             write(table)
-            first_ns = first_ns if rows else int(table.times_ns[0])
+            first_ns = int(table.times_ns[0]) if first_ns is None else first_ns
             rows += len(table.times_ns)
             advance(len(table.times_ns))
-    return rows, len(titles), counted_from(faults, first_ns)
+    return rows, len(titles), counted_from(faults, first_ns or 0)
 
 
 def check_table_name(output: Path) -> None:
@@ -226,7 +227,7 @@ def _iter_tables(
     states: dict[_Result, dict[int, str]] = {result: {} for result in automata}
     for time_ns, result, state in _iter_states(source) if automata else ():
         states[result][time_ns] = state
-    first_ns: int | None = None
+    first_ns = named_zero_ns(source)
     for series, lost in _iter_series(source):
         faults += lost
         if not series:

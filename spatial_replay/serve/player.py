@@ -285,7 +285,7 @@ class Session:
         """
         self._log = loaded
         self._pace = Pace(clock)
-        self._transport = Transport(start_ns, end_ns)
+        self._transport, self._zero_ns = Transport(start_ns, end_ns), loaded.first_ns
         self.edited = loaded.edit({})
         self._pending = PendingRequests()
         # awaited from the next requests on, and from those that are being done
@@ -323,7 +323,7 @@ class Session:
     def playback(self) -> Mapping[str, float | bool]:
         """The values of `PLAYBACK`."""
         state = self.state
-        seconds = round((state.time_ns - self._transport.start_ns) / 1e9, 3)
+        seconds = round((state.time_ns - self._zero_ns) / 1e9, 3)
         is_playing = state.status is Status.PLAYING
         return dict(zip(PLAYBACK, (seconds, is_playing, state.speed, self._loops), strict=True))
 
@@ -372,7 +372,7 @@ class Session:
         self._loops = bool(values.get(loop, self._loops))
         seek_ns = None
         if time in values:
-            seek_ns = self._transport.start_ns + round(min(float(values[time]), _LONGEST_S) * 1e9)
+            seek_ns = self._zero_ns + round(min(float(values[time]), _LONGEST_S) * 1e9)
         return self.control(
             is_playing=bool(values.get(play, now[play])),
             speed=float(values.get(speed, now[speed])),

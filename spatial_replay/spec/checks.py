@@ -103,7 +103,7 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
                 yield _reach(level.prefix, token, source)
                 level.prefix = None
             if published:
-                yield from _regrouped(level, token, source)
+                yield from _grouping_warnings(level, token, source)
             level.binary = token
 
 
@@ -121,13 +121,13 @@ def _strong_next(prefix: Token, sign: Token, source: SourceText) -> Diagnostic:
 def _reach(prefix: Token, operator: Token, source: SourceText) -> Diagnostic:
     message = f"{prefix.value!r} reaches over {operator.value!r} up to the closing bracket"
     hint = f"write ({prefix.value} ...) {operator.value} ... or {prefix.value} (... {operator.value} ...)"
-    tool = "R2U2" if _written(operator, source) in _R2U2_SIGNS else "rtamt"
-    if tool == "R2U2" or _written(prefix, source) != prefix.value:
+    tool = "R2U2" if _source_text(operator, source) in _R2U2_SIGNS else "rtamt"
+    if tool == "R2U2" or _source_text(prefix, source) != prefix.value:
         hint = f"in {tool} it ends in front of {operator.value!r}; {hint}"
     return source.diagnostic("warning", span_of(prefix), message, hint)
 
 
-def _regrouped(level: _Level, operator: Token, source: SourceText) -> Iterator[Diagnostic]:
+def _grouping_warnings(level: _Level, operator: Token, source: SourceText) -> Iterator[Diagnostic]:
     if level.negation is not None:
         message = f"the published grammar takes 'not' over {operator.value!r} as well; here it ends before it"
         yield source.diagnostic("warning", span_of(level.negation), message, "write the brackets you mean")
@@ -150,16 +150,16 @@ def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[D
     A bounded until is spelt alike here and in R2U2, so it counts only in a text with signs of R2U2.
     """
     signs = (token for token in tokens if token.type in ("AND", "OR"))
-    is_of_r2u2 = any(_written(token, source) in _R2U2_SIGNS for token in signs)
+    is_of_r2u2 = any(_source_text(token, source) in _R2U2_SIGNS for token in signs)
     for place, token in enumerate(tokens):
         if token.type not in ("PREFIX", "INFIX"):
             continue
-        if _written(token, source) == "next":
+        if _source_text(token, source) == "next":
             message = "'next' is read as X, so there has to be a next sample"
             hint = "in rtamt it holds at the last sample, too: write WX for that, X for this"
             yield source.diagnostic("warning", span_of(token), message, hint)
         window = tokens[place + 1 : place + 3]
-        is_window = [each.type for each in window] == ["LSQB", "NUMBER"]
+        is_window = [following.type for following in window] == ["LSQB", "NUMBER"]
         begin = window[1].value if is_window else ""
         if is_of_r2u2 and token.value in ("U", "R") and begin.strip("0").isdigit():
             message = f"the left side of {token.value!r} counts from now, not from its window's beginning"
@@ -167,7 +167,7 @@ def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[D
             yield source.diagnostic("warning", span_of(token), message, hint)
 
 
-def _written(token: Token, source: SourceText) -> str:
+def _source_text(token: Token, source: SourceText) -> str:
     return source.text[span_of(token).start : span_of(token).end]
 
 
@@ -252,23 +252,23 @@ def scale_warnings(
     for statement in scales:
         name = statement.name.text
         if name not in units or units[name].divisor is None:
-            known = [unit.signal for unit in units.values() if unit.signal is not None]
-            hint = nearest_hint(name, known) or f"it takes a signal that a spec compares, or {LENGTHS}"
-            message = f"no spec compares {name!r}, so this scale divides nothing"
+            signals = [unit.signal for unit in units.values() if unit.signal is not None]
+            hint = nearest_hint(name, signals) or f"it takes a signal that a spec compares, or {LENGTHS}"
+            message = f"no number of a spec is in the unit of {name!r}, so this scale divides nothing"
             yield source.diagnostic("warning", statement.name.span, message, hint)
 
 
 def object_names(specification: Specification) -> tuple[str, ...]:
     """Return the tracked objects that the specs are about, members of groups included, as in the text."""
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for atom in _atoms(specification):
         for term in terms_of(atom.expression):
             base = base_of(term)
             if isinstance(base, TrackedName):
-                found[base.name] = None
+                names[base.name] = None
             elif isinstance(base, Group):
-                found.update(dict.fromkeys(named_members(base)))
-    return tuple(found)
+                names.update(dict.fromkeys(named_members(base)))
+    return tuple(names)
 
 
 def group_classes(specification: Specification) -> tuple[str, ...]:
@@ -281,15 +281,13 @@ def group_classes(specification: Specification) -> tuple[str, ...]:
             elif isinstance(formula, Atom):
                 groups += terms_of(formula.expression)
     bases = [base for term in groups if isinstance(base := base_of(term), Group)]
-    return tuple(dict.fromkeys(name for each in bases if (name := each.class_name)))
+    return tuple(dict.fromkeys(name for base in bases if (name := base.class_name)))
 
 
 def signal_names(specification: Specification) -> tuple[str, ...]:
     """Return the numeric signals that the specs compare, in the order of the text."""
-    found: dict[str, None] = {}
-    for atom in _atoms(specification):
-        found.update(dict.fromkeys(logged_signals(atom.expression)))
-    return tuple(found)
+    atoms = _atoms(specification)
+    return tuple(dict.fromkeys(name for atom in atoms for name in logged_signals(atom.expression)))
 
 
 def _atoms(specification: Specification) -> Iterable[Atom]:
@@ -330,7 +328,7 @@ def check_names(
     known_classes = tuple(classes)
     source = SourceText.of(specification.source, specification.filename)
     places, defined = _places(specification, source)
-    found: list[Diagnostic] = []
+    diagnostics: list[Diagnostic] = []
 
     def report(
         kind: str, name: str, candidates: tuple[str, ...], span: Span, hint: str = "", during: str = ""
@@ -339,7 +337,7 @@ def check_names(
         choices = (*candidates, *specification.constants) if kind == "signal" else candidates
         hint = hint or " ".join(filter(None, (nearest_hint(name, choices), _listing(kind, candidates))))
         message = f"the {where} never has the {kind} {name!r}" + (during and f" {during}")
-        found.append(source.diagnostic("error", span, message, hint))
+        diagnostics.append(source.diagnostic("error", span, message, hint))
 
     for kind, names, candidates in (
         ("object", object_names(specification), objects),
@@ -349,25 +347,25 @@ def check_names(
             if name not in candidates:
                 hint = _class_hint(name, kind, known_classes)
                 report(kind, name, candidates, places.get(name, Span(0, 0)), hint, during)
-    taken = {each.casefold() for each in known_classes}
+    folded_classes = {name.casefold() for name in known_classes}
     for spec in specification.results:
-        chosen = each.get(spec.parameter or "", "all")
-        kind, _, name = chosen.partition(":")
-        if kind == "class" and name.casefold() not in taken:
+        choice = each.get(spec.parameter or "", "all")
+        kind, _, name = choice.partition(":")
+        if kind == "class" and name.casefold() not in folded_classes:
             report("class", name, known_classes, spec.span)
-        elif kind != "class" and chosen not in ("all", *objects):
-            report("object", chosen, objects, spec.span)
+        elif kind != "class" and choice not in ("all", *objects):
+            report("object", choice, objects, spec.span)
     for name in group_classes(specification):
         # a log may lack a class; one that is nearly spelt like another is taken for a mistake
-        if name != ANY_CLASS and name.casefold() not in taken and nearest_hint(name, known_classes):
+        if name != ANY_CLASS and name.casefold() not in folded_classes and nearest_hint(name, known_classes):
             report("class", name, known_classes, places.get(name, Span(0, 0)))
     for name, span in defined.items():
         if name in objects:
             message = f"the {where} has an object {name!r}, which this definition hides"
             hint = "give the definition another name"
             hint += f"; {title_hint(name)}" if any(spec.name == name for spec in specification.specs) else ""
-            found.append(source.diagnostic("warning", span, message, hint))
-    return tuple(sorted(found, key=lambda each: (each.line, each.column)))
+            diagnostics.append(source.diagnostic("warning", span, message, hint))
+    return tuple(sorted(diagnostics, key=lambda diagnostic: (diagnostic.line, diagnostic.column)))
 
 
 def with_numbers(specification: Specification, units: Mapping[str, str]) -> Specification:
@@ -380,14 +378,14 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
     tables = {signal: names for signal, unit in units.items() if (names := names_from_unit(unit))}
     faults = Faults(SourceText.of(specification.source, specification.filename))
 
-    def compared(atom: Atom) -> Equality | None:
+    def named_equality(atom: Atom) -> Equality | None:
         part = atom.expression.operand if isinstance(atom.expression, Negative) else atom.expression
         if isinstance(part, Equality) and part.signal.name in tables and is_text_number(part.value):
             return part
         return None
 
     def change(atom: Atom) -> Atom:
-        if (part := compared(atom)) is None:
+        if (part := named_equality(atom)) is None:
             return atom
         names = tables[part.signal.name]
         numbers = {text_number(name): number for name, number in names.items()}
@@ -406,7 +404,7 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
                 "multiply one of them by a constant that converts it, or by 1 if its declared unit is wrong"
             )
             faults.add(atom.span, message, hint)
-    if not any(map(compared, _atoms(specification))):
+    if not any(map(named_equality, _atoms(specification))):
         faults.raise_if_any()
         return specification
     specs = tuple(replace(spec, formula=rewritten(spec.formula, change)) for spec in specification.specs)
@@ -416,19 +414,19 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
 
 def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
     """Return the spelling of a class that was taken for an object; "" for none."""
-    meant = next((each for each in classes if each.casefold() == name.casefold()), None)
+    meant = next((label for label in classes if label.casefold() == name.casefold()), None)
     if kind != "object" or meant is None:
         return ""
-    written = f"class {quoted(meant)}"
-    return f"it is a class: write {written} for all of them, or forall one in {written}: ..."
+    group = f"class {quoted(meant)}"
+    return f"it is a class: write {group} for all of them, or forall one in {group}: ..."
 
 
 def _listing(kind: str, names: tuple[str, ...]) -> str:
     kinds = "classes" if kind == "class" else f"{kind}s"
     if not names:
         return f"it has no {kinds}"
-    listed = ", ".join(names[:_LISTED])
-    return f"its {kinds} are {listed}" + (", ..." if len(names) > _LISTED else "")
+    first = ", ".join(names[:_LISTED])
+    return f"its {kinds} are {first}" + (", ..." if len(names) > _LISTED else "")
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:

@@ -279,7 +279,8 @@ class ComparisonBuilder:
                 message, hint = "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"
             self.resolver.fault(written.span, scope, message, hint)
             return Number(0.0)
-        return speed_of(*(self._moving(each, scope, alone=len(arguments) == 1) for each in arguments))
+        is_alone = len(arguments) == 1
+        return speed_of(*(self._moving(argument, scope, alone=is_alone) for argument in arguments))
 
     def _moving(self, written: ArgumentSyntax, scope: Scope, *, alone: bool) -> Term:
         """Return a term that `speed` takes."""

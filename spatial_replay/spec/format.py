@@ -230,7 +230,7 @@ def format_formula(
         case Boolean(operator="not"):
             return f"not {operand(formula.operands[0])}"
         case Boolean():
-            return f" {formula.operator} ".join([operand(each) for each in formula.operands])
+            return f" {formula.operator} ".join([operand(inner) for inner in formula.operands])
         case Temporal():
             operator = formula.operator + format_bound(formula.bound)
             if len(formula.operands) == 1:
@@ -270,7 +270,7 @@ def _format_spec(spec: NamedSpec, relations: frozenset[str]) -> str:
 
 def title_text(spec: NamedSpec) -> str:
     """Return the requirement id and the title of a spec as one text; "" for none."""
-    return ": ".join(each for each in (spec.id, spec.title) if each is not None)
+    return ": ".join(text for text in (spec.id, spec.title) if text is not None)
 
 
 def _format_outline(outline: Outline) -> str:

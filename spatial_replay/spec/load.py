@@ -102,13 +102,13 @@ from spatial_replay.spec.tokens import (
 )
 from spatial_replay.spec.walks import (
     base_of,
+    divide_by_scale,
     is_centre,
     iter_expressions,
     iter_formulas,
     named_members,
     other_names,
     presence_of,
-    scaled,
     substitute,
     terms_of,
 )
@@ -180,7 +180,7 @@ class AtomBuilder:
         scope: Scope,
     ) -> Atom:
         text = format_atom(relation, expression, terms, parameters, self.names)
-        expression = scaled(expression, self.resolver.names.scales)
+        expression = divide_by_scale(expression, self.resolver.names.scales)
         span = scope.call or written.span
         return Atom(text, relation, expression, span=span, terms=terms, parameters=parameters)
 

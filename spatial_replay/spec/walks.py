@@ -162,11 +162,11 @@ def is_about_having_rates(leaf: Formula) -> bool:
 def change_of(rate: Rate) -> Sum | SignedDistance:
     """Return what a rate is per second: the difference between two reports."""
     match rate.terms:
-        case (one, other):
+        case (first, second):
             before = (_moved_back(term, _moving(rate)) for term in rate.terms)
-            return SignedDistance(*before) - SignedDistance(one, other)
-        case (one,):
-            alone: Any = base_of(one)
+            return SignedDistance(*before) - SignedDistance(first, second)
+        case (term,):
+            alone: Any = base_of(term)
             return SignedDistance(Centre(alone), _moved_back(Centre(alone), _moving(rate)))
     signal = rate.signal or Signal("")
     return signal - PreviousSignal(signal.name, signal)
@@ -227,12 +227,12 @@ def iter_bound(formula: Formula) -> Iterator[tuple[Formula, tuple[Quantified, ..
         yield node, around
         if isinstance(node, Quantified):
             stack.append((node.body, (*around, node)))
-        stack += [(each, around) for each in reversed(operands_of(node))]
+        stack += [(operand, around) for operand in reversed(operands_of(node))]
 
 
 def iter_atoms(formula: Formula) -> Iterator[Atom]:
     """Yield the atoms of a formula, those in quantifiers included, in the order of the text."""
-    return (each for each in iter_formulas(formula) if isinstance(each, Atom))
+    return (part for part in iter_formulas(formula) if isinstance(part, Atom))
 
 
 def iter_parts(formula: Formula) -> Iterator[Expression]:
@@ -264,35 +264,35 @@ def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
 
 def named_members(group: Group) -> tuple[str, ...]:
     """Return the members of a named group, without those left out; none of an open one."""
-    left_out = {each.name for each in group.excluded}
+    left_out = {member.name for member in group.excluded}
     return tuple(name for name in group.members or () if name not in left_out)
 
 
 def is_spatial(formula: Formula) -> bool:
     """Return whether a formula is about one sample: no operator in it looks ahead or back."""
-    return not any(isinstance(each, Temporal) for each in iter_formulas(formula))
+    return not any(isinstance(part, Temporal) for part in iter_formulas(formula))
 
 
 def looks_ahead(formula: Formula) -> bool:
     """Return whether a formula contains a future operator."""
     return any(
-        isinstance(each, Temporal) and each.operator in FUTURE_OPERATORS for each in iter_formulas(formula)
+        isinstance(part, Temporal) and part.operator in FUTURE_OPERATORS for part in iter_formulas(formula)
     )
 
 
 def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
     """Yield the terms that atoms measure and the groups of open quantifiers, in the order of the text."""
     for formula in formulas:
-        for each in iter_formulas(formula):
-            if isinstance(each, Atom):
-                yield from terms_of(each.expression)
-            elif isinstance(each, Quantified):
-                yield each.group
+        for part in iter_formulas(formula):
+            if isinstance(part, Atom):
+                yield from terms_of(part.expression)
+            elif isinstance(part, Quantified):
+                yield part.group
 
 
 def other_names(formula: Formula) -> frozenset[str]:
     """Return the names in a formula of objects, regions, groups and specs: all but variables."""
-    names = {each.name for each in iter_formulas(formula) if each.name is not None}
+    names = {part.name for part in iter_formulas(formula) if part.name is not None}
     objects = (part.term for part in iter_parts(formula) if isinstance(part, Present))
     for base in map(base_of, chain(iter_terms([formula]), objects)):
         if isinstance(base, (TrackedName, RegionName, Group)):
@@ -320,7 +320,7 @@ def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
         if current is stand_ins[operand]:
             signs.add(sign)
         below = -sign if operator_of(current) == "not" else sign
-        stack.extend((each, below) for each in operands_of(current))
+        stack.extend((inner, below) for inner in operands_of(current))
     return tuple(sorted(signs, reverse=True))
 
 
@@ -350,7 +350,9 @@ def can_settle(formula: Formula, *, satisfied: bool) -> bool:
             return can_settle(operand, satisfied=not satisfied)
         case Boolean(operator="and" | "or" as operator, operands=operands):
             needs_all = (operator == "and") == satisfied
-            return (all if needs_all else any)(can_settle(each, satisfied=satisfied) for each in operands)
+            return (all if needs_all else any)(
+                can_settle(operand, satisfied=satisfied) for operand in operands
+            )
         case Temporal(operator="G" | "F" as operator, operands=(operand,), bound=bound):
             is_open = bound is None or bound.upper is None
             if is_open and (operator == "G") == satisfied:
@@ -384,7 +386,7 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
             inner = {old: new for old, new in names.items() if old not in formula.variables}
             return replace(formula, group=group, body=substitute(formula.body, inner, relations))
         case _:
-            operands = tuple([substitute(each, names, relations) for each in formula.operands])
+            operands = tuple([substitute(operand, names, relations) for operand in formula.operands])
             return replace(formula, operands=operands)
 
 
@@ -398,7 +400,8 @@ def rewritten(formula: Formula, change: Callable[[Atom], Atom]) -> Formula:
         case Quantified():
             return replace(formula, body=rewritten(formula.body, change))
         case Boolean() | Temporal():
-            return replace(formula, operands=tuple([rewritten(each, change) for each in formula.operands]))
+            operands = tuple([rewritten(operand, change) for operand in formula.operands])
+            return replace(formula, operands=operands)
 
 
 def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) -> Formula:
@@ -407,19 +410,19 @@ def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) ->
         return formula
     if node == 0:
         return replace(formula, operands=operands)
-    own: list[Formula] = []
+    replaced: list[Formula] = []
     place = 1
     for operand in formula.operands:
         count = sum(1 for _ in iter_nodes(operand))
         is_within = place <= node < place + count
-        own.append(with_operands(operand, node - place, operands) if is_within else operand)
+        replaced.append(with_operands(operand, node - place, operands) if is_within else operand)
         place += count
-    return replace(formula, operands=tuple(own))
+    return replace(formula, operands=tuple(replaced))
 
 
 def without_variables(formula: Quantified) -> Formula:
     """Return the body of a quantifier with variables that are known by their place alone."""
-    inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
+    inner = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
     # no name of a text begins with a blank and a number
     return substitute(
         formula.body,
@@ -433,7 +436,7 @@ def substitute_term(term: Term, names: Names) -> Term:
         case Variable():
             return names.get(term.name, term)
         case Group():
-            return replace(term, excluded=tuple(_object(each, names) for each in term.excluded))
+            return replace(term, excluded=tuple(_object(member, names) for member in term.excluded))
         case Earlier(rate=(_, *_)):
             moved: Any = substitute_term(term.term, names)
             rate: Any = tuple(substitute_term(moving, names) for moving in term.rate)
@@ -474,9 +477,9 @@ def map_leaves(
         case Negative():
             return Negative(map_leaves(expression.operand, change))
         case Minimum():
-            return Minimum(tuple([map_leaves(each, change) for each in expression.operands]))
+            return Minimum(tuple([map_leaves(operand, change) for operand in expression.operands]))
         case Maximum():
-            return Maximum(tuple([map_leaves(each, change) for each in expression.operands]))
+            return Maximum(tuple([map_leaves(operand, change) for operand in expression.operands]))
         case Product():
             return Product(expression.factor, map_leaves(expression.operand, change))
         case Scaled():
@@ -534,10 +537,7 @@ def units_of(formula: Formula) -> tuple[Unit, ...]:
     A minimum over atoms of one unit is a number of that unit. Over several it compares what may not be
     comparable, unless each of them is scaled: see `is_mixed`.
     """
-    found: dict[Unit, None] = {}
-    for each in iter_atoms(formula):
-        found.update(dict.fromkeys(_units(each.expression)))
-    return tuple(found)
+    return tuple(dict.fromkeys(unit for atom in iter_atoms(formula) for unit in _units(atom.expression)))
 
 
 def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: bool = True) -> str:
@@ -548,13 +548,13 @@ def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: b
         is_scaled: whether the number is what `scale` made of it, which has no unit.
     """
     units = {
-        "" if is_scaled and unit.divisor is not None else _declared(unit, declared)
+        "" if is_scaled and unit.divisor is not None else _declared_name(unit, declared)
         for unit in units_of(formula)
     }
     return units.pop() if len(units) == 1 else ""
 
 
-def _declared(unit: Unit, declared: Mapping[str, str]) -> str:
+def _declared_name(unit: Unit, declared: Mapping[str, str]) -> str:
     if unit.kind == "orientation":
         return ""
     name = declared.get(unit.signal or "", "")
@@ -580,7 +580,7 @@ def units_text(units: Sequence[Unit]) -> str:
     return f"Its robustness is the least of numbers in {what}: {', '.join(others)} and {last}."
 
 
-def scaled(expression: Expression, scales: Sequence[Scale]) -> Expression:
+def divide_by_scale(expression: Expression, scales: Sequence[Scale]) -> Expression:
     """Return what an atom computes, divided if there is a scale for the one unit of what it measures."""
     units = _units(expression)
     for scale in scales:
@@ -645,5 +645,5 @@ def summed_units(expression: Expression, declared: Mapping[str, str]) -> list[st
             case Minimum(operands) | Maximum(operands):
                 stack += reversed(operands)
             case Signal() | SignedDistance():
-                units[_declared(_unit_of(current, None), declared)] = None
+                units[_declared_name(_unit_of(current, None), declared)] = None
     return [unit for unit in units if unit]

@@ -263,6 +263,36 @@ def test_thresholds_of_open_groups_and_templates_are_compared_over_their_objects
     assert "for c in cars: goes from 2 to 8, holds for all in 2 and for none in 0 of 4 samples\n" in said
 
 
+def test_an_empty_group_holds_and_rates_are_known_where_a_log_is_read_in_parts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "long.jsonl", tmp_path / "s.spatial"
+    box = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    walker = {"name": "walker", "class": "person", "polygon": box}
+    # long enough to be read in several blocks
+    lines = (
+        {"time_ns": 10**7 * n, "objects": [walker] if n < 5 else [], "signals": {"x": 0.01 * n}}
+        for n in range(20_001)
+    )
+    log.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    spec.write_text(
+        "region lane = box(3, 0, 9, 1)\n"
+        "spec steady = G (rate(x) <= 3)\n"
+        'spec clear = G forall p in class "person": p dist lane >= 1\n'
+        'spec none = G forall c in class "car": c dist lane >= 1\n'
+    )
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "rate(x) <= 3: goes from 1 to 1, is unknown in 1 of 20,001 samples" in said
+    clear = 'p dist lane >= 1 for p in class "person": goes from 2 to 2, has no object, and so is +inf,'
+    assert f"{clear} in 19,996 of 20,001 samples, always holds in the others" in said
+    none = 'c dist lane >= 1 for c in class "car": has no object, and so is +inf, in every sample'
+    assert none in said
+    assert run(["check", str(spec), "--log", str(log), "--json"]) == 0
+    counts = [(each["known"], each["empty"]) for each in json.loads(capsys.readouterr().out)["thresholds"]]
+    assert counts == [(20_000, 0), (5, 19_996), (0, 20_001)]
+
+
 def test_errors_are_marked_at_their_lines_for_github_and_for_code_scanning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -103,3 +103,14 @@ def test_the_layout_says_where_0_is_on_a_viewers_axis(
     assert panels["Plot!robustness"]["xAxisLabel"] == f"time [s]; texts count from {offset}"
     title = panels["RawMessages!specification"]["foxglovePanelTitle"]
     assert title == f"Specification; 0 s = 2023-11-14 22:13:20.000 UTC, {offset}"
+    events = panels["Table!events"]["foxglovePanelTitle"]
+    assert events == "Events; 0 s = 22:13:20.000 UTC"
+
+
+def test_tables_and_warnings_of_a_part_count_like_the_whole(folder: Path) -> None:
+    said(folder, "replay", "run.bag", *GIVEN, "--from", "1.55s", "-o", "part.mcap")
+    said(folder, "export", "part.mcap", "-o", "part.csv")
+    first = (folder / "part.csv").read_text().splitlines()[1]
+    assert float(first.split(",")[1]) == pytest.approx(1.6)
+    outside = run_program("replay", "part.mcap", "--from", "9s", cwd=folder)
+    assert "its samples are from 1.600 s to 5.900 s" in outside.stderr

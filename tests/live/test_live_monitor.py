@@ -1089,3 +1089,13 @@ def test_a_run_is_doubtful_where_it_contradicts_its_mapping_and_its_log_keeps_th
     assert (said in output.err, "doubtful, robustness" in output.out) == (True, code != 0)
     assert run(["replay", str(log), "--spec", str(spec)]) == code
     assert said in capsys.readouterr().err
+
+
+def test_the_log_of_a_run_that_is_left_in_python_is_doubtful_too(tmp_path: Path) -> None:
+    mapping = "topics: {/robot: {position: [x, y], yaw: yaw}, /vase: {position: [x, y]}}"
+    mapped, spec = files(tmp_path, mapping, "spec goal = F (robot dist vase >= 1)")
+    turned = b'{"x": 2.0, "y": 0.0, "yaw": 200}'
+    sent = [each for tick in range(30) for each in (pose(2, tick), frame(1, tick * 10 * MS, turned))]
+    with rude_server(*sent) as address:
+        asyncio.run(updates_of(address, spec, mapped, 9, output=tmp_path / "live.mcap"))
+    assert [doubt.assumption for doubt in sr.read_trace(tmp_path / "live.mcap").doubts] == ["radians"]

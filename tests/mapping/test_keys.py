@@ -89,6 +89,8 @@ def test_a_stamp_that_is_no_time_is_refused_with_another_clock(stamp: Any) -> No
     content = {"x": 0.0, "y": 0.0, "stamp": stamp}
     with pytest.raises(UsageError, match="`clock: log`"):
         read("stamp: stamp", content, mapping="clock: header")
+    with pytest.raises(UsageError, match=r"is not a time; .*`clock: log`"):
+        read("", content, mapping="clock: header")
     assert read("", {**content, "stamp": "soon"}).states("t") == "+"
 
 

@@ -91,7 +91,7 @@ class Evidence:
                 at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
                 if at == end:
                     raise LookupError(f"there is no sample at {time_ns} ns any more")
-                past = tail(trace.slice(0, at), self._reach) if at else trace.slice(0, 0)
+                past = tail(trace.slice(0, at), self._reach) if at and self._reach else trace.slice(0, 0)
                 sample = Trace.concatenate([past, trace.slice(at, end)])
                 scenes[time_ns] = TraceScene(sample, self._regions, len(past))
             if not pending:

@@ -298,8 +298,8 @@ class _Walk:
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples that an operator looks at."""
-        begin, end = windows_of(formula, self._done.times_ns)
-        return range(int(begin[sample]), int(end[sample]))
+        begin, end = windows_of(formula, self._done.times_ns, np.array([sample]))
+        return range(int(begin[0]), int(end[0]))
 
     def _extreme(self, operand: SignedOperand, window: range, end: End, *, is_minimum: bool) -> PathNode:
         low, high = self._ends(operand, slice(window.start, window.stop))

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, TypeAlias
 
+import numpy as np
+
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.offline import (
@@ -371,7 +373,7 @@ def _step(step: PathNode, formula: Formula, times_ns: Integers) -> WitnessStep:
     text, time_ns = format_formula(formula), int(times_ns[step.sample])
     is_empty = False
     if isinstance(formula, Temporal):
-        begin, end = windows_of(formula, times_ns)
-        is_empty = bool(begin[step.sample] >= end[step.sample])
+        begin, end = windows_of(formula, times_ns, np.array([step.sample]))
+        is_empty = bool(begin[0] >= end[0])
     are_left_out = leaves_out(formula) and not is_empty
     return WitnessStep(step.node, operator_of(formula), formula.name, text, time_ns, are_left_out)
