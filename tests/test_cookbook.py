@@ -75,6 +75,14 @@ CASES = {
         run({"cup": at([AWAY, MAT, MAT]), "plate": at([AWAY, AWAY, MAT])}),
     ),
     "kept_out": (run({"robot": at([(0, 1), (1.8, 1)])}), run({"robot": at([(0, 1), (1.95, 1)])})),
+    "can_stop": (
+        run({"robot": at([(0, 0), (1, 0), (1.05, 0)])}),
+        run({"robot": at([(0, 0), (1, 0), (1.8, 0)])}),
+    ),
+    "follows": (
+        run(signals={"wanted": [0, 1, 1, 1, 1], "level": [0, 0, 0.5, 0.97, 1]}),
+        run(signals={"wanted": [0, 1, 1, 1, 1], "level": [0, 0, 0.5, 0.9, 1]}),
+    ),
     "distant": (
         run({"robot": at([(0, 0)] * 2), "ann": at([(2, 0), (1, 0)], "person")}),
         run({"robot": at([(0, 0)] * 2), "ann": at([(2, 0), (0.4, 0)], "person")}),
