@@ -8,6 +8,7 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from spatial_replay.spec.constants import names_in
 from spatial_replay.spec.formula import (
     ComputedSignal,
     Equality,
@@ -238,6 +239,8 @@ class ComparisonBuilder:
             self.resolver.fault(written.span, scope, f"{what}, distances or rates", _PLUGIN)
             return Number(0.0)
         amount, number = self.resolver.number(factor, scope), self._number(operand, scope)
+        if any(self.resolver.is_unknown(name, scope) for name in names_in(factor)):
+            return number
         if amount == 0.0:
             message = "a factor of 0" if is_product else "division by zero"
             self.resolver.fault(factor.span, scope, message, "leave the number out, or write another factor")

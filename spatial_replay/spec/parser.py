@@ -562,6 +562,7 @@ def _broken(tokens: Sequence[Token]) -> BrokenStatement | None:
 
 _EXPECTATIONS: tuple[tuple[frozenset[str], str], ...] = (
     (frozenset({"TRUTH", "NOT", "PREFIX"}), "a formula"),
+    (frozenset({"NUMBER", "ENLARGE", "RATE"}), "a signal, a number or a distance"),
     (frozenset({"ENLARGE", "ALL"}), "an object, region or group"),
     (frozenset({"NUMBER", "MINUS"}), "a number"),
     (frozenset({"PLUS", "STAR"}), "an arithmetic sign"),
@@ -579,6 +580,7 @@ _SIGN_OF: Mapping[str, str] = MappingProxyType({
 _COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
     {
         "a formula": frozenset({"NAME", "LPAR", "MINUS", "NUMBER", "ENLARGE", "ALL", "CLASS", "RATE"}),
+        "a signal, a number or a distance": frozenset({"NAME", "LPAR", "MINUS", "ALL", "CLASS", "CENTER"}),
         "an object, region or group": frozenset({"NAME", "LPAR", "CLASS", "NUMBER", "MINUS"}),
         "a number": frozenset({"NAME", "LPAR"}),
         "an arithmetic sign": frozenset({"MINUS", "SLASH"}),

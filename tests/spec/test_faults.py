@@ -140,6 +140,7 @@ spec template(ego) = ego ovlp goal
         ),
         ("spec s = robot.speed <= 1", ".", "an object has no fields", "speed(robot) <= 1"),
         ("spec s = count(people) <= 2", "count(people)", "is not a function", "a plug-in computes it"),
+        ("spec s = x + <= 3", "<=", "expected a signal, a number or a distance", ""),
         ("spec s = 2 <= 3", "2 <= 3", "two constants are compared", "a signal, a distance"),
         ("spec s = x <= 2s + y", "2s", "a duration, where a plain number", "its unit"),
         ("const e = 5 s", "s", "'s' is no unit here", "without the blank: 5s"),
@@ -315,6 +316,12 @@ def test_a_broken_definition_is_one_fault_however_often_it_is_used() -> None:
         "spec s = a ovlp\nregion r = box(\ngroup g = ,\nspec t = s and a ovlp r and forall x in g: x ovlp a"
     )
     assert len(faults_of(text)) == 3
+
+
+def test_a_factor_that_a_macro_is_not_given_is_no_fault() -> None:
+    specification = parse_specification("def f(k) = k * x <= y / k\nspec s = x >= y")
+    assert [warning.message for warning in specification.warnings] == ["'f' is a macro that nothing uses"]
+    assert len(faults_of("const k =\nspec s = k * x <= y")) == 1
 
 
 def test_a_fault_in_a_macro_names_the_line_that_uses_it() -> None:
