@@ -266,7 +266,8 @@ class _Assembling:
                 f"{self._plan.mapping.name}: topics.{planned.name}.publisher: there is no publisher {number};"
                 f" the topic has {counted(len(channels), 'channel')}"
             )
-        return places[arrived.channel[places] == channels[number - 1]]
+        of_publisher: Integers = places[arrived.channel[places] == channels[number - 1]]
+        return of_publisher
 
     def _stamp(self, reader: TopicReader, places: Integers, arrived: MessageColumns) -> _Stamped:
         """Return the messages of one topic with their times on its clock, decoded if the clock needs that."""
