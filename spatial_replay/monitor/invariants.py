@@ -113,9 +113,9 @@ def find_violated_invariants(
     if not invariants:
         return
     evaluate = evaluate_unfinished if goes_on else evaluate_offline
-    done = evaluate(evidence.instance.formula, evidence.instance.program.leaves, leaves, times_ns)
+    nodes = evaluate(evidence.instance.formula, evidence.instance.program.leaves, leaves, times_ns)
     for invariant in invariants:
-        violated = _intervals_of(evidence, done, invariant, most)
+        violated = _intervals_of(evidence, nodes, invariant, most)
         if violated.intervals:
             yield violated
 
@@ -156,58 +156,58 @@ class _Invariant(NamedTuple):
 
 
 def _intervals_of(
-    evidence: Evidence, done: OfflineNodes, invariant: _Invariant, most: int
+    evidence: Evidence, nodes: OfflineNodes, invariant: _Invariant, most: int
 ) -> ViolatedInvariant:
-    begins, ends = windows_of(invariant.operator, done.times_ns, np.array([0]))
-    is_asked = np.zeros(len(done.times_ns), np.bool_)
+    begins, ends = windows_of(invariant.operator, nodes.times_ns, np.array([0]))
+    is_asked = np.zeros(len(nodes.times_ns), np.bool_)
     is_asked[begins[0] : ends[0]] = True
-    low, high = done.judged_ends(invariant.operand)
+    low, high = nodes.judged_ends(invariant.operand)
     robustness = high if invariant.end is End.HIGH else -low
     runs = _Runs.of(is_asked & (robustness < 0.0))
     intervals, worst = [], []
     for start, end in zip(runs.starts.tolist(), runs.ends.tolist(), strict=True):
         worst.append(start + int(np.argmin(robustness[start:end])))
-        first_ns, last_ns, worst_ns = done.times_ns[[start, end - 1, worst[-1]]].tolist()
+        first_ns, last_ns, worst_ns = nodes.times_ns[[start, end - 1, worst[-1]]].tolist()
         least = float(robustness[worst[-1]])
         intervals.append(ViolatedInterval(first_ns, last_ns, end - start, worst_ns, least))
-    intervals[:most] = _with_atoms(evidence, done, invariant, intervals[:most], worst[:most])
+    intervals[:most] = _with_atoms(evidence, nodes, invariant, intervals[:most], worst[:most])
     conjunct = invariant.conjunct
     if invariant.condition is None:
         return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
-    held = _Runs.of(is_asked & (done.ends(invariant.condition)[0] >= 0.0))
+    held = _Runs.of(is_asked & (nodes.ends(invariant.condition)[0] >= 0.0))
     missed = np.unique(np.searchsorted(held.starts, runs.starts, side="right"))
-    condition = short_title(evidence.bound(done.tree[invariant.condition][0]))
+    condition = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
     entries = len(held.starts), len(missed)
     return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals), condition, entries)
 
 
 def _with_atoms(
     evidence: Evidence,
-    done: OfflineNodes,
+    nodes: OfflineNodes,
     invariant: _Invariant,
     intervals: Sequence[ViolatedInterval],
     worst: Sequence[int],
 ) -> Iterator[ViolatedInterval]:
     """Yield intervals with the atom that decides the worst sample of each."""
     bindings, condition = evidence.instance.bindings, invariant.condition
-    paths = [deciding_path(done, invariant.operand, invariant.end, sample=sample) for sample in worst]
-    responses = [missed_response(path, done, bindings)[1] for path in paths]
+    paths = [deciding_path(nodes, invariant.operand, invariant.end, sample=sample) for sample in worst]
+    responses = [missed_response(path, nodes, bindings)[1] for path in paths]
     conditions = [
-        path if condition is None else deciding_path(done, condition, End.LOW, sample=sample)
+        path if condition is None else deciding_path(nodes, condition, End.LOW, sample=sample)
         for path, sample in zip(paths, worst, strict=True)
     ]
     ends = [path.steps[-1].sample for path in (*paths, *responses, *conditions) if path is not None]
-    scene_at = evidence.scenes(set(done.times_ns[ends].tolist())).__getitem__
+    scene_at = evidence.scenes(set(nodes.times_ns[ends].tolist())).__getitem__
     for interval, path, asked in zip(intervals, paths, conditions, strict=True):
-        deciding = atom_of_path(evidence, done, path, scene_at)
-        deciding_ns = int(done.times_ns[path.steps[-1].sample])
-        closest = find_missed(evidence, done, path, scene_at).closest
+        deciding = atom_of_path(evidence, nodes, path, scene_at)
+        deciding_ns = int(nodes.times_ns[path.steps[-1].sample])
+        closest = find_missed(evidence, nodes, path, scene_at).closest
         if closest is not None:
             deciding, deciding_ns = closest
         if deciding is None:
             yield interval
             continue
-        place = _place_of(deciding) or _place_of(atom_of_path(evidence, done, asked, scene_at))
+        place = _place_of(deciding) or _place_of(atom_of_path(evidence, nodes, asked, scene_at))
         yield replace(interval, deciding=deciding, deciding_ns=deciding_ns, place=place)
 
 

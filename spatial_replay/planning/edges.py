@@ -232,9 +232,9 @@ def _leaves_of(formulas: Iterable[Formula]) -> Iterator[Formula]:
 def _members_of(group: Group, sample: Sample) -> int:
     classes = {name: tracked.class_name for name, tracked in sample.objects.items()} | dict(sample.unknown)
     excluded = {name.name for name in group.excluded}
-    wanted = (group.class_name or ANY_CLASS).casefold()
+    own_class = (group.class_name or ANY_CLASS).casefold()
     return sum(
-        name not in excluded and wanted in (ANY_CLASS, (class_name or "").casefold())
+        name not in excluded and own_class in (ANY_CLASS, (class_name or "").casefold())
         for name, class_name in classes.items()
     )
 

@@ -240,11 +240,11 @@ class Planner:
     def _test(self, sample: Sample) -> None:
         """Step the states in which groups without members have done nothing, unless that loses acceptance."""
         groups = [groups_without_members(formula, sample) for formula in self._formulas]
-        known = self.automaton.step_set(self._tested, self._symbol)
+        closed = self.automaton.step_set(self._tested, self._symbol)
         symbol = [None if empty else value for empty, value in zip(groups, self._symbol, strict=True)]
         still_open = self.automaton.step_set(self._tested, symbol) & self.automaton.can_accept
-        self._awaited = [] if still_open <= known else [group for empty in groups for group in empty]
-        self._tested = known | still_open
+        self._awaited = [] if still_open <= closed else [group for empty in groups for group in empty]
+        self._tested = closed | still_open
 
     @property
     def _lacks_members(self) -> bool:

@@ -340,9 +340,9 @@ class _Search:
     def threshold(self) -> Threshold | None:
         """Return the nearest number that flips the verdict, or None."""
         dial = self._dial
-        found = [number for each in self._directions if (number := self._nearest(each)) is not None]
-        for number in sorted(found, key=lambda number: abs(number - dial.value)):
-            candidates = [each for each in _rounded(number, dial.value) if self._is_possible(each)]
+        nearest = [number for side in self._directions if (number := self._nearest(side)) is not None]
+        for number in sorted(nearest, key=lambda number: abs(number - dial.value)):
+            candidates = list(filter(self._is_possible, _rounded(number, dial.value)))
             # one of the first two flips it nearly always; each measures all bindings of a quantifier again
             for some in filter(None, (candidates[:2], candidates[2:])):
                 verdicts = self._verdicts(some, is_shifted=False)
@@ -350,9 +350,9 @@ class _Search:
                     if self._is_flipped(verdict):
                         is_exact = dial.is_exact or len(self._directions) > 1
                         is_written = dial.kind != "margin"
-                        written = "" if is_written else self._replacement(candidate)
+                        replacement = "" if is_written else self._replacement(candidate)
                         return Threshold(
-                            dial.value, candidate, is_written, is_exact, verdict, dial.constant, written
+                            dial.value, candidate, is_written, is_exact, verdict, dial.constant, replacement
                         )
         return None
 

@@ -187,13 +187,13 @@ def find_witness(
     evaluate, verdict_of = (
         (evaluate_unfinished, online_verdict) if goes_on else (evaluate_offline, final_verdict)
     )
-    done = evaluate(instance.formula, instance.program.leaves, leaves, times_ns)
-    lower, upper = done.interval(node)
+    nodes = evaluate(instance.formula, instance.program.leaves, leaves, times_ns)
+    lower, upper = nodes.interval(node)
     verdict = verdict_of(lower, upper)
     end = End.of(verdict)
-    found = deciding_path(done, node, end)
-    path, deciding = _steps(evidence, done, found), atom_of_path(evidence, done, found, evidence.scene)
-    at_ns = path[-1].time_ns
+    path = deciding_path(nodes, node, end)
+    steps, deciding = _steps(evidence, nodes, path), atom_of_path(evidence, nodes, path, evidence.scene)
+    at_ns = steps[-1].time_ns
     gaps: tuple[Gap, ...] = ()
     if deciding is not None and deciding.unknown:
         gaps = evidence.gaps(deciding.atom, at_ns)
@@ -201,22 +201,17 @@ def find_witness(
             deciding = replace(deciding, unknown=("the samples pause there",))
     while_present = None
     if verdict is Verdict.UNKNOWN and deciding is not None and deciding.unknown and not goes_on:
-        while_present = _while_present(evidence, leaves, times_ns, node, found)
+        while_present = _while_present(evidence, leaves, times_ns, node, path)
 
     def flip(atom: DecidingAtom) -> Threshold | Obstacle | None:
         over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
         return threshold_of(evidence, *over, node, verdict, atom, goes_on=open_ended)
 
     threshold = flip(deciding) if deciding is not None and flips else None
-    open_end = None
-    if end is not End.OPEN and lower < upper and not goes_on:
-        other_path = deciding_path(done, node, end.turned)
-        other = atom_of_path(evidence, done, other_path, evidence.scene)
-        if other is not None and other.lower < other.upper:
-            open_end = other, int(times_ns[other_path.steps[-1].sample])
+    has_open_end = end is not End.OPEN and lower < upper and not goes_on
     missed, closest, closest_path = _NOTHING_MISSED
     if verdict is Verdict.VIOLATED:
-        missed, closest, closest_path = find_missed(evidence, done, found, evidence.scene)
+        missed, closest, closest_path = find_missed(evidence, nodes, path, evidence.scene)
     response = flip(closest[0]) if closest is not None and flips else None
     return Witness(
         instance.name,
@@ -224,21 +219,32 @@ def find_witness(
         verdict,
         lower,
         upper,
-        path,
+        steps,
         deciding,
         threshold if isinstance(threshold, Threshold) else None,
         None if isinstance(threshold, Threshold) else threshold,
-        open_end,
+        _open_end(evidence, nodes, node, end.turned) if has_open_end else None,
         int(times_ns[-1]) if goes_on else None,
         missed,
         gaps,
         closest,
-        () if closest_path is None else _steps(evidence, done, closest_path),
+        () if closest_path is None else _steps(evidence, nodes, closest_path),
         evidence.units,
-        declared_unit(evidence.bound(done.tree[node][0]), evidence.units),
+        declared_unit(evidence.bound(nodes.tree[node][0]), evidence.units),
         while_present,
         response if isinstance(response, Threshold) else None,
     )
+
+
+def _open_end(
+    evidence: Evidence, nodes: OfflineNodes, node: int, end: End
+) -> tuple[DecidingAtom, int] | None:
+    """Return the atom that leaves one end of a node open, and the time of its sample; None if none does."""
+    path = deciding_path(nodes, node, end)
+    deciding = atom_of_path(evidence, nodes, path, evidence.scene)
+    if deciding is None or deciding.lower == deciding.upper:
+        return None
+    return deciding, int(nodes.times_ns[path.steps[-1].sample])
 
 
 SceneAt: TypeAlias = Callable[[int], TraceScene]
@@ -264,28 +270,28 @@ _NOTHING_MISSED: Final = MissedWitness()
 
 
 def atom_of_path(
-    evidence: Evidence, done: OfflineNodes, path: DecidingPath, scene_at: SceneAt
+    evidence: Evidence, nodes: OfflineNodes, path: DecidingPath, scene_at: SceneAt
 ) -> DecidingAtom | None:
     """Return the atom that decides the leaf at the end of a path; None if that is no leaf."""
     step = path.steps[-1]
-    leaf = evidence.bound(done.tree[step.node][0])
+    leaf = evidence.bound(nodes.tree[step.node][0])
     if not isinstance(leaf, Atom | Quantified):
         return None
-    return deciding_atom(scene_at(int(done.times_ns[step.sample])), leaf, path.end)
+    return deciding_atom(scene_at(int(nodes.times_ns[step.sample])), leaf, path.end)
 
 
 def find_missed(
-    evidence: Evidence, done: OfflineNodes, path: DecidingPath, scene_at: SceneAt
+    evidence: Evidence, nodes: OfflineNodes, path: DecidingPath, scene_at: SceneAt
 ) -> MissedWitness:
     """Return the response that was missed on a path to what violates a formula."""
-    missed, nearest = missed_response(path, done, evidence.instance.bindings)
+    missed, nearest = missed_response(path, nodes, evidence.instance.bindings)
     if missed is not None:
-        best = None if nearest is None else atom_of_path(evidence, done, nearest, scene_at)
+        best = None if nearest is None else atom_of_path(evidence, nodes, nearest, scene_at)
         if nearest is None or best is None or best.unknown:
             return MissedWitness(missed)
-        return MissedWitness(missed, (best, int(done.times_ns[nearest.steps[-1].sample])), nearest)
+        return MissedWitness(missed, (best, int(nodes.times_ns[nearest.steps[-1].sample])), nearest)
     step = path.steps[-1]
-    leaf, at_ns = evidence.bound(done.tree[step.node][0]), int(done.times_ns[step.sample])
+    leaf, at_ns = evidence.bound(nodes.tree[step.node][0]), int(nodes.times_ns[step.sample])
     if not isinstance(leaf, Quantified):
         return _NOTHING_MISSED
     # an implication within the one node of an open group
@@ -299,9 +305,8 @@ def find_missed(
     return MissedWitness(missed, None if best is None or best.unknown else (best, at_ns))
 
 
-def _steps(evidence: Evidence, done: OfflineNodes, path: DecidingPath) -> tuple[WitnessStep, ...]:
-    nodes = (evidence.bound(done.tree[step.node][0]) for step in path.steps)
-    return tuple(_step(step, node, done.times_ns) for step, node in zip(path.steps, nodes, strict=True))
+def _steps(evidence: Evidence, nodes: OfflineNodes, path: DecidingPath) -> tuple[WitnessStep, ...]:
+    return tuple(_step(step, evidence.bound(nodes.tree[step.node][0]), nodes.times_ns) for step in path.steps)
 
 
 def _while_present(
