@@ -14,7 +14,7 @@ import numpy as np
 from spatial_replay.compare.runs import file_of
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import Source
+from spatial_replay.logs.messages import ZERO, Source
 from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene, look_back
@@ -28,7 +28,6 @@ from spatial_replay.replay.engine import Replay, Replayed, run_replay
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
-    ZERO,
     ReplayOptions,
     Selection,
     Window,

@@ -424,6 +424,9 @@ LIBRARY = "spatial-replay"
 METADATA = "spatial_replay"
 """The metadata record that comes first: who wrote the log, from what, with which options."""
 
+ZERO = "zero_ns"
+"""Its entry of the time that texts about the log count from; without it, they count from the first sample."""
+
 ENDING = "spatial_replay_ending"
 """The metadata record at the end of a recording: how many samples it holds, and how it ended."""
 

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.errors import OutputError, UsageError, system_reason
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import TRIGGER, Channel, Messages, Row
+from spatial_replay.logs.messages import TRIGGER, ZERO, Channel, Messages, Row
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.monitor.monitor import Monitor, Update
 from spatial_replay.recording.log import (
@@ -341,6 +341,7 @@ class ClipLog(RecorderLog):
         self._channels: Mapping[int, Channel] = {}
         self.held_bytes = 0
         self._newest_ns = self._evicted_ns = -1
+        self._zero_ns: int | None = None
         self._progress: dict[type, tuple[int, float]] = {}
         self._open: _Open | None = None
         self._manual: deque[_ManualTrigger] = deque()
@@ -377,6 +378,8 @@ class ClipLog(RecorderLog):
         self._begin_due()
         # in the order of time, so that the ring holds what is around the sample that fires
         for item in sorted(come, key=lambda each: each.time_ns):
+            if self._zero_ns is None and isinstance(item.content, Sample):
+                self._zero_ns = item.time_ns
             self._hold(item)
             if isinstance(item.content, Sample):
                 self._evaluate(item.content)
@@ -493,7 +496,8 @@ class ClipLog(RecorderLog):
                 number += 1
             slug = re.sub(r"[^A-Za-z0-9_]+", "-", reason).strip("-")[:60] or "trigger"
             path = self._folder / f"{number:04d}-{slug}.mcap"
-            clip = self._open = _Open(path, self._files, self._about, reason, at_ns)
+            zero = {} if self._zero_ns is None else {ZERO: str(self._zero_ns)}
+            clip = self._open = _Open(path, self._files, {**self._about, **zero}, reason, at_ns)
             clip.channels = self._channels
             begin_ns = clip.begin_ns = at_ns - self._before_ns
             for held in self._static:

@@ -43,6 +43,7 @@ from spatial_replay.logs.messages import (
     PLAN_METADATA,
     RECORDED_PREFIX,
     VERDICTS,
+    ZERO,
     Attachment,
     Channel,
     Messages,
@@ -118,7 +119,7 @@ class Recording:
 
         Args:
             files: specifications to evaluate and write beside the samples.
-            about: further metadata: where the samples come from, a seed.
+            about: further metadata: where the samples come from, a seed, the zero of a part of a run.
             known: automata of specs of these files, which are not compiled again.
 
         Raises:
@@ -141,6 +142,8 @@ class Recording:
         self._doubts: tuple[str, ...] = ()
         self._images: set[str] = set()
         self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
+        if about is not None and ZERO in about:
+            self._evaluation.annotator.count_from(int(about[ZERO]))
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
             sink.add_metadata(AUTOMATA, {each.name: each.summary for each in self.automata})

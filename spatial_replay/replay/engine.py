@@ -34,6 +34,7 @@ from spatial_replay.logs.messages import (
     RECORDED_PREFIX,
     REPLAYED_PREFIX,
     VERDICTS,
+    ZERO,
     Attachment,
     Block,
     Messages,
@@ -56,7 +57,6 @@ from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
-    ZERO,
     LogNames,
     ReplayOptions,
     Selection,

@@ -23,6 +23,7 @@ from spatial_replay.logs.messages import (
     METADATA,
     OBJECTS,
     SAMPLES_A_GAP,
+    ZERO,
     Block,
     Channel,
     MemorySource,
@@ -58,8 +59,6 @@ if TYPE_CHECKING:
 KEEP_ALL: Final = (ALL,)
 """Default selection of a copy."""
 
-ZERO: Final = "zero_ns"
-"""The metadata entry of the time that texts about a log count from."""
 _DECIMAL: Final = re.compile(r"\d{1,19}", re.ASCII)
 CLIP_METADATA: Final = "spatial_replay_clip"
 """The metadata record that says what a clip was cut from."""

@@ -492,6 +492,9 @@ def test_a_recorder_keeps_what_is_around_its_trigger(tmp_path: Path, when: str, 
     trace = sr.read_trace(clip.path)
     assert trace.times_ns.tolist() == [tick * 10**8 for tick in range(at - 10, at + 6)]
     assert len([each for each in messages_of(clip.path) if each[0] == "/camera"]) == 16
+    # seconds are those of the run, also when the clip is evaluated by itself
+    (result,) = sr.replay_log(clip.path).results
+    assert result.violated_at_ns is None or " 4.100 s" in result.explain()
 
 
 @pytest.mark.parametrize(
