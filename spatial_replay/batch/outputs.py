@@ -89,13 +89,13 @@ def repository_path(file: str | Path, environment: Mapping[str, str] = os.enviro
     """
     if is_address(file):
         return str(file)
-    path, here = Path(file).absolute(), Path.cwd()
+    path, current = Path(file).absolute(), Path.cwd()
     job = environment.get("GITHUB_WORKSPACE")
-    above = next((each for each in (here, *here.parents) if (each / ".git").exists()), here)
+    above = next((folder for folder in (current, *current.parents) if (folder / ".git").exists()), current)
     for base in (Path(job) if job else above, above):
-        for own, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
-            if own.is_relative_to(root):
-                return own.relative_to(root).as_posix()
+        for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
+            if candidate.is_relative_to(root):
+                return candidate.relative_to(root).as_posix()
     return path.as_posix()
 
 
@@ -255,7 +255,7 @@ def _lines(
 ) -> Iterator[str]:
     suites: dict[tuple[str, ...], list[Values]] = {}
     keys = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
-    found = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
+    results = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
     faults = ("failure", "expected", "error", "error_kind")
     edited = {
         (total.group["case"], total.group["file"], total.group["spec"])
@@ -265,7 +265,7 @@ def _lines(
     flaky: dict[tuple[str, str, str], list[str]] = {}
     for result in flaky_results(table):
         flaky.setdefault((result.case, result.file, result.spec), []).append(result.text)
-    for row in table.select([*keys, *found, *faults]).to_pylist():
+    for row in table.select([*keys, *results, *faults]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
     yield '<?xml version="1.0" encoding="utf-8"?>\n'
@@ -274,7 +274,7 @@ def _lines(
         f'time="{_time(row for rows in suites.values() for row in rows)}">\n'
     )
     for (case, file, spec), rows in suites.items():
-        shown = rows if keeps else [row for row in rows if row["failure"] is not None]
+        written = rows if keeps else [row for row in rows if row["failure"] is not None]
         failures, errors = _counts(rows)
         title = f"{case}.{spec or file}"
         yield (
@@ -294,10 +294,10 @@ def _lines(
         yield "</properties>\n"
         # two files may have a spec of one name
         class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
-        for row in shown:
+        for row in written:
             yield from _case(row, class_name, reports, limit)
-        if len(shown) < len(rows):
-            left_out = counted(len(rows) - len(shown), "test case")
+        if len(written) < len(rows):
+            left_out = counted(len(rows) - len(written), "test case")
             yield f"<system-out>{left_out} that passed left out, to keep this report small</system-out>\n"
         yield "</testsuite>\n"
     yield "</testsuites>\n"
@@ -321,8 +321,8 @@ def _case(
         if (row["case"], row["log"]) in reports:
             yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
     elif row["untested"] and limit is None:
-        own = _text("\n".join([*tested, *row["untested"]]))
-        yield f"<system-out>{own}</system-out>\n"
+        text = _text("\n".join([*tested, *row["untested"]]))
+        yield f"<system-out>{text}</system-out>\n"
     yield "</testcase>\n"
 
 
@@ -417,21 +417,21 @@ def _panel(title: str, *content: Html) -> Html:
 def _totals(by_spec: Sequence[Total]) -> Html:
     names = ("case", "spec", "requirement")
     numbers, cells = _cells(by_spec)
-    head = [*(element("th", each) for each in names), *(_number("th", each) for each in numbers)]
+    head = [*(element("th", name) for name in names), *(_number("th", name) for name in numbers)]
     rows = [
         element(
             "tr",
-            *(element("td", text(cell)) for cell in own[: len(names)]),
-            *(_number("td", cell) for cell in own[len(names) :]),
+            *(element("td", text(cell)) for cell in row[: len(names)]),
+            *(_number("td", cell) for cell in row[len(names) :]),
         )
-        for own in cells
+        for row in cells
     ]
     return element("table", element("thead", element("tr", *head)), element("tbody", *rows))
 
 
 def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
-    names = [element("th", each) for each in ("log", "spec")]
-    texts = [element("th", each) for each in ("failure", "reason")]
+    names = [element("th", name) for name in ("log", "spec")]
+    texts = [element("th", name) for name in ("failure", "reason")]
     head = element("tr", *names, _number("th", "robustness"), *texts)
     body = [
         element(
@@ -463,9 +463,9 @@ def _with_code(sentence: str) -> Iterator[Html]:
 def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
     import pyarrow.compute as pc
 
-    has_cases = len({each.group["case"] for each in by_spec}) > 1
-    for each in by_spec:
-        group = each.group
+    has_cases = len({total.group["case"] for total in by_spec}) > 1
+    for total in by_spec:
+        group = total.group
         fits = pc.and_(
             pc.and_(pc.equal(table["case"], group["case"]), pc.equal(table["file"], group["file"])),
             pc.equal(table["spec"], group["spec"]),
@@ -474,8 +474,8 @@ def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
         finite = numbers[np.isfinite(numbers)]
         if len(finite):
             case = group["case"] if has_cases else None
-            title = " · ".join(filter(None, (case, each.requirement, group["spec"])))
-            caption = element("figcaption", text(title), **_tip(each.about))
+            title = " · ".join(filter(None, (case, total.requirement, group["spec"])))
+            caption = element("figcaption", text(title), **_tip(total.about))
             yield element("figure", caption, _histogram(finite))
 
 
@@ -513,7 +513,7 @@ def _matrix(
     table: pa.Table, by_spec: Sequence[Total], reports: Mapping[tuple[str, str], str]
 ) -> Iterator[Html]:
     """Yield a row for each log, the worst first, and a column for each spec."""
-    columns = [(each.group["case"], each.group["file"], each.group["spec"]) for each in by_spec]
+    columns = [(total.group["case"], total.group["file"], total.group["spec"]) for total in by_spec]
     cells: dict[str, dict[tuple[str, str, str], Values]] = {}
     for row in worst_rows(table, len(table)):
         column = (row["case"], row["file"], row["spec"])
@@ -531,13 +531,13 @@ def _matrix(
     cases = {case for case, _, _ in columns}
     yield element("p", "Marked results fail.")
     titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
-    abouts = [each.about for each in by_spec]
+    abouts = [total.about for total in by_spec]
     head = [_sortable("log", ""), *map(_sortable, titles, ["number"] * len(titles), abouts)]
     body = []
     for name, of_log in cells.items():
-        shown = [_cell(of_log.get(column)) for column in columns]
-        own = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
-        body.append(element("tr", element("td", _linked(own, reports)), *shown))
+        row_cells = [_cell(of_log.get(column)) for column in columns]
+        report = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
+        body.append(element("tr", element("td", _linked(report, reports)), *row_cells))
     yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
 
 
@@ -552,13 +552,15 @@ def _cell(row: Values | None) -> Html:
         return element(
             "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
         )
-    shown = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
+    words = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
     value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
     why = f": {row['failure'].rstrip('.')}" if fails else ""
     tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
-    tip = " ".join([tip, *(each for each in row["untested"] or () if each.rstrip(".") not in why)])
-    shown = f"{shown}{damage_word(row)}{before}"
-    return element("td", shown, title=tip, **{"class": kind, "data-value": value})
+    tip = " ".join(
+        [tip, *(sentence for sentence in row["untested"] or () if sentence.rstrip(".") not in why)]
+    )
+    words = f"{words}{damage_word(row)}{before}"
+    return element("td", words, title=tip, **{"class": kind, "data-value": value})
 
 
 def _sortable(title: str, kind: str, about: str = "") -> Html:
@@ -630,24 +632,24 @@ def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:
     """Return what is wanted of each log with a failing verdict, by case and log."""
     names = ("case", "log", "failure", "error")
     rows = zip(*(result.table.column(name).to_pylist() for name in names), strict=True)
-    found: dict[tuple[str, str], list[Wanted]] = {
+    wanted_by_log: dict[tuple[str, str], list[Wanted]] = {
         (case, log): [] for case, log, failure, error in rows if failure and not error
     }
-    for each in result.wanted:
-        if (each.case.name, each.log.name) in found:
-            found[each.case.name, each.log.name].append(each)
+    for wanted in result.wanted:
+        if (wanted.case.name, wanted.log.name) in wanted_by_log:
+            wanted_by_log[wanted.case.name, wanted.log.name].append(wanted)
     # a result that is gone may have no log any more
-    return {key: wanted for key, wanted in found.items() if wanted}
+    return {key: wanted for key, wanted in wanted_by_log.items() if wanted}
 
 
 def _task(wanted: list[Wanted]) -> Task:
     first = wanted[0]
-    return Task(first.log.path, tuple(each.file.text for each in wanted), first.case.conditions)
+    return Task(first.log.path, tuple(request.file.text for request in wanted), first.case.conditions)
 
 
 def _file_name(log: str, wanted: list[Wanted]) -> str:
     """Return a name that says which log it is, and changes with what the page shows."""
-    digest = hashlib.sha256("".join(each.key or "" for each in wanted).encode()).hexdigest()[:12]
+    digest = hashlib.sha256("".join(request.key or "" for request in wanted).encode()).hexdigest()[:12]
     return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
 
 

@@ -144,8 +144,8 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
         except UsageError as error:
             yield str(error)
         if parameter not in parameters:
-            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
-            yield f"no template has a parameter {parameter!r}; templates here: {known}"
+            names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
+            yield f"no template has a parameter {parameter!r}; templates here: {names}"
     for spec in templates:
         if spec.parameter not in chosen:
             yield (
@@ -185,7 +185,7 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
         UsageError: patterns without a log; all are listed, with their places.
         RemoteError: a bucket cannot be listed.
     """
-    found: dict[str, FoundLog] = {}
+    logs_by_path: dict[str, FoundLog] = {}
     faults = []
     for pattern in patterns:
         place = f"{pattern.place}: " if pattern.place else ""
@@ -196,12 +196,12 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
             continue
         if not logs:
             faults.append(f"{place}{_nothing(pattern.text, folder)}")
-        found.update((log.path, log) for log in logs if log.path not in found)
-        if len(found) > _MOST_LOGS:
+        logs_by_path.update((log.path, log) for log in logs if log.path not in logs_by_path)
+        if len(logs_by_path) > _MOST_LOGS:
             raise UsageError(f"{pattern.text}: more than {counted(_MOST_LOGS, 'log')}; split the batch")
     if faults:
         raise UsageError("\n".join(first_lines(faults, _MOST_FAULTS)))
-    return list(found.values())
+    return list(logs_by_path.values())
 
 
 def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
@@ -232,16 +232,18 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
     if address.startswith(("http://", "https://")) or not (is_folder or has_magic(address)):
         yield FoundLog(str(log_file(address)), address)
         return
-    found = matching_addresses(address)
-    bags = {each.removesuffix(BAG_METADATA) for each in found if each.endswith(f"/{BAG_METADATA}")}
-    for each in found:
-        folder = each[: each.rfind("/") + 1]
+    addresses = matching_addresses(address)
+    bags = {
+        address.removesuffix(BAG_METADATA) for address in addresses if address.endswith(f"/{BAG_METADATA}")
+    }
+    for address in addresses:
+        folder = address[: address.rfind("/") + 1]
         if folder in bags:
             # a ROS 2 bag is one log, where its metadata is in the order
-            if each == folder + BAG_METADATA:
+            if address == folder + BAG_METADATA:
                 yield FoundLog(folder, folder)
-        elif not is_folder or each.lower().endswith(LOG_ENDINGS):
-            yield FoundLog(each, each)
+        elif not is_folder or address.lower().endswith(LOG_ENDINGS):
+            yield FoundLog(address, address)
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
@@ -254,12 +256,12 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
             continue
         # in the order of their names, and without hidden folders
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        here = _found(Path(parent), folder)
+        parent_log = _found(Path(parent), folder)
         for name in sorted(names):
             if name.lower().endswith(LOG_ENDINGS) and not name.startswith("."):
                 # as texts: paths would take most of the time
-                shown = name if here.name == "." else f"{here.name}/{name}"
-                yield FoundLog(encodable(shown), f"{here.path}/{name}")
+                path_name = name if parent_log.name == "." else f"{parent_log.name}/{name}"
+                yield FoundLog(encodable(path_name), f"{parent_log.path}/{name}")
     # to open one is the error of its row: a batch does not pass over logs in silence
     yield from (_found(Path(error.filename), folder) for error in closed)
 
@@ -298,12 +300,15 @@ def identify(
     groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
     # few are read sooner than a process begins
     at_work = ThisProcess() if len(groups) == 1 else workers
-    found: dict[str, str | None] = {}
+    identity_by_path: dict[str, str | None] = {}
     with progress("logs read", len(unknown)) as advance:
         for group, identities in at_work.results(identities_of, groups) if groups else ():
-            found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
+            identity_by_path |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
             advance(len(group))
-    return {path: found[path] if path in found else known[states[path] or ""] for path in paths}, states
+    return {
+        path: identity_by_path[path] if path in identity_by_path else known[states[path] or ""]
+        for path in paths
+    }, states
 
 
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
@@ -324,7 +329,7 @@ def _identity(path: str) -> str | None:
 def _files_of(path: str) -> list[Path]:
     """Return the files that a log consists of."""
     whole = Path(path)
-    return sorted(each for each in whole.iterdir() if each.is_file()) if whole.is_dir() else [whole]
+    return sorted(file for file in whole.iterdir() if file.is_file()) if whole.is_dir() else [whole]
 
 
 def _state(path: str) -> str | None:
@@ -355,8 +360,8 @@ def _hash_of_log(path: str) -> str:
     if not Path(path).is_dir():
         raise OSError(f"{path} is no regular file")
     total = hashlib.sha256()
-    for each in files:
-        total.update(f"{each.name}\0{_hash_of(each)}\0".encode("utf-8", "surrogatepass"))
+    for file in files:
+        total.update(f"{file.name}\0{_hash_of(file)}\0".encode("utf-8", "surrogatepass"))
     return f"files:{total.hexdigest()}"
 
 
@@ -369,7 +374,7 @@ def _version_at(address: str) -> str:
     file = log_file(address)
     assert isinstance(file, RemoteFile)
     files = bag_files_at(file) if file.name == BAG_METADATA else [file]
-    versions = [(str(each), *_version_of(each)) for each in files]
+    versions = [(str(file), *_version_of(file)) for file in files]
     return f"version:{hashlib.sha256(json.dumps(versions).encode()).hexdigest()}"
 
 
@@ -475,7 +480,7 @@ def _files(
         try:
             texts[path] = read_specification_text(path)
         except SpecificationError as error:
-            faults.diagnoses.update((str(each), each) for each in error.diagnoses)
+            faults.diagnoses.update((str(diagnosis), diagnosis) for diagnosis in error.diagnoses)
         except UsageError as error:
             faults.add(f"{case.place('specs')}{error}")
     if case.conditions.mapping is not None:
@@ -483,20 +488,20 @@ def _files(
             load_mapping(case.conditions.mapping)
         except UsageError as error:
             faults.add(str(error))
-    own = tuple(text for path in case.specs if (text := texts[path]) is not None)
-    if not case.is_whole or len(own) < len(case.specs):
+    case_texts = tuple(text for path in case.specs if (text := texts[path]) is not None)
+    if not case.is_whole or len(case_texts) < len(case.specs):
         return ()
     try:
-        parsed = parsed_specifications(own, case.conditions)
+        parsed = parsed_specifications(case_texts, case.conditions)
     except SpecificationError as error:
-        faults.diagnoses.update((str(each), each) for each in error.diagnoses)
+        faults.diagnoses.update((str(diagnosis), diagnosis) for diagnosis in error.diagnoses)
         return ()
     except UsageError as error:
         faults.add(f"{case.place('constants')}{error}")
         return ()
     for fault in choice_faults(case, parsed):
         faults.add(f"{case.place('each')}{fault}")
-    return tuple(spec_file(*each, folder) for each in zip(case.specs, own, parsed, strict=True))
+    return tuple(spec_file(*file, folder) for file in zip(case.specs, case_texts, parsed, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -577,12 +582,16 @@ def run_batch(
     folder = ResultsFolder.create(results)
     with folder.locked():
         known, remarks = folder.identities()
-        paths = list(dict.fromkeys(log.path for each in cases for log in each.logs))
+        paths = list(dict.fromkeys(log.path for case in cases for log in case.logs))
         identities, states = identify(paths, known, workers, progress)
         wanted = _wanted(cases, identities)
-        by_state = {states[path] or "": each for path, each in identities.items() if each and states[path]}
+        by_state = {
+            states[path] or "": identity for path, identity in identities.items() if identity and states[path]
+        }
         folder.write_identities(by_state)
-        lasting = {each.key for each in wanted if each.key is not None and not each.file.has_plugins}
+        lasting = {
+            request.key for request in wanted if request.key is not None and not request.file.has_plugins
+        }
         stored, damaged = folder.rows(lasting)
         tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
@@ -602,7 +611,7 @@ def run_batch(
         table = _table(wanted, [stored, *new_rows.tables], unstored, fail_on)
         folder.write_run(table)
     # a log that cannot be read was tried, and is not known
-    evaluated = {task.log for task in tasks} | {each.log.path for each in wanted if each.key is None}
+    evaluated = {task.log for task in tasks} | {request.log.path for request in wanted if request.key is None}
     return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
 
 
@@ -639,11 +648,11 @@ def _key_of(conditions: Conditions) -> list[Any]:
 def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> dict[Task, tuple[str, ...]]:
     """Return a task for each log and conditions that lack rows, with the keys of these."""
     groups: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
-    taken = set(stored)
-    for each in wanted:
-        if each.key is not None and each.key not in taken:
-            taken.add(each.key)
-            groups[each.log.path, each.case.conditions][each.key] = each.file
+    keys = set(stored)
+    for request in wanted:
+        if request.key is not None and request.key not in keys:
+            keys.add(request.key)
+            groups[request.log.path, request.case.conditions][request.key] = request.file
     return {
         Task(path, tuple(file.text for file in files.values()), conditions): tuple(files)
         for (path, conditions), files in groups.items()
@@ -660,17 +669,19 @@ def _table(
     import pyarrow as pa
 
     unreadable = {
-        f"{each.log.path}\0{each.file.hash}": _unreadable(each) for each in wanted if each.key is None
+        f"{request.log.path}\0{request.file.hash}": _unreadable(request)
+        for request in wanted
+        if request.key is None
     }
     rows = pa.concat_tables([*stored, table_of({**unstored, **unreadable})])
     places: dict[str, list[int]] = defaultdict(list)
     for place, key in enumerate(rows.column("key").to_pylist()):
         places[key].append(place)
     indices, asked = [], []
-    for each in wanted:
-        for place in places[each.key or f"{each.log.path}\0{each.file.hash}"]:
+    for request in wanted:
+        for place in places[request.key or f"{request.log.path}\0{request.file.hash}"]:
             indices.append(place)
-            asked.append(each)
+            asked.append(request)
     chosen = rows.take(pa.array(indices, pa.int64()))
     return _judged(_named(chosen, asked), asked, fail_on)
 
@@ -680,15 +691,15 @@ def _named(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
     import pyarrow as pa
 
     sources = rows.column(SOURCE).to_pylist()
-    names = [encodable(log_file(each.log.path).name) for each in asked]
-    other = [
+    names = [encodable(log_file(request.log.path).name) for request in asked]
+    renamed = [
         place for place, (old, new) in enumerate(zip(sources, names, strict=True)) if old not in (None, new)
     ]
-    if not other:
+    if not renamed:
         return rows
     for column in ("faults", "remarks", "missing", "error"):
         texts = rows.column(column).to_pylist()
-        for place in other:
+        for place in renamed:
             texts[place] = _renamed(texts[place], sources[place], names[place])
         field = rows.schema.field(column)
         rows = rows.set_column(rows.schema.get_field_index(column), field, pa.array(texts, field.type))
@@ -699,7 +710,7 @@ def _renamed(text: str | list[str] | None, old: str, new: str) -> str | list[str
     """Return texts with another name of a file, where it is a word: "a.csv" is part of "b-a.csv.gz"."""
     if isinstance(text, str):
         return re.sub(rf"(?<![\w./-]){re.escape(old)}(?![\w-]|\.\w)", lambda _: new, text)
-    return text and [str(_renamed(each, old, new)) for each in text]
+    return text and [str(_renamed(line, old, new)) for line in text]
 
 
 def _unreadable(wanted: Wanted) -> tuple[ResultRow, ...]:
