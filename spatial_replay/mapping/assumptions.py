@@ -753,7 +753,7 @@ ASSUMPTIONS: Final = (
         "A name is one object.",
         "leaps by more than the object's size, and back within four reports; a quarter of all contradicts",
         _one_object,
-        "give a `name` with the field that tells them apart",
+        "give a `name` with the field that distinguishes them",
     ),
     Assumption(
         "complete_list",
@@ -825,7 +825,7 @@ ASSUMPTIONS: Final = (
         "Objects move steadily.",
         "the longest step; five sizes at 20 times the usual speed is remarked",
         _leap,
-        "`invalid` names numbers without a value, a `name` with an id tells objects apart",
+        "`invalid` names numbers without a value, a `name` with an id distinguishes objects",
         is_remark=True,
     ),
 )
