@@ -9,7 +9,8 @@ import numpy as np
 
 from spatial_replay.monitor.ends import Needs
 from spatial_replay.monitor.stream import Instance
-from spatial_replay.spec.formula import ANY_CLASS, NamedSpec, Specification
+from spatial_replay.spec.formula import ANY_CLASS, NamedSpec, Specification, TrackedName
+from spatial_replay.spec.walks import base_of, iter_atoms
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import ABSENT, Trace
 
@@ -51,7 +52,14 @@ class ClassMembers:
 def needs_of_spec(spec: NamedSpec, object: str | None = None) -> Needs:
     """Return the names that one spec uses; the parameter of a template stands for the object."""
     needs = Needs.of([Specification((replace(spec, parameter=None),), profile="")], {})
-    return needs if object is None else replace(needs, objects=needs.objects | {object})
+    # an object of `present` alone is not needed for a verdict, but may be absent by a wrong reading
+    names = {
+        term.name
+        for atom in iter_atoms(spec.formula)
+        for term in map(base_of, atom.terms)
+        if isinstance(term, TrackedName)
+    }
+    return replace(needs, objects=needs.objects | names | ({object} if object is not None else set()))
 
 
 def doubts_about(needs: Needs, doubts: Iterable[Doubt], members: ClassMembers) -> tuple[Doubt, ...]:

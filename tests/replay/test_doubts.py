@@ -32,6 +32,7 @@ spec named = G (robot enclosedin zone)
 spec other = G (cart enclosedin zone)
 spec classed = G (forall p in people: p enclosedin zone)
 spec any = G (forall a in everything: a enclosedin zone)
+spec gone = F present(robot) and F present(cart)
 spec charged = G ("battery" > 0)
 spec each(ego) = G (ego enclosedin zone)
 """
@@ -64,7 +65,7 @@ def replay(trace: Trace) -> Replayed:
 @pytest.mark.parametrize(
     ("about", "results"),
     [
-        ({"objects": {"robot"}}, {"named", "any", "each(robot)"}),
+        ({"objects": {"robot"}}, {"named", "gone", "any", "each(robot)"}),
         # of the class in one sample only
         ({"objects": {"walker"}}, {"classed", "any", "each(walker)"}),
         ({"signals": {"battery"}}, {"charged"}),
