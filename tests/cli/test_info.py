@@ -89,7 +89,7 @@ def test_an_annotated_log_shows_its_verdicts(log: Path, capsys: pytest.CaptureFi
         capsys.readouterr()
         assert run(["info", str(path)]) == 0
         assert (
-            "verdicts\n  charged  violated, robustness not determined\n  alone    unknown, robustness not"
+            "verdicts\n  charged  violated, robustness between -inf and -0.1\n  alone    unknown, robustness"
             in capsys.readouterr().out
         )
     assert run(["info", str(annotated), "--json"]) == 0
