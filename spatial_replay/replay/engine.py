@@ -273,16 +273,23 @@ class Replay:
             write(merge(annotator.end(self._end_ns, finals, replayed.results)))
         return replayed
 
-    def draw_samples(self, times_ns: Sequence[int], show: Callable[[SceneFrames], None]) -> None:
-        """Draw the scene at some samples; call it after `run`, which kept series and leaves.
-
-        Messages of the scene leave out samples that follow each other closely.
+    def draw_samples(
+        self, results: Sequence[SpecResult], times_ns: Sequence[int], show: Callable[[SceneFrames], None]
+    ) -> None:
+        """Draw the scene at some samples, also at those without a message of the scene.
 
         Args:
+            results: what `run` returned, with series and leaves.
             times_ns: those of the samples, increasing.
             show: takes what the scene shows at each.
         """
-        stretches = [join_blocks(kept) for kept in self._kept]
+        if not times_ns:
+            return
+        stretches = [
+            SeriesBlock(result.times_ns, result.series, result.leaves)
+            for result in results
+            if result.leaves is not None
+        ]
         scene = replace(self._evaluation.annotator.scene, written_ns=None, shown=(), last={})
         annotator = self._evaluation.new_annotator(scene, self._selection.options.arrow, show)
         waiting = deque(times_ns)

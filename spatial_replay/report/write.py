@@ -149,7 +149,7 @@ def report_of(
         planned_for(source, replay.files),
     )
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
-    replay.draw_samples(missing_ns, collector.scene.insert)
+    replay.draw_samples(replayed.results, missing_ns, collector.scene.insert)
     return replayed, report
 
 
