@@ -931,7 +931,7 @@ class LiveAssembler(_Assembling):
             return
         for time_ns, message in zip(times_ns.tolist(), contents, strict=True):
             try:
-                chunk = reader.extractor.read([message], np.zeros(1, np.int64))
+                chunk = reader.extractor.read([message], np.zeros(1, np.int64), is_early=True)
             except MISFITS:
                 # reported when it is read for its objects
                 continue

@@ -194,11 +194,12 @@ class Extractor:
             time = self._time_of_empty
         return None if time is None else time.nanoseconds([message])[0]
 
-    def read(self, messages: Sequence[object], places: Integers) -> DetectionChunk:
+    def read(self, messages: Sequence[object], places: Integers, *, is_early: bool = False) -> DetectionChunk:
         """Extract the objects of some messages.
 
         Args:
             places: (N,) the place of each message in its batch.
+            is_early: whether they are read again later, in the order of their times.
 
         Raises:
             FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message differs
@@ -211,10 +212,11 @@ class Extractor:
         of_message = [messages[number] for number in index] if self.namer.needs_messages else None
         objects = _Objects(values, index, self.namer.codes(values, order, of_message))
         deleted: list[tuple[int, int]] = []
+        scene_stamps_ns = self._scene_stamps_ns
         if self.layout.solids == "marker":
             objects, deleted = _split_deleted_markers(objects)
         elif self.layout.solids == "scene":
-            deleted = self._deleted_entities(messages, objects)
+            deleted, scene_stamps_ns = self._deleted_entities(messages, objects)
         if self.namer.is_filtering:
             objects = objects.where(self.namer.select(objects.name))
         chunk = DetectionChunk(places, deleted)
@@ -227,6 +229,9 @@ class Extractor:
             paths = list(map(FieldPath.of, self.unseen))
             if any(leads_somewhere(path, thing) for path in paths for thing in objects.values):
                 self.unseen = ()
+        if not is_early:
+            # a message that fails is read again, alone
+            self._scene_stamps_ns = scene_stamps_ns
         return chunk
 
     def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:
@@ -240,22 +245,19 @@ class Extractor:
         )
 
     def _with_one_class(self, detections: Detections) -> Detections:
-        """Return objects that keep their first class, or are other objects with another one."""
+        """Return objects that keep their first class, or have their class in their name."""
         names, classes = detections.name.tolist(), detections.class_code.tolist()
-        first = [
-            self._first_classes.setdefault(name, code) for name, code in zip(names, classes, strict=True)
-        ]
-        if first == classes:
-            return detections
         if self.layout.class_changes == "first":
-            return replace(detections, class_code=np.array(first, np.int64))
-        split = [
-            name
-            if code == first_code
-            else self._names[f"{self._names.by_code[name]}_{self._classes.by_code[code]}"]
-            for name, code, first_code in zip(names, classes, first, strict=True)
-        ]
-        return replace(detections, name=np.array(split, np.int64))
+            first = self._first_classes
+            classes = [first.setdefault(name, code) for name, code in zip(names, classes, strict=True)]
+            return replace(detections, class_code=np.array(classes, np.int64))
+        # by the class alone, so that a window has the names of the whole log
+        names = [self._name_of_class(name, code) for name, code in zip(names, classes, strict=True)]
+        return replace(detections, name=np.array(names, np.int64))
+
+    def _name_of_class(self, name: int, code: int) -> int:
+        class_name = self._classes.by_code[code]
+        return name if class_name is None else self._names[f"{self._names.by_code[name]}_{class_name}"]
 
     def _fill(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
@@ -290,7 +292,7 @@ class Extractor:
             chunk.numbers = read_rows(binding.numbers, values, binding.width, binding.style)
             self._forget_unset(binding, chunk.numbers, values)
             if self.layout.invalid:
-                chunk.numbers[np.isin(chunk.numbers, self.layout.invalid)] = nan
+                chunk.numbers[np.isin(chunk.numbers, with_single_precision(self.layout.invalid))] = nan
             if self.layout.origin is not None:
                 # such as degrees times 10,000,000; sizes beside them are in metres
                 chunk.numbers[:, list(binding.position[:2])] *= self.layout.scale
@@ -347,9 +349,15 @@ class Extractor:
     def _elements(self, message: object) -> list[object]:
         return [message] if self._path is None else list(iter_elements(self._path, message))
 
-    def _deleted_entities(self, messages: Sequence[object], entities: _Objects) -> list[tuple[int, int]]:
-        """Return (message, name) of each deletion in a foxglove.SceneUpdate; entities are after deletions."""
+    def _deleted_entities(
+        self, messages: Sequence[object], entities: _Objects
+    ) -> tuple[list[tuple[int, int]], dict[int, int]]:
+        """Return (message, name) of each deletion in a foxglove.SceneUpdate, and the stamps that remain.
+
+        The entities of a message are added after its deletions.
+        """
         deleted: list[tuple[int, int]] = []
+        stamps_ns = dict(self._scene_stamps_ns)
         starts = np.searchsorted(entities.message, np.arange(len(messages) + 1)).tolist()
         stamps = [_stamp_of_scene(entity) for entity in entities.values]
         for number, message in enumerate(messages):
@@ -357,16 +365,16 @@ class Extractor:
             for deletion in get(message, "deletions") or ():
                 stamp_ns = _stamp_of_scene(deletion) or LATEST_NS
                 if get(deletion, "type") in DELETE_ALL_ENTITIES:
-                    names = list(self._scene_stamps_ns)
+                    names = list(stamps_ns)
                 else:
                     names = self.namer.codes([deletion], [0], [message])
-                gone = [name for name in names if self._scene_stamps_ns.get(name, 0) <= stamp_ns]
+                gone = [name for name in names if stamps_ns.get(name, 0) <= stamp_ns]
                 for name in gone:
-                    self._scene_stamps_ns.pop(name, None)
+                    stamps_ns.pop(name, None)
                 deleted += [(number, name) for name in gone]
             reported = slice(starts[number], starts[number + 1])
-            self._scene_stamps_ns.update(zip(entities.name[reported], stamps[reported], strict=True))
-        return deleted
+            stamps_ns.update(zip(entities.name[reported], stamps[reported], strict=True))
+        return deleted, stamps_ns
 
     def _bind_time(self, example: object, message: object) -> None:
         if not self._is_time_bound:
@@ -526,13 +534,14 @@ class TopicReader:
         reads = self.is_mapped or self.decodes_on_arrival
         self._decode: Decoder = decoder(planned.topic) if reads else _skip
         decode = self._decode
-        if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
-            self._decode = lambda payload: sparse(decode(payload))
-        elif reads and planned.layout is not None and planned.layout.is_geojson:
+        if reads and planned.layout is not None and planned.layout.is_geojson:
             self._decode = lambda payload: features_in(decode(payload))
         elif reads and planned.is_protobuf_json:
             objects = planned.layout.objects if planned.layout is not None else ""
             self._decode = lambda payload: from_protobuf_json(decode(payload), objects)
+        if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
+            decode_fully = self._decode
+            self._decode = lambda payload: sparse(decode_fully(payload))
         self._time: TimeGetter | None = None
         self._is_time_bound = False
         self._signal_fields = () if planned.mapping is None else planned.mapping.signals
@@ -728,7 +737,7 @@ class TopicReader:
         except (TypeError, OverflowError):
             raise FieldError(f"{signal.field}: its value is neither a number nor a text") from None
 
-        invalid = () if self.planned.mapping is None else self.planned.mapping.invalid
+        invalid = with_single_precision(() if self.planned.mapping is None else self.planned.mapping.invalid)
 
         def number_of(message: object) -> float:
             value = get(message)
@@ -781,6 +790,11 @@ class TopicReader:
 
     def _misfit_error(self, reason: str) -> UsageError:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {reason}")
+
+
+def with_single_precision(numbers: Sequence[float]) -> list[float]:
+    """Return numbers, and what is left of them in a field of type float32."""
+    return [*numbers, *np.array(numbers, np.float32).astype(np.float64).tolist()]
 
 
 def _getter_of_set_values(path: FieldPath, example: object) -> Get:

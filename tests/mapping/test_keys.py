@@ -15,7 +15,7 @@ from google.protobuf.json_format import MessageToDict
 from google.protobuf.struct_pb2 import Struct
 from mcap.writer import Writer
 
-from mapping.feeding import SECOND, Feed, Made, make
+from mapping.feeding import SECOND, Feed, Made, make, ros
 from spatial_replay import Footprint, Trace, UsageError
 from spatial_replay.geometry.measure import contact
 from spatial_replay.mapping.assemble import LiveAssembler
@@ -246,7 +246,11 @@ def test_an_optional_number_that_protobuf_did_not_set_is_unknown() -> None:
     [
         ("remark", {"o1": "++++"}, {"o1": "walker, bike, bike, walker"}),
         ("first", {"o1": "++++"}, {"o1": "walker, walker, walker, walker"}),
-        ("split", {"o1": "+--+", "o1_bike": "-++-"}, {"o1": "walker, walker", "o1_bike": "bike, bike"}),
+        (
+            "split",
+            {"o1_bike": "-++-", "o1_walker": "+--+"},
+            {"o1_bike": "bike, bike", "o1_walker": "walker, walker"},
+        ),
     ],
 )
 def test_an_object_that_changes_its_class_is_one_or_two(
@@ -406,3 +410,8 @@ def test_a_topic_of_two_publishers_is_two_objects(tmp_path: Path) -> None:
     assert [doubt for block in blocks for doubt in block.doubts] == []
     with pytest.raises(UsageError, match=r"publisher 3; the topic has 2 channels"):
         list(log(f"{{name: a, publisher: 3, {part}}}").iter_blocks())
+
+
+def test_invalid_numbers_of_single_precision_are_found() -> None:
+    pose = ros("turtlesim/Pose", x=float(np.float32(327.67)), y=0.0)
+    assert read("invalid: [327.67]", pose, name="turtlesim/Pose").states("t") == "?"
