@@ -135,7 +135,7 @@ def _title(token: Token) -> str:
 
 def _arithmetic(operator: Any, operands: tuple[Quantity, ...], children: list[Any]) -> Arithmetic:
     span = _cover(children)
-    depth = 1 + max([each.depth for each in operands if isinstance(each, Arithmetic)], default=0)
+    depth = 1 + max([operand.depth for operand in operands if isinstance(operand, Arithmetic)], default=0)
     if depth > MAX_DEPTH:
         hint = "give parts of it names of their own, with const"
         raise StatementError(span, f"more than {MAX_DEPTH} operations within one another", hint)
@@ -499,7 +499,7 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
     tokens = group.tokens
     if group.is_broken:
         return _broken(tokens)
-    known = faults.count
+    fault_count = faults.count
     deepest = _too_deep(tokens)
     if deepest is not None:
         message = f"more than {MAX_DEPTH} brackets within one another"
@@ -528,7 +528,7 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
             _report(unexpected.token, tokens, parsing.accepts(), relations, faults)
     except StatementError as fault:
         faults.add(fault.span, fault.message, fault.hint)
-    if faults.count > known or result is None:
+    if faults.count > fault_count or result is None:
         return _broken(tokens)
     if group.is_bare_formula:
         formula: FormulaSyntax = result
@@ -630,24 +630,24 @@ def _report(
     token: Token, tokens: Sequence[Token], accepted: set[str], relations: Collection[str], faults: Faults
 ) -> None:
     """Report a token that cannot stand where it does."""
-    position = next((index for index, other in enumerate(tokens) if other is token), len(tokens))
+    position = next((index for index, candidate in enumerate(tokens) if candidate is token), len(tokens))
     before = tokens[position - 1] if position else None
     span = _place(token, tokens)
-    if position and (other := meant(tokens, position, accepted)) is not None:
-        faults.add(span, *other)
+    if position and (advice := meant(tokens, position, accepted)) is not None:
+        faults.add(span, *advice)
         return
     if token.type == "$END":
         rest = faults.source.text[span.start :].partition("\n")[0].lstrip()
         hint = "# begins a comment; a plug-in counts objects" if rest.startswith("#") else ""
         faults.add(span, f"the statement ends too early: expected {_expected(accepted)}", hint)
         return
-    found = f"expected {_expected(accepted)}, found {token.value!r}"
-    kinds = [each.type for each in tokens[: position + 1]]
+    message = f"expected {_expected(accepted)}, found {token.value!r}"
+    kinds = [token.type for token in tokens[: position + 1]]
     if kinds.count("RPAR") > kinds.count("LPAR"):
         faults.add(span, f"{token.value!r} closes nothing", "leave it out, or open it in front with '('")
     elif token.type == "NAME" and "RELATION" in accepted:
-        known = (*relations, "dist", "closer", "between", "and", "or", "implies")
-        hint = faults.nearest(token.value, known) or f"relations are {', '.join(sorted(relations))}, dist"
+        words = (*relations, "dist", "closer", "between", "and", "or", "implies")
+        hint = faults.nearest(token.value, words) or f"relations are {', '.join(sorted(relations))}, dist"
         faults.add(span, f"unknown relation {token.value!r}", hint)
     elif before is not None and before.type in ("RELATION", "DIST", "CLOSER", "THAN") and token.type in (
         "PREFIX", "NOT", "QUANTIFIER", "TRUTH",
@@ -658,10 +658,10 @@ def _report(
         hint = f"write it between its objects: {_between_objects(tokens, position)}"
         faults.add(span, f"{token.value!r} is not a function", hint)
     elif token.type == "EQUAL" and tokens[0].type != "CONST":
-        faults.add(span, found, "equality is written ==; a statement begins a line with what it defines")
+        faults.add(span, message, "equality is written ==; a statement begins a line with what it defines")
     elif token.type == "SLASH" and "NAME" in accepted:
         hint = 'a name with other characters than letters, digits and _ is written in quotes: "/a/b"'
-        faults.add(span, found, hint)
+        faults.add(span, message, hint)
     elif token.type in ("RELATION", "DIST", "CLOSER", "BETWEEN") and before is not None:
         hint = "a relation stands between two objects, without operators inside"
         if before.type in ("PREFIX", "INFIX", "TRUTH", "NOT"):
@@ -669,12 +669,12 @@ def _report(
         faults.add(span, f"{token.value!r} needs an object, region or group on its left", hint)
     elif "NAME" in accepted and (token.value in KEYWORDS or token.type == "RELATION"):
         hint = f"that word is reserved; an object of its name is written in quotes: {quoted(token.value)}"
-        faults.add(span, found, hint)
+        faults.add(span, message, hint)
     elif "TITLE" in accepted and token.type == "NAME":
         hint = 'a title is written in quotes: spec NAME "REQ-12: what must hold" = ...'
-        faults.add(span, found, hint)
+        faults.add(span, message, hint)
     elif "NAME" in accepted and token.type == "NUMBER":
         hint = f"a name that begins with a digit is written in quotes: {quoted(token.value)}"
-        faults.add(span, found, hint)
+        faults.add(span, message, hint)
     else:
-        faults.add(span, found)
+        faults.add(span, message)

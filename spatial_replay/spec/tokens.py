@@ -187,17 +187,17 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
             # G[0:5], as other tools write windows
             result.append(_as(token, "COMMA", ","))
         elif token.type == "NAME" and following and not _is_quoted(token):
-            written = _word(token, result, following, macros)
-            if written.type == "ERROR":
+            word = _word(token, result, following, macros)
+            if word.type == "ERROR":
                 # so far and no further, or a text full of such words would take quadratic time
                 after = tokens[index + 1 : index + 1000]
                 if following[0].value in macros or _holds_formula(after):
                     _report(token, faults)
                 else:
-                    written = token
+                    word = token
             if token.value in RATES and following[0].type == "LPAR" and token.value not in macros:
-                written = _as(token, "RATE", token.value)
-            result.append(written)
+                word = _as(token, "RATE", token.value)
+            result.append(word)
         else:
             result.append(token)
     return result
@@ -244,7 +244,7 @@ def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
     if not _starts(before):
         return False
     if after[0].type == "LSQB":
-        is_index = [each.type for each in after[1:]] == ["NAME", "RSQB"]
+        is_index = [token.type for token in after[1:]] == ["NAME", "RSQB"]
         return len(after) > 1 and after[1].type != "MINUS" and not is_index
     # "always until p" is the name `always`, unless a relation follows: then `until` is one
     if after[0].value in _INFIX_WORDS and after[0].type == "NAME":
@@ -319,7 +319,7 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     token = tokens[position] if position < len(tokens) else missing
     last, before, *_ = [*reversed(tokens[max(0, position - 2) : position]), missing, missing]
     after = tokens[position + 1] if position + 1 < len(tokens) else missing
-    found = f"{token.value!r} cannot stand here"
+    message = f"{token.value!r} cannot stand here"
     if position == 1 and (statement := meant_statement(tokens)):
         return f"{last.value!r} begins no statement", statement
     operator = tokens[position - 3].value if position > 2 else ""
@@ -328,10 +328,10 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         within = f"{'O' if operator == 'Y' else 'F'}[0, {last.value}]"
         return f"{operator} takes no window", f"it means one sample; within {last.value} is {within} (...)"
     if window := _meant_window(tokens, position):
-        return found, f"a window is written with both of its ends: {window}"
+        return message, f"a window is written with both of its ends: {window}"
     relation = last if last.type == "RELATION" else before
     if token.type == "NUMBER" and relation.value in _WITH_NUMBER and last.type in ("RELATION", "LPAR"):
-        return found, f"the number of a relation stands in square brackets: {relation.value}[{token.value}]"
+        return message, f"the number of a relation stands in square brackets: {relation.value}[{token.value}]"
     if before.type == "RSQB" and last.value in ("s", "ms"):
         return f"{last.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
     if token.type in _RELATIONS and before.type in ("SLASH", "MINUS") and last.type == "NAME":
@@ -339,35 +339,35 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         hint = f'a name with {before.value} is written in quotes: "{first}{before.value}{last.value}"'
         return f"{token.value!r} needs an object, region or group on its left", hint
     if token.type == "MINUS" and before.type in _RELATIONS - {"COMPARE"} and after.value.isidentifier():
-        return found, f'a name with - is written in quotes: "{last.value}-{after.value}"'
+        return message, f'a name with - is written in quotes: "{last.value}-{after.value}"'
     if (before.type, last.type) == ("NAME", "MINUS") and token.value[1:].isidentifier():
-        return found, f'a name with - is written in quotes: "{before.value}-{token.value}"'
+        return message, f'a name with - is written in quotes: "{before.value}-{token.value}"'
     if token.type in _RELATIONS and before.type == "LPAR" and last.type == "NAME" and position > 2:
         name = tokens[position - 3]
         if name.type == "NAME" and (hint := function_hint(name.value, _argument(tokens, position - 1))):
             return f"{name.value!r} is not a function", hint
     if tokens[0].type == "GROUP" and last.type == "EQUAL" and token.type in ("LSQB", "LPAR"):
-        return found, f"members stand without brackets: group {tokens[1].value} = a, b"
+        return message, f"members stand without brackets: group {tokens[1].value} = a, b"
     if shape := _meant_shape(tokens, position, accepted):
-        return found, shape
+        return message, shape
     if (token.value == "=>" and "COMPARE" in accepted) or (
         before.value == "=>" and token.type in ("RPAR", "$END")
     ):
         return "'=>' means implies", "at least is written >="
     if token.value == "=" and last.value in ("==", "!="):
-        return found, f"it is written {last.value}"
+        return message, f"it is written {last.value}"
     if token.type == "NOT" and last.type == "LSQB" and before.value in ("X", "WX"):
         return f"{before.value}[!] is no operator", "a next sample that has to be there is written X (...)"
     if token.value == "=" and (
         sign := {"<": "<=", ">": ">="}.get(after.value if "COMPARE" in accepted else last.value)
     ):
-        return found, f"it is written {sign}, without a blank"
+        return message, f"it is written {sign}, without a blank"
     if token.type == "TRUTH" and last.type == "COMPARE":
-        return found, f"a flag is a number: {before.value} {last.value} {int(token.value == 'true')}"
+        return message, f"a flag is a number: {before.value} {last.value} {int(token.value == 'true')}"
     if token.value == "dist" and _is_quoted(token):
-        return found, f"a relation stands without quotes: {last.value} dist {after.value or 'b'}"
+        return message, f"a relation stands without quotes: {last.value} dist {after.value or 'b'}"
     if token.type == "NUMBER" and (operator := _AT_TIMES.get(last.value.lower())):
-        return found, f"a window stands behind its operator: {operator.format(token.value)} (...)"
+        return message, f"a window stands behind its operator: {operator.format(token.value)} (...)"
     if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
         kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
         return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"
@@ -394,7 +394,7 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         return "a signal has no [-n]", hint
     if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
         hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
-        return found, f"{hint}; a range is two comparisons, joined by and"
+        return message, f"{hint}; a range is two comparisons, joined by and"
     return None
 
 
@@ -405,14 +405,14 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
     if start is None:
         return ""
     inner = tokens[start + 1 : start + 6]
-    kinds = [each.type for each in inner]
-    numbers = [each.value.strip(".") for each in inner if each.type == "NUMBER"]
+    kinds = [token.type for token in inner]
+    numbers = [token.value.strip(".") for token in inner if token.type == "NUMBER"]
     operator = tokens[start].value
     if operator in ("X", "WX", "Y"):
         return ""
     match kinds:
         case ["COMPARE", "NUMBER", *_] | ["LSQB", "COMPARE", "NUMBER", *_]:
-            sign = next(each.value for each in inner if each.type == "COMPARE")
+            sign = next(token.value for token in inner if token.type == "COMPARE")
             return f"{operator}[{numbers[0]}, inf]" if sign[0] == ">" else f"{operator}[0, {numbers[0]}]"
         case ["LSQB", "NUMBER", "RSQB", *_]:
             return f"{operator}[0, {numbers[0]}]"
@@ -440,18 +440,18 @@ def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str]
 
 def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
     word = str(token.value).lower()
-    found = f"{token.value!r} cannot stand here"
+    message = f"{token.value!r} cannot stand here"
     if word in _ORDERING and "AND" in accepted and (after.type != "NUMBER" or word == "by"):
-        return found, _ORDERING[word]
+        return message, _ORDERING[word]
     if (str(last.value).lower(), word) == ("exactly", "once"):
-        return found, "p holds in one sample only is written (not p) U (p and WX (G not p))"
+        return message, "p holds in one sample only is written (not p) U (p and WX (G not p))"
     if "RELATION" in accepted:
         if word in ("is", "are"):
             relation = after.value if after.type in _RELATIONS else "leftof"
             text = f'; a text is compared as {last.value} == "AUTO"' if after.type not in _RELATIONS else ""
-            return found, f"leave it out: {last.value} {relation} ...{text}"
+            return message, f"leave it out: {last.value} {relation} ...{text}"
         if quantifier := _QUANTIFYING.get(str(last.value).lower()):
-            return found, f"write {quantifier} {token.value if token.type == 'NAME' else 'x'} in GROUP: ..."
+            return message, f"write {quantifier} {token.value if token.type == 'NAME' else 'x'} in GROUP: ..."
         if word in _MEANT_RELATIONS and after.type == "NAME":
             hint = f"write {last.value} {_MEANT_RELATIONS[word]} {after.value or 'b'}"
             return f"unknown relation {token.value!r}", hint
@@ -459,13 +459,13 @@ def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[st
         return f"{token.value!r} is not an operator", f"the operator is written {_MEANT_BETWEEN[word]}"
     if "AND" in accepted and word in _AT_TIMES:
         window = _AT_TIMES[word].format(after.value or "5s")
-        return found, f"a window stands behind its operator: {window} (...)"
+        return message, f"a window stands behind its operator: {window} (...)"
     return None
 
 
 def meant_statement(tokens: Sequence[Token]) -> str:
     """Return how a line is written that begins with no word of a statement; "" where that is not known."""
-    line = [each for each in tokens if each.line == tokens[0].line]
+    line = [token for token in tokens if token.line == tokens[0].line]
     if line[0].value.lower() in _TYPES and len(line) > 1 and line[1].type == "NAME":
         return "signals are not declared: leave the line out"
     if line[0].value.lower() in _DEFINING:
@@ -477,7 +477,7 @@ def meant_statement(tokens: Sequence[Token]) -> str:
     value = line[3:] if line[2].type == "EQUAL" else line[2:]
     if not value:
         return ""
-    is_number = all(each.type in ("NUMBER", "NAME", *_ARITHMETIC) for each in value)
+    is_number = all(token.type in ("NUMBER", "NAME", *_ARITHMETIC) for token in value)
     definition = f"{line[0].value} = {_as_written(value)}"
     if is_number:
         return f"a number is defined by const {definition}; equality is written =="
@@ -486,7 +486,7 @@ def meant_statement(tokens: Sequence[Token]) -> str:
 
 def _as_written(tokens: Sequence[Token]) -> str:
     """Return tokens as a text, with blanks where there were some."""
-    gaps = ["" if one.end_pos == other.start_pos else " " for one, other in pairwise(tokens)]
+    gaps = ["" if first.end_pos == second.start_pos else " " for first, second in pairwise(tokens)]
     return "".join(token.value + gap for token, gap in zip(tokens, [*gaps, ""], strict=True))
 
 
@@ -499,8 +499,8 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
     shape = _SHAPES.get(tokens[called].value.lower())
     if called and shape and tokens[0].type != "REGION" and tokens[called - 1].type not in _STATEMENTS:
         return f"a shape gets a name first: region goal = {shape}"
-    start = next((n for n, each in enumerate(tokens[:position]) if each.type in _SHAPE), None)
-    if start is None or "HEIGHT" in {*accepted, *(each.type for each in tokens[:position])}:
+    start = next((n for n, token in enumerate(tokens[:position]) if token.type in _SHAPE), None)
+    if start is None or "HEIGHT" in {*accepted, *(token.type for token in tokens[:position])}:
         return ""
     numbers = _numbers(tokens[start:])
     pairs = [f"({x}, {y})" for x, y in zip(numbers[::2], numbers[1::2], strict=False)]
@@ -524,9 +524,11 @@ _SHAPE = frozenset({"BOX", "CIRCLE", "POLYGON"})
 
 def _numbers(tokens: Sequence[Token]) -> list[str]:
     """Return the numbers up to the end of the line, with their signs."""
-    line = [each for each in tokens if each.line == tokens[0].line]
+    line = [token for token in tokens if token.line == tokens[0].line]
     signs = ["-" if before.type == "MINUS" else "" for before in line]
-    return [sign + each.value for sign, each in zip(signs, line[1:], strict=False) if each.type == "NUMBER"]
+    return [
+        sign + token.value for sign, token in zip(signs, line[1:], strict=False) if token.type == "NUMBER"
+    ]
 
 
 def _argument(tokens: Sequence[Token], start: int) -> str:
@@ -674,9 +676,9 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
     """
     tokens: list[Token] = []
     line = 1
-    for found in _TOKEN.finditer(text):
-        kind, value = found.lastgroup, found.group()
-        span = Span(found.start(), found.end())
+    for piece in _TOKEN.finditer(text):
+        kind, value = piece.lastgroup, piece.group()
+        span = Span(piece.start(), piece.end())
         if kind == "line":
             line += 1
             continue
@@ -698,15 +700,15 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             faults.add(span, f"'{sign}' is not part of the language", meant_sign(sign))
             token_type = "ERROR"
         elif kind == "unknown":
-            _report_unknown(value, span, faults, tokens, text[found.end() : found.end() + 1])
+            _report_unknown(value, span, faults, tokens, text[piece.end() : piece.end() + 1])
             token_type = "ERROR"
         else:
             token_type = "NUMBER"
-            unit = found.group("unit")
+            unit = piece.group("unit")
             if unit is not None and unit not in ("s", "ms"):
-                per = _PER.match(text, found.end())
-                is_window = unit == "m" and {"PREFIX", "INFIX"} & {each.type for each in tokens[-4:-1]}
-                meant_unit = "min" if is_window and "LSQB" in {each.type for each in tokens[-3:]} else unit
+                per = _PER.match(text, piece.end())
+                is_window = unit == "m" and {"PREFIX", "INFIX"} & {token.type for token in tokens[-4:-1]}
+                meant_unit = "min" if is_window and "LSQB" in {token.type for token in tokens[-3:]} else unit
                 hint = unit_hint(value.removesuffix(unit), meant_unit, per.group(1) if per else "")
                 hint = hint or f"units of time are s and ms; a name is written in quotes: {quoted(value)}"
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
@@ -720,7 +722,7 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
 def _with_scales(tokens: list[Token]) -> list[Token]:
     """Read `scale NAME =` as a statement; anywhere else `scale` is a name like others."""
     for index, token in enumerate(tokens[:-2]):
-        following = [each.type for each in tokens[index + 1 : index + 3]]
+        following = [token.type for token in tokens[index + 1 : index + 3]]
         if token.value == "scale" and token.type == "NAME" and following == ["NAME", "EQUAL"]:
             before = tokens[index - 1] if index else None
             if before is None or before.line != token.line:
@@ -767,7 +769,7 @@ def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Toke
         )
         faults.add(span, message, hint)
         return
-    if text[0] == "{" and [each.type for each in before[-3:]] == ["GROUP", "NAME", "EQUAL"]:
+    if text[0] == "{" and [token.type for token in before[-3:]] == ["GROUP", "NAME", "EQUAL"]:
         hint = f"members stand without brackets: group {before[-2].value} = a, b"
         faults.add(span, "'{' cannot stand here", hint)
         return
