@@ -69,7 +69,7 @@ class HeightComparisons:
 
     def remarks(self) -> Iterator[Sentence]:
         """Yield a sentence on each comparison that heights decide."""
-        for comparison in (comparison for _, listed in self._comparisons for comparison in listed):
+        for comparison in (comparison for _, comparisons in self._comparisons for comparison in comparisons):
             if comparison.count:
                 holds, not_so = ("holds", "does not") if comparison.holds else ("fails", "holds")
                 share = f"in {comparison.count:,} of {counted(comparison.compared, 'sample')} looked at"
