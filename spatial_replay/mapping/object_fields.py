@@ -570,6 +570,9 @@ def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
             inner = field_names(fields[path])
             if all(name in inner and _is_number(get_field(fields[path], name)) for name in names[:2]):
                 return tuple(f"{path}.{name}" for name in names if name in inner)
+        numbers = () if path.endswith("bbox") else _numbers(fields[path], 3) or _numbers(fields[path], 2)
+        if numbers:
+            return tuple(f"{path}[{index}]" for index in range(len(numbers)))
     for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
         if all(_is_number(fields.get(name)) for name in names[:2]):
             return tuple(name for name in names if name in fields)

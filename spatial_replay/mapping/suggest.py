@@ -396,8 +396,9 @@ def _suggestions(topic: Topic, examples: Sequence[object]) -> list[TopicSuggesti
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
         return [TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())]
-    bodies = [other for other in guess.others if other.is_body and not share_places(guess, other, examples)]
-    lists = [replace(guess, others=tuple(other for other in guess.others if other not in bodies)), *bodies]
+    bodies = [body for body in guess.others if body.is_body and not share_places(guess, body, examples)]
+    rest = tuple(unnamed for unnamed in guess.others if unnamed not in bodies)
+    lists = [replace(guess, others=rest), *bodies]
     return [_of_guess(topic, guess, examples) for guess in lists[:_MOST_LISTS]]
 
 
@@ -592,7 +593,8 @@ def _shape(guess: Guess) -> str:
         return f"{{polygon: {yaml_text(guess.polygon)}}}"
     if not guess.size:
         return f"{{disc: {_RADIUS}}}"
-    return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
+    sizes = ", ".join(map(yaml_text, guess.size))
+    return f"{{disc: {sizes}}}" if len(guess.size) == 1 else f"{{box: [{sizes}]}}"
 
 
 def _name(topic: Topic, guess: Guess) -> str:
@@ -611,9 +613,11 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
     if guess.objects is None and guess.names:
         by_id = (f"one object a message: {guess.names[0]} takes turns",)
     sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
+    if guess.size[:1] and guess.size[0].endswith("[0]"):
+        sizeless = (f"{guess.size[0][:-3]} is read as length, width and height, in this order",)
     if guess.is_sizeless:
         sizeless = (f"its sizes are 0 in all messages looked at: {_RADIUS} is a guess",)
-    paths = [str(other.objects) for other in guess.others[:6]]
+    paths = [str(unused.objects) for unused in guess.others[:6]]
     others = (f"other lists that look like objects: {', '.join(paths)}",) if paths else ()
     if isinstance(guess.bounds, str) and "xy" not in guess.bounds:
         sizeless = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)

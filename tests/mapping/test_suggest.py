@@ -204,6 +204,19 @@ def test_each_list_of_objects_in_a_message_has_an_entry() -> None:
         assert sorted(str(topic.name) for topic in parse_mapping(text).topics) == sorted(names)
 
 
+def test_sizes_and_turns_are_found_in_lists() -> None:
+    annotation = {
+        "instance": "a",
+        "translation": [373.2, 1130.4, 0.8],
+        "size": [0.6, 0.7, 1.6],
+        "rotation": [0.98, 0.0, 0.0, -0.18],
+    }
+    text, topic = suggested_for([{"annotations": [annotation, {**annotation, "instance": "b"}]}] * 3)
+    assert topic.shape == ShapeMapping("box", ("size[0]", "size[1]", "size[2]"))
+    assert (topic.position, topic.orientation, topic.order) == ("translation", "rotation", "wxyz")
+    assert "size is read as length, width and height" in text
+
+
 def test_floors_are_named() -> None:
     def text(*levels: str) -> str:
         robots = [{"name": f"r{k}", "x": 1.0, "y": 2.0, "level_name": name} for k, name in enumerate(levels)]
