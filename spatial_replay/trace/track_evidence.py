@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import pi
 
 import numpy as np
 
@@ -20,6 +21,8 @@ class TrackEvidence:
     def __init__(self) -> None:
         self._widest_turn = 0.0
         self._turned: set[str] = set()
+        self._counts_turns = True
+        self._steps = self._fast_steps = 0
         self._names: set[str] = set()
         self._signals: set[str] = set()
         self._samples = 0
@@ -36,13 +39,26 @@ class TrackEvidence:
         self._samples += len(trace)
         self._last_ns = int(trace.times_ns[-1])
         turns = np.abs(trace.yaw)
+        if (turns > 2 * pi).any():
+            self._add_steps(trace)
         if (turns > MANY_TURNS).any():
             self._widest_turn = max(self._widest_turn, float(np.fmax.reduce(turns)))
             self._turned.update(trace.names)
 
+    def _add_steps(self, trace: Trace) -> None:
+        """Look whether angles count turns: they begin within one, and then change by less than half of one."""
+        yaw = np.where(trace.rows >= 0, trace.yaw[trace.rows], np.nan)
+        begins = self._samples == len(trace)
+        steps, seconds = np.abs(np.diff(yaw, axis=0)), np.diff(trace.times_ns)[:, None] / 1e9
+        self._counts_turns &= not (steps >= pi).any() and not (begins and (np.abs(yaw[0]) > 2 * pi).any())
+        self._steps += int(np.count_nonzero(np.isfinite(steps)))
+        self._fast_steps += int(np.count_nonzero(steps > 2 * pi * seconds))
+
     def doubts(self) -> Iterator[Doubt]:
         """Yield the assumptions that the samples contradict, after the last of them."""
-        if self._turned:
+        # few robots turn more than once a second
+        is_fast = self._fast_steps > self._steps / 10
+        if self._turned and not (self._counts_turns and not is_fast):
             text = f"its angles reach {number_text(self._widest_turn)} and are read as radians"
             yield Doubt("radians", "", Sentence(f"{text}; write them in radians"), frozenset(self._turned))
         period_ns = (self._last_ns - self._first_ns) / max(1, self._samples - 1)

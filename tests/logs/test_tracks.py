@@ -283,6 +283,11 @@ def test_a_csv_in_degrees_is_doubtful(csv, yaw, doubtful):
     assert {name for doubt in doubts for name in doubt.objects} == doubtful
 
 
+def test_a_csv_whose_yaw_counts_turns_is_not_doubtful(csv):
+    lines = (f"{tick * 10**9},car,vehicle,{tick},2,{tick / 2},4,2" for tick in range(80))
+    assert [block.doubts for block in open_source(csv(HEADER, *lines)).iter_blocks()] == [()]
+
+
 @pytest.mark.parametrize(("step", "doubtful"), [(100_000, ["log_time_unit"]), (1_000_000, [])])
 def test_a_csv_with_times_in_microseconds_is_doubtful(csv, step, doubtful):
     path = csv(HEADER, *(f"{tick * step},car,vehicle,{tick},2,0,4,2" for tick in range(20)))
