@@ -16,7 +16,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from spatial_replay.mapping.binding import BY_PLACE
-from spatial_replay.mapping.evidence import Moment, TopicEvidence
+from spatial_replay.mapping.evidence import FAR_LEAP, Moment, TopicEvidence
 from spatial_replay.mapping.mapping_file import UNITS_NS, LogMapping
 from spatial_replay.text import Instant, Sentence, counted, number_text
 from spatial_replay.trace.doubts import MANY_TURNS, SHORTEST_PERIOD_NS, Doubt
@@ -519,7 +519,7 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     return (
         f"its objects are {number_text(size)} long and move at {number_text(speed)} a second, and others at"
-        f" most {number_text(max(sizes))} and {number_text(max(speeds))}: it may be in millimetres"
+        f" most {number_text(max(sizes))} and {number_text(max(speeds))}: it may be in mm or cm"
     )
 
 
@@ -589,11 +589,22 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
     if moment is not None and is_far and motions.returns >= _FEW and _one_object(evidence, log) is None:
         like = "with a number that stands for not available"
         return _there_and_back(moment, motions.returns, motions.chances, like)
-    jump, usual = motions.jump, motions.speed.quantile(0.9)
+    jump, comeback, usual = motions.jump, motions.comeback, max(motions.speed.quantile(0.9), 0.0)
     if jump is None or motions.speed.count < _FEW_LEAPS or not evidence.size.greatest > 0:
         return None
+    if motions.zeros >= _FEW:
+        times = counted(motions.zeros, "time")
+        return f"its objects leap to (0, 0) {times}, as where that stands for not available"
+    far = FAR_LEAP * evidence.size.greatest
+    if comeback is not None and comeback.amount > max(far, _FARTHER * usual * motions.comeback_s):
+        return Sentence(
+            f"{comeback.name} is {number_text(comeback.amount)} farther at ",
+            Instant(comeback.time_ns, 0),
+            f", after {number_text(motions.comeback_s)} s without it, as where a name is used again; usual"
+            f" speeds are below {number_text(usual)}",
+        )
     speed = jump.amount / motions.jump_s if motions.jump_s > 0 else np.inf
-    if not (jump.amount > _FAR_LEAP * evidence.size.greatest and speed > _FAST_LEAP * max(usual, 0.0)):
+    if not (jump.amount > far and speed > _FAST_LEAP * usual):
         return None
     return Sentence(
         f"{jump.name} is {number_text(jump.amount)} farther at ",
@@ -602,7 +613,7 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
-_FEW_LEAPS, _FAR_LEAP, _FAST_LEAP = 10, 5.0, 20.0
+_FEW_LEAPS, _FAST_LEAP, _FARTHER = 10, 20.0, 3.0
 
 _DEGREES: Final = "`yaw: {field: PATH, unit: deg}` reads degrees"
 
@@ -789,7 +800,7 @@ ASSUMPTIONS: Final = (
         "All topics have one unit of length.",
         "sizes and speeds; 200 times those of all other topics contradict",
         _one_unit,
-        "`scale: 0.001` for the topic brings it into metres",
+        "`scale: 0.001` for the topic brings millimetres into metres",
     ),
     Assumption(
         "one_frame",
@@ -823,7 +834,8 @@ ASSUMPTIONS: Final = (
     Assumption(
         "motion",
         "Objects move steadily.",
-        "the longest step; five sizes at 20 times the usual speed is remarked",
+        "the longest step; five sizes at 20 times the usual speed, or at 3 times after an absence, are"
+        " remarked, and so are leaps to (0, 0)",
         _leap,
         "`invalid` names numbers without a value, a `name` with an id distinguishes objects",
         is_remark=True,

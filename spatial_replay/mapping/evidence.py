@@ -37,7 +37,10 @@ _LONGEST_GAP: Final = 9
 """Messages from one report of an object to the next; longer gaps count as this one."""
 
 _MOST_LEAPS: Final = 4
-"""Reports that tell whether an object is back where it was."""
+"""Reports by which an object counts as back where it was."""
+
+FAR_LEAP: Final = 5.0
+"""Sizes of an object: a longer step is worth a look."""
 
 _FAST: Final = 100.0
 """Footprint units a second: what leaps there and back faster is not one robot."""
@@ -223,6 +226,8 @@ class Motions:
     Attributes:
         speed, turn_rate: in footprint units, and radians, a second.
         jump: the longest step of an object; `jump_s` is how long it took.
+        comeback: the longest over a second or more in which messages did not report the object.
+        zeros: how often an object leapt to (0, 0), by more than five of its sizes.
         turn_step: the greatest change of the number that is read as yaw.
         chances: reports of objects that were reported at least twice before; in `returns` of them an object
             is back where it was two to four reports before, having leapt by more than its size in each step.
@@ -238,7 +243,9 @@ class Motions:
         self._names, self._classes = names, classes
         self.speed, self.turn_rate = Spread(), Spread()
         self.jump: Moment | None = None
-        self.jump_s = 0.0
+        self.jump_s = self.comeback_s = 0.0
+        self.comeback: Moment | None = None
+        self.zeros = 0
         self.turn_step = 0.0
         self.chances = self.returns = self.slow_returns = 0
         self.return_moment: Moment | None = None
@@ -298,6 +305,12 @@ class Motions:
         if distance[at] > (self.jump.amount if self.jump is not None else 0.0):
             self.jump = Moment(self._name(later[at]), int(times_ns[at]), float(distance[at]))
             self.jump_s = float(seconds[at])
+        is_absence = (later[:, _MESSAGE] - earlier[:, _MESSAGE] > 1) & (seconds >= 1.0)
+        if is_absence.any():
+            self._add_comeback(later, np.where(is_absence, np.nan_to_num(distance, nan=0.0), 0.0), seconds)
+        is_zero = ~later[:, _X : _Y + 1].any(axis=1)
+        if is_zero.any():
+            self.zeros += int(np.count_nonzero(is_zero & (distance > FAR_LEAP * later[:, _SIZE])))
         moves = (distance > 0) & np.isfinite(later[:, _TURN])
         if not moves.any():
             return
@@ -313,6 +326,12 @@ class Motions:
         offsets = [np.exp(1j * (course - angle)).sum() for angle in angles]
         self._courses += np.array([*offsets, np.exp(1j * course).sum()])
         self._steps += int(np.count_nonzero(moves))
+
+    def _add_comeback(self, later: Floats, distance: Floats, seconds: Floats) -> None:
+        at = int(distance.argmax())
+        if distance[at] > (self.comeback.amount if self.comeback is not None else 0.0):
+            self.comeback = Moment(self._name(later[at]), self._time_ns(later[at]), float(distance[at]))
+            self.comeback_s = float(seconds[at])
 
     def _add_returns(self, reports: Floats, after: Integers) -> None:
         """Count the objects that are back where they were some reports before, and leapt in between.
@@ -381,7 +400,7 @@ class _Objects(NamedTuple):
 
 
 class TopicEvidence:
-    """What the messages of one mapped topic say about how it is read.
+    """Measurements of the messages of one mapped topic, and of their objects and signals.
 
     Attributes:
         arrivals, motions: of its messages and objects.

@@ -46,7 +46,7 @@ class TrackEvidence:
             self._turned.update(trace.names)
 
     def _add_steps(self, trace: Trace) -> None:
-        """Look whether angles count turns: they begin within one, and then change by less than half of one."""
+        """Look whether angles count turns: they begin within one, and step by less than half of one."""
         yaw = np.where(trace.rows >= 0, trace.yaw[trace.rows], np.nan)
         begins = self._samples == len(trace)
         steps, seconds = np.abs(np.diff(yaw, axis=0)), np.diff(trace.times_ns)[:, None] / 1e9

@@ -311,7 +311,9 @@ def _names() -> Iterator[Case]:
     yield Case("one_object", False, "trembles", BOT, at(*(0.2 * (k % 2) for k in range(40))))
     random = Random(2)
     yield Case("one_object", False, "noise", BOT, at(*(random.gauss(0.0, 2.0) for _ in range(500))))
-    yield Case("one_object", False, "is placed anew", BOT, at(*(0.1 * k + 30.0 * (k > 9) for k in range(40))))
+    yield Case(
+        "one_object", False, "is placed again", BOT, at(*(0.1 * k + 30.0 * (k > 9) for k in range(40)))
+    )
     yield Case("one_object", False, "a shuttle", BOT, at(*(8.0 * (k % 2) for k in range(40)), step=10.0))
 
     def lists(*listed: Any) -> list[Said]:
@@ -351,6 +353,18 @@ def _names() -> Iterator[Case]:
 
     far = [*straight(20), {"x": 300.0, "y": 0.0}, {"x": 300.1, "y": 0.0}]
     yield Case("motion", True, "is far away at once", BOT, _run(far))
+    lost = [{"x": 0.0, "y": 0.0} if k % 10 > 7 else {"x": 9 + 0.01 * k, "y": 5.0} for k in range(40)]
+    yield Case("motion", True, "is at (0, 0) where it is lost", BOT, _run(lost))
+    from_zero = [{"x": 0.01 * k, "y": 0.0} for k in range(40)]
+    yield Case("motion", False, "begins at (0, 0)", BOT, _run(from_zero))
+
+    def absent(after: float) -> list[Said]:
+        seen = [k for k in range(120) if not 40 < k < 80]
+        places = {k: 0.1 * k + (after if k >= 80 else 0.0) for k in seen}
+        return _run({"of": [{"id": 1, "x": places[k], "y": 0.0}] if k in places else []} for k in range(120))
+
+    yield Case("motion", True, "an id is used again", LISTED, absent(15.0))
+    yield Case("motion", False, "an object is hidden for a while", LISTED, absent(0.0))
     yield Case("motion", False, "accelerates", BOT, _run({"x": 0.001 * k * k, "y": 0.0} for k in range(60)))
 
 
