@@ -111,9 +111,9 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     # the quotient below is 0 / 0 for equal quaternions, and linear interpolation is exact enough near them
     is_close = sine < _LEAST_NORM
     divisor = np.where(is_close, 1.0, sine)
-    one = np.where(is_close, 1.0 - share, np.sin((1.0 - share) * angle) / divisor)
-    other = np.where(is_close, share, np.sin(share * angle) / divisor)
-    return np.asarray(one[:, None] * first + other[:, None] * second)
+    weight = np.where(is_close, 1.0 - share, np.sin((1.0 - share) * angle) / divisor)
+    next_weight = np.where(is_close, share, np.sin(share * angle) / divisor)
+    return np.asarray(weight[:, None] * first + next_weight[:, None] * second)
 
 
 HISTORY_NS = 10 * 10**9
@@ -271,22 +271,22 @@ class FrameTree:
             count, first, first_child = self._ignored.get(reason, (0, entry, child))
             self._ignored[reason] = count + 1, first, first_child
             return
-        known = self._children.setdefault(child, _Child())
+        frame = self._children.setdefault(child, _Child())
         if is_static:
-            if known.static and known.static[-1][2:4] == entry[2:4]:
+            if frame.static and frame.static[-1][2:4] == entry[2:4]:
                 return
-            last_ns = known.static[-1].stamp_ns if known.static else -1
+            last_ns = frame.static[-1].stamp_ns if frame.static else -1
             if stamp_ns == 0 or stamp_ns < last_ns:
                 entry = entry._replace(stamp_ns=max(clock_ns, last_ns))
-        entries, others = (known.static, known.moving)[:: 1 if is_static else -1]
+        entries, others = (frame.static, frame.moving)[:: 1 if is_static else -1]
         if entries and (is_static or entries[-1].parent != parent):
             self._contradict(child, entries[-1], entry)
         if others and not entries:
             self._contradict(child, others[-1], entry, is_mixed=True)
         if not is_static:
             self.newest_stamp_ns = stamp_ns
-            if known.moving:
-                self._note_restart(child, known, entry)
+            if frame.moving:
+                self._note_restart(child, frame, entry)
         entries.append(entry)
         self._series.pop(child, None)
 
@@ -307,7 +307,7 @@ class FrameTree:
         restart = child.restart = _Restart(old, new)
         if self._restarts and self._restarts[-1].new.log_ns > old.log_ns:
             # in one restart, all frames step back one after the other
-            restart = min(restart, self._restarts.pop(), key=lambda each: each.new.log_ns)
+            restart = min(restart, self._restarts.pop(), key=lambda restart: restart.new.log_ns)
         self._restarts = [*self._restarts[1 - _MOST_RESTARTS :], restart]
         self._series.clear()
 
@@ -324,7 +324,7 @@ class FrameTree:
     def forget_moving(self) -> None:
         """Drop every transform but the static ones: nothing is known between those and what comes next."""
         self._children = {
-            name: _Child(static=each.static) for name, each in self._children.items() if each.static
+            name: _Child(static=child.static) for name, child in self._children.items() if child.static
         }
         self._series.clear()
 
@@ -370,7 +370,7 @@ class FrameTree:
         times_ns, log_ns = ask.times_ns, ask.log_ns
         if log_ns is None:
             return [ask]
-        runs = np.searchsorted([each.new.log_ns for each in self._restarts], log_ns, "right")
+        runs = np.searchsorted([restart.new.log_ns for restart in self._restarts], log_ns, "right")
         if ask.by_stamp:
             for number, (old, new) in enumerate(self._restarts, 1):
                 # an observation may come before the first transform of its run
@@ -393,7 +393,7 @@ class FrameTree:
             return [ask]
         _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
         group = group.reshape(-1)
-        return [ask.part(group == each) for each in range(int(group.max()) + 1)]
+        return [ask.part(group == number) for number in range(int(group.max()) + 1)]
 
     def _in_one_tree(self, target: str, source: str, ask: _Question) -> Transforms:
         up = self._ancestors(source, ask)
@@ -440,18 +440,18 @@ class FrameTree:
         inside = after <= last
         after = np.minimum(after, last)
         before = np.where(inside & (series.times_ns[after] == times_ns), after, after - inside)
-        known = (before >= 0) | is_still
+        is_known = (before >= 0) | is_still
         before, after = np.where(is_still, newest, np.maximum(before, 0)), np.where(is_still, newest, after)
         start, end = series.times_ns[before], series.times_ns[after]
         is_hole = end - start > ask.longest_ns
-        if (known & inside & is_hole).any():
-            longest = int((end - start)[known & inside].max())
-            at_ns = int(series.clock_ns[before][known & inside & is_hole][0])
+        if (is_known & inside & is_hole).any():
+            longest = int((end - start)[is_known & inside].max())
+            at_ns = int(series.clock_ns[before][is_known & inside & is_hole][0])
             if longest > self._holes.get(frame, (0, 0))[0]:
                 self._holes[frame] = longest, at_ns
         is_between = inside & ~is_hole
         is_held = ask.holds & ~is_between & (times_ns - start <= ask.longest_ns)
-        known &= is_between | is_held
+        is_known &= is_between | is_held
         span = np.where(end > start, end - start, 1)
         # poses in different parents cannot be interpolated; the earlier one holds
         moves = is_between & (end > start) & (series.parent[before] == series.parent[after])
@@ -459,7 +459,7 @@ class FrameTree:
         first, second = series.poses[before], series.poses[after]
         translation = first[:, :3] + share[:, None] * (second[:, :3] - first[:, :3])
         turned = slerp(first[:, 3:], second[:, 3:], share)
-        return _transforms(translation, np.where((share == 0.0)[:, None], first[:, 3:], turned), known)
+        return _transforms(translation, np.where((share == 0.0)[:, None], first[:, 3:], turned), is_known)
 
     def _series_of(self, frame: str, ask: _Question) -> tuple[_Series, Integers]:
         """Return the transforms of a child that a question is about, in order, and the times to look for.
@@ -473,16 +473,16 @@ class FrameTree:
             run = None
             if ask.is_apart and ask.log_ns is not None:
                 clock, times_ns = "log_ns", ask.log_ns
-        known = self._series.setdefault(frame, {})
-        if (clock, run) not in known:
-            moving = [each for each in child.moving if run is None or self._run_of(each) == run]
-            first_ns = min((getattr(each, clock) for each in moving), default=inf)
-            static = [each for each in child.static if getattr(each, clock) < first_ns]
-            known[clock, run] = _series([*static, *moving], clock, first_ns)
-        return known[clock, run], times_ns
+        series_of_frame = self._series.setdefault(frame, {})
+        if (clock, run) not in series_of_frame:
+            moving = [entry for entry in child.moving if run is None or self._run_of(entry) == run]
+            first_ns = min((getattr(entry, clock) for entry in moving), default=inf)
+            static = [entry for entry in child.static if getattr(entry, clock) < first_ns]
+            series_of_frame[clock, run] = _series([*static, *moving], clock, first_ns)
+        return series_of_frame[clock, run], times_ns
 
     def _run_of(self, entry: _Entry) -> int:
-        return bisect_right(self._restarts, entry.log_ns, key=lambda each: each.new.log_ns)
+        return bisect_right(self._restarts, entry.log_ns, key=lambda restart: restart.new.log_ns)
 
     def _contradict(self, child: str, old: _Entry, new: _Entry, *, is_mixed: bool = False) -> None:
         """Note, once for each frame, two kinds, two parents, or a static transform that changes."""
@@ -490,7 +490,7 @@ class FrameTree:
         if key in self._contradictions:
             return
         what, counting = f"frame {child!r} has two parents,", "newest counts"
-        places = " and ".join(f"{each.parent!r} at {_place(each)}" for each in (old, new))
+        places = " and ".join(f"{entry.parent!r} at {_place(entry)}" for entry in (old, new))
         if is_mixed:
             what, counting = f"frame {child!r} is sent static and moving, in", "moving ones count"
         elif old.parent == new.parent:
@@ -505,7 +505,9 @@ class FrameTree:
         """Count the transforms of a child that lie far from the one before and the one after, which agree."""
         kinds = [(entry.parent, self._run_of(entry)) for entry in entries]
         for kind in dict.fromkeys(kinds):
-            self._look_for_jumps_in(name, sorted(compress(entries, (each == kind for each in kinds))))
+            self._look_for_jumps_in(
+                name, sorted(compress(entries, (kind_of_entry == kind for kind_of_entry in kinds)))
+            )
 
     def _look_for_jumps_in(self, name: str, entries: list[_Entry]) -> None:
         if len(entries) < _MANY_JUMPS:
@@ -520,17 +522,17 @@ class FrameTree:
         # from one pose over some of others to the next of the same publisher
         lags = range(2, min(_MOST_PUBLISHERS, len(poses) - 1) + 1)
         aside = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
-        usual = min(float(np.quantile(each, 0.3)) for each in aside.values())
+        usual = min(float(np.quantile(distances, 0.3)) for distances in aside.values())
 
         def jumps_of(times: int) -> Integers:
-            found = np.zeros(len(poses), np.bool_)
+            jumps = np.zeros(len(poses), np.bool_)
             for lag in lags:
                 over = aside[lag]
                 between = [aside[by][: len(over)] for by in range(1, lag)]
                 between += [aside[by][lag - by :][: len(over)] for by in range(1, lag)]
                 least = np.min(between, axis=0)
-                found[: len(over)] |= (least > max(_LEAST_JUMP, times * usual)) & (over * times < least)
-            return np.flatnonzero(found)
+                jumps[: len(over)] |= (least > max(_LEAST_JUMP, times * usual)) & (over * times < least)
+            return np.flatnonzero(jumps)
 
         # noise jumps rarely, and hardly ever by ten times the usual motion
         jumps = jumps_of(5)
@@ -553,12 +555,12 @@ class FrameTree:
             texts.append(Sentence(f"{count} {were} left out{of}", Instant(first.clock_ns, 0), f": {reason}"))
         texts += self._contradictions.values()
         doubtful = [child.restart for child in self._children.values()]
-        if restarts := [each for each in self._restarts if each not in doubtful]:
+        if restarts := [restart for restart in self._restarts if restart not in doubtful]:
             rule = "earlier ones do not count from there on; cut the log there to evaluate each run by itself"
             why = f", as when a simulation restarts: {rule}"
             texts.append(_stepping("transforms", len(restarts), *restarts[0], why))
         if self._steps:
-            name, (count, old, new) = min(self._steps.items(), key=lambda each: each[1][2].clock_ns)
+            name, (count, old, new) = min(self._steps.items(), key=lambda step: step[1][2].clock_ns)
             others = len(self._steps) - 1
             of = f"{name!r} and {counted(others, 'other frame')}" if others else repr(name)
             rule = (
@@ -619,15 +621,15 @@ def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
     order = np.argsort(times, kind="stable")
     ordered = times[order]
     keep = order[np.append(ordered[1:] != ordered[:-1], True)[: len(order)]]
-    kept = [entries[i] for i in keep.tolist()]
-    number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in kept))}
+    distinct = [entries[i] for i in keep.tolist()]
+    number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in distinct))}
     return _Series(
         int(np.count_nonzero(times[keep] < first_ns)),
         times[keep],
-        np.array([entry.clock_ns for entry in kept], np.int64),
+        np.array([entry.clock_ns for entry in distinct], np.int64),
         list(number),
-        np.array([number[entry.parent] for entry in kept], np.int64),
-        np.array([entry.pose for entry in kept], np.float64),
+        np.array([number[entry.parent] for entry in distinct], np.int64),
+        np.array([entry.pose for entry in distinct], np.float64),
     )
 
 
@@ -652,7 +654,7 @@ def _stepping(of: str, count: int, old: _Entry, new: _Entry, why: str) -> Senten
 
 
 def _place(entry: _Entry) -> str:
-    return f"({', '.join(f'{each:.4g}' for each in entry.pose[:3])})"
+    return f"({', '.join(f'{number:.4g}' for number in entry.pose[:3])})"
 
 
 def _transforms(translation: Floats, quaternions: Floats, known: NDArray[np.bool_]) -> Transforms:
@@ -726,7 +728,7 @@ def _getter(example: object) -> Get:
     paths = ["child_frame_id", parent]
     for parts in (_SECONDS, _REST):
         fields = [f"{stamp}.{part}" for part in parts]
-        existing = [each for each in fields if leads_somewhere(FieldPath.of(each), example)]
+        existing = [field for field in fields if leads_somewhere(FieldPath.of(field), example)]
         if not existing:
             raise FieldError(f"{stamp} is not a time; a transform has a stamp")
         paths.append(existing[0])
