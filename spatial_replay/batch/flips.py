@@ -40,7 +40,7 @@ class ResultChange:
 
     @property
     def kind(self) -> Kind:
-        """What happened to the result."""
+        """The change of the result between the two versions."""
         change = self.difference.change
         if change in ("verdict", "better"):
             return "flipped"

@@ -236,7 +236,7 @@ class FrameTree:
         self._series: dict[str, dict[tuple[str, int | None], _Series]] = {}
         self._restarts: list[_Restart] = []
         self.newest_stamp_ns = 0
-        """Of the last transform that is not static."""
+        """The stamp of the last transform that is not static."""
         self._ignored: dict[str, tuple[int, _Entry, str]] = {}
         self._steps: dict[str, tuple[int, _Entry, _Entry]] = {}
         self._contradictions: dict[tuple[str, bool, bool], Sentence] = {}

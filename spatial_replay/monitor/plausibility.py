@@ -95,7 +95,7 @@ class ThresholdRange:
 
     @property
     def _words_of_empty(self) -> str:
-        """What it is where its groups are empty."""
+        """Words for the value over empty groups."""
         quantifiers = {quantified.quantifier for quantified in self.bound}
         if len(quantifiers) > 1:
             return "has no object"

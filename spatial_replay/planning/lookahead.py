@@ -478,7 +478,7 @@ class Arranger:
         """Return poses near others that meet all demands, and are clear of everything; None if none is found.
 
         Each step goes to the nearest places that meet the demands, linear as here and in the steps before.
-        Of two sides, a distance has only the nearer one.
+        A distance between two sides is that of the nearer one.
         """
         workspace, size = self._settings.workspace, self._grid.cell_size
         obstacles = {
