@@ -36,7 +36,7 @@ def _computed(inner: st.SearchStrategy[tuple[str, Any]]) -> st.SearchStrategy[tu
         return f"({one[0]} - {other[0]})", lambda at: one[1](at) - other[1](at)
 
     def times(factor: str, one: tuple[str, Any]) -> tuple[str, Any]:
-        return f"{factor} * {one[0]}", lambda at: float(factor) * one[1](at)
+        return f"{factor} * ({one[0]})", lambda at: float(factor) * one[1](at)
 
     def over(factor: str, one: tuple[str, Any]) -> tuple[str, Any]:
         return f"({one[0]} / {factor})", lambda at: one[1](at) / float(factor)

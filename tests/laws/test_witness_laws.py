@@ -124,8 +124,8 @@ def total(deciding) -> float:
     """The deciding branch added up."""
     measured = iter(deciding.measured)
     return sum(
-        sign * (part.value if isinstance(part, Number) else next(measured).value)
-        for sign, part in deciding.branch
+        weight * (part.value if isinstance(part, Number) else next(measured).value)
+        for weight, part in deciding.branch
     )
 
 

@@ -515,8 +515,8 @@ class DecidingAtom:
         end: which end of its interval decides.
         value: its robustness with every uncertainty at 0; NaN if unknown.
         lower, upper: the ends of its interval.
-        branch: the summands of its number: numbers, signals and measurements, each with its sign; empty if
-            it is unknown.
+        branch: the summands of its number: numbers, signals and measurements, each with its weight, such as
+            -1; empty if it is unknown.
         measured: the signals and measurements among them.
         unknown: the reasons why it is unknown.
     """
@@ -526,7 +526,7 @@ class DecidingAtom:
     value: float
     lower: float
     upper: float
-    branch: tuple[tuple[int, Expression], ...] = field(repr=False)
+    branch: tuple[tuple[float, Expression], ...] = field(repr=False)
     measured: tuple[Measured, ...]
     unknown: tuple[str, ...]
 
@@ -632,19 +632,21 @@ def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) 
 
 
 def _branch(
-    scene: TraceScene, expression: Expression, end: End, sign: int
-) -> Iterator[tuple[int, Expression]]:
-    """Iterate over the signed summands of an expression, once minima and maxima have taken an operand."""
+    scene: TraceScene, expression: Expression, end: End, weight: float
+) -> Iterator[tuple[float, Expression]]:
+    """Iterate over the weighted summands of an expression, once minima and maxima have taken an operand."""
     match expression:
         case Sum():
-            yield from _branch(scene, expression.first, end, sign)
-            yield from _branch(scene, expression.second, end, sign)
+            yield from _branch(scene, expression.first, end, weight)
+            yield from _branch(scene, expression.second, end, weight)
         case Negative():
-            yield from _branch(scene, expression.operand, end.turned, -sign)
-        case Product() | Scaled():
-            yield from _branch(scene, expression.operand, end, sign)
+            yield from _branch(scene, expression.operand, end.turned, -weight)
+        case Product(factor, operand):
+            yield from _branch(scene, operand, end, weight * factor)
+        case Scaled(operand, divisor):
+            yield from _branch(scene, operand, end, weight / divisor)
         case Equality():
-            yield sign, expression.signal
+            yield weight, expression.signal
         case Minimum() | Maximum():
             operands = expression.operands
             intervals = _intervals(scene, [_as_atom(each) for each in operands])
@@ -652,9 +654,9 @@ def _branch(
                 isinstance(expression, Minimum), tuple(map(SignedOperand, range(len(operands))))
             )
             first, *_ = chosen(extremum, end, intervals.__getitem__)
-            yield from _branch(scene, operands[first.index], end, sign)
+            yield from _branch(scene, operands[first.index], end, weight)
         case _:
-            yield sign, expression
+            yield weight, expression
 
 
 def _as_atom(expression: Expression) -> Atom:
