@@ -290,10 +290,10 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
     read = courses.pop("read")
     if abs(read) > _STEADY and abs(phase(read)) < _ASKEW:
         return None
-    fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _STEADY and abs(phase(mean)) < _ALONG}
+    fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG}
     keys = max(fits, key=lambda keys: fits[keys].real, default=None)
     # on one straight way, a robot may go sideways; but headings of satellite receivers count from north
-    is_straight = abs(motions.course) > _STEADY
+    is_straight = abs(motions.course) > _STRAIGHT
     is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
     if keys is None or (is_straight and not ("north" in keys and is_compass)):
         return None
@@ -321,7 +321,8 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
-_FEW_STEPS: Final = 10
+_FEW_STEPS: Final = 20
+_STRAIGHT, _CLOSE = 0.8, 0.95
 _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
 
 
