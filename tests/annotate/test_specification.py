@@ -69,7 +69,7 @@ def test_every_node_is_there_with_its_text_and_place():
         (Boolean("or", (NEAR, TURNED)), "mixed"),
         (Temporal("U", (NEAR, Temporal("G", (NEAR,)))), ""),
         (Quantified("forall", ("a",), Group("all", class_name="*"), TURNED), "1"),
-        (Atom("odd", "odd", Signal("load") + SignedDistance(CUP, Variable("a"))), "mixed"),
+        (Atom("odd", "odd", Signal("load") + SignedDistance(CUP, Variable("a"))), "units of load"),
         (Atom("none", "none", Number(1.0)), "1"),
     ],
 )

@@ -137,7 +137,7 @@ def test_annotations_are_recognised_by_content(annotations: Write, tmp_path: Pat
     packed.write_bytes(gzip.compress((row(0, 0) + "\n").encode()))
     assert len(read_trace(packed)) == 1
     assert open_source(annotations("damaged", row(0, 0))).kind == "drone annotations"
-    with pytest.raises(LogError, match="not a log in a known format"):
+    with pytest.raises(UsageError, match="not a log in a known format"):
         open_source(annotations("0 0 0 0 0 0 0 0 0", "a b c d e f g h i j"))
 
 
