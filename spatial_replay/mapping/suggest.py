@@ -626,7 +626,9 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
         shape = f"shape: {{polygon: {guess.other_outline}}}"
         by_id = (*by_id, f"objects whose size is 0 have corners; `{shape}` reads these, and not the boxes")
     if guess.plane is not None:
-        by_id = (*by_id, f"{guess.plane} names floors or maps; objects on all of them are in one plane here")
+        floors = f"{guess.plane} names floors or maps; objects on all of them are in one plane here"
+        one_floor = f"frame: {{field: {guess.plane}}} with `fixed_frame: FLOOR` evaluates one of them"
+        by_id = (*by_id, floors, one_floor)
     if guess.has_compass:
         by_id = (*by_id, f"{guess.yaw} beside latitude and longitude counts from north, clockwise")
     return by_id + sizeless + indexed + others

@@ -600,3 +600,15 @@ def test_detections_are_placed_by_their_own_headers() -> None:
     # without a fixed frame, all frames of the topic are named
     doubts = make("topics: {/d: {name: '{id}'}}", feed).doubts
     assert any("'base', 'map', 'mast'" in doubt.text for doubt in doubts)
+
+
+def test_floors_are_frames_without_a_way_between_them() -> None:
+    feed = Feed()
+    robots = [
+        {"name": name, "level": level, "x": 1.0, "y": 0.0} for name, level in (("a", "L1"), ("b", "L2"))
+    ]
+    feed.add("/fleet", SECOND, {"robots": robots})
+    entry = "{objects: 'robots[*]', name: '{name}', position: [x, y], frame: {field: level}}"
+    made = make(f"fixed_frame: L1\ntopics: {{/fleet: {entry}}}", feed)
+    assert (made.states("a"), made.states("b")) == ("+", "?")
+    assert any("no transform to 'L1' names the frame 'L2'" in remark for remark in made.remarks)
