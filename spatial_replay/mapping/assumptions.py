@@ -118,7 +118,7 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
     if evidence.planned.clock == "header" or arrivals.messages <= _FEW or first_ns is None or last_ns is None:
         return None
     # the mean, since messages of one burst are close in any unit
-    period_ns = (last_ns - first_ns) / (arrivals.messages - 1)
+    period_ns = arrivals.mean_period_s * 1e9
     for unit, ns in list(UNITS_NS.items())[1:]:
         year = _year(first_ns * ns)
         if year is not None and period_ns < SHORTEST_PERIOD_NS < period_ns * ns:
@@ -172,6 +172,25 @@ def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _LONG_STILL_S, _LONG_STILL = 0.3, 5
+
+
+def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
+    arrivals = evidence.arrivals
+    passed_s, log_s = arrivals.stamps_passed_s, arrivals.log_passed_s
+    if not (evidence.uses_stamps and evidence.has_moving_stamps and passed_s > 0 and log_s > 0):
+        return None
+    # a simulation runs at any rate, but not at that of another unit
+    factor = passed_s / log_s
+    if not any(abs(factor * ns - 1) < _UNIT_ERROR or abs(factor / ns - 1) < _UNIT_ERROR for ns in _FACTORS):
+        return None
+    return (
+        f"its stamps advance by {number_text(passed_s)} s while {number_text(log_s)} s pass in the log, as"
+        " if they were in another unit"
+    )
+
+
+_UNIT_ERROR: Final = 0.02
+_FACTORS: Final = (1e3, 1e6, 1e9)
 
 
 def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
@@ -365,13 +384,18 @@ def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
     most = max(abs(evidence.low[0]), abs(evidence.high[0]))
     if not most > 90:
         return None
-    as_e7 = f"; times 1e-7 it is {number_text(most * 1e-7)}" if 1e6 < most <= 9e8 else ""
-    return f"{most:.0f} is no latitude in degrees{as_e7}"
+    hint = f"; times 1e-7 it is {number_text(most * 1e-7)}" if 1e6 < most <= 9e8 else ""
+    if most == _NO_LATITUDE:
+        hint = ", and AIS sends 91 and 181 for not available"
+    return f"{most:.0f} is no latitude in degrees{hint}"
+
+
+_NO_LATITUDE: Final = 91.0
 
 
 def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
     layout = evidence.planned.layout
-    if layout is None or layout.origin is None:
+    if layout is None or layout.origin is None or _no_degrees(evidence, log):
         return None
     origin = np.array(layout.origin)
     away = max(np.abs(evidence.low[:2] - origin).max(), np.abs(evidence.high[:2] - origin).max())
@@ -513,6 +537,12 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
     speeds = [other.motions.speed.quantile(0.9) for other in others]
     speeds = [speed for speed in speeds if speed > 0]
     size, speed = evidence.size.median, evidence.motions.speed.quantile(0.9)
+    # messages that are recorded in bursts only seem to be fast
+    arrivals = evidence.arrivals
+    usual = evidence.motions.speed.median * min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
+    # a size that the mapping gives has the unit of the mapping, and a place that of the log
+    if usual > max(_SOUND, _SIZES_A_SECOND * size) and size > 0:
+        return f"its objects are {number_text(size)} long and move at {number_text(usual)} a second"
     if not (sizes and speeds and speed > _THOUSAND * max(speeds)):
         return None
     # a shape in the mapping has the unit of the mapping; no robot is faster than sound
@@ -524,7 +554,7 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
     )
 
 
-_THOUSAND, _SOUND = 200, 343.0
+_THOUSAND, _SOUND, _SIZES_A_SECOND = 200, 343.0, 1_000.0
 
 
 def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
@@ -643,6 +673,14 @@ ASSUMPTIONS: Final = (
         "`clock: log` takes the times of recording",
     ),
     Assumption(
+        "stamp_unit",
+        "Stamps have the unit that the mapping says.",
+        "how far stamps advance while time passes in the log; a factor of 1,000, 1e6 or 1e9 contradicts",
+        _unit_of_stamps,
+        "`stamp: {field: PATH, unit: ms}` names the unit, and `clock: log` takes the times of recording",
+        is_about_signals=True,
+    ),
+    Assumption(
         "one_clock",
         "All stamps are of one clock.",
         "how late messages are recorded after their stamps; 5 s from other topics contradict",
@@ -714,7 +752,8 @@ ASSUMPTIONS: Final = (
         "Positions are lengths.",
         "names of fields and the range of coordinates; latitudes and longitudes contradict",
         _degrees_as_metres,
-        "`origin: [LATITUDE, LONGITUDE]` brings latitudes and longitudes into metres",
+        "`origin: [LATITUDE, LONGITUDE]` brings latitudes and longitudes into metres; no key reads a range"
+        " with an angle",
     ),
     Assumption(
         "upward",
@@ -729,7 +768,7 @@ ASSUMPTIONS: Final = (
         "Latitudes are degrees.",
         "the greatest latitude; above 90 contradicts",
         _no_degrees,
-        "`scale: 1e-7` for the topic reads such integers",
+        "`scale: 1e-7` for the topic reads integers, `invalid: [91, 181]` leaves out what is not available",
     ),
     Assumption(
         "origin",
@@ -787,7 +826,7 @@ ASSUMPTIONS: Final = (
         "Bounds are two opposite corners.",
         "where the second lies; left of the first in a fifth of all contradicts",
         _corners,
-        "give `position` and `shape: {box: [WIDTH, HEIGHT]}`",
+        "`bounds: {field: PATH, form: xywh}` reads a corner and a size",
     ),
     Assumption(
         "extent",
@@ -799,9 +838,10 @@ ASSUMPTIONS: Final = (
     Assumption(
         "one_unit",
         "All topics have one unit of length.",
-        "sizes and speeds; 200 times those of all other topics contradict",
+        "sizes and speeds; 200 times those of all other topics contradict, and so do 1,000 sizes a second"
+        " above the speed of sound",
         _one_unit,
-        "`scale: 0.001` for the topic brings millimetres into metres",
+        "`scale: 0.001` for the topic brings millimetres into metres, also the sizes in its entry",
     ),
     Assumption(
         "one_frame",

@@ -24,7 +24,7 @@ from spatial_replay.mapping.topic_reader import TopicReader
 _HEADING: Final = re.compile(r"heading|course|bearing|azimuth|cog$", re.I)
 """Names of fields that hold angles from north, clockwise."""
 
-_ANGLE: Final = re.compile(r"(^|[._])(bearing|azimuth|heading|theta|phi|yaw|angle)$", re.I)
+_ANGLE: Final = re.compile(r"(^|[._])(bearing|azimuth|heading|theta|phi|yaw|angle)(_?(deg|rad)\w*)?$", re.I)
 """Names of fields that hold angles."""
 
 _MOST_VALUES: Final = 4_096
@@ -116,6 +116,8 @@ class Arrivals:
             before, which had come earlier, too.
         longest_still_s: the longest time for which stamps stood still; `still_ns` is when that began.
         stamps_vary: whether they differ at all.
+        stamps_passed_s, log_passed_s: the time from the first stamp to the last, and that between their
+            times of recording.
     """
 
     def __init__(self) -> None:
@@ -127,6 +129,8 @@ class Arrivals:
         self.publishers: set[int] = set()
         self.log_period_s = Spread()
         self.longest_still_s, self.still_ns, self.stamps_vary = 0.0, 0, False
+        self.stamps_passed_s = self.log_passed_s = 0.0
+        self._first_stamp_ns = self._first_stamp_log_ns = 0
         self._first_log_ns = self._last_log_ns = self._first_publish_ns = 0
         self._publisher: int | None = None
         self._waiting: list[tuple[Integers, ...]] = []
@@ -182,6 +186,13 @@ class Arrivals:
         self._publisher = int(channels[-1])
         self.last_ns = int(times_ns[-1])
 
+    @property
+    def mean_period_s(self) -> float:
+        """The mean interval between messages; NaN without two at different times."""
+        if self.first_ns is None or self.last_ns is None or self.messages < 2:
+            return nan
+        return (self.last_ns - self.first_ns) / (self.messages - 1) / 1e9 or nan
+
     def add_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
         """Add the stamps of some messages, in order, and when these were recorded."""
         self._waiting_stamps.append((stamps_ns, log_ns))
@@ -194,6 +205,9 @@ class Arrivals:
         self.lateness_s.add((log_ns - stamps_ns) / 1e9)
         if self._stamp_ns is None:
             self._stamp_ns, self._since_ns = int(stamps_ns[0]), int(log_ns[0])
+            self._first_stamp_ns, self._first_stamp_log_ns = self._stamp_ns, self._since_ns
+        self.stamps_passed_s = (int(stamps_ns[-1]) - self._first_stamp_ns) / 1e9
+        self.log_passed_s = (int(log_ns[-1]) - self._first_stamp_log_ns) / 1e9
         is_new = np.append(stamps_ns[0] != self._stamp_ns, stamps_ns[1:] != stamps_ns[:-1])
         self.stamps_vary = self.stamps_vary or bool(is_new.any())
         since_ns = np.where(is_new, log_ns, 0)
@@ -227,7 +241,7 @@ class Motions:
         speed, turn_rate: in footprint units, and radians, a second.
         jump: the longest step of an object; `jump_s` is how long it took.
         comeback: the longest over a second or more in which messages did not report the object.
-        zeros: how often an object leapt to (0, 0), by more than five of its sizes.
+        zeros: how often an object leapt to (0, 0), by more than five of its sizes, but for comebacks.
         turn_step: the greatest change of the number that is read as yaw.
         chances: reports of objects that were reported at least twice before; in `returns` of them an object
             is back where it was two to four reports before, having leapt by more than its size in each step.
@@ -310,7 +324,8 @@ class Motions:
             self._add_comeback(later, np.where(is_absence, np.nan_to_num(distance, nan=0.0), 0.0), seconds)
         is_zero = ~later[:, _X : _Y + 1].any(axis=1)
         if is_zero.any():
-            self.zeros += int(np.count_nonzero(is_zero & (distance > FAR_LEAP * later[:, _SIZE])))
+            is_far = distance > FAR_LEAP * later[:, _SIZE]
+            self.zeros += int(np.count_nonzero(is_zero & is_far & ~is_absence))
         moves = (distance > 0) & np.isfinite(later[:, _TURN])
         if not moves.any():
             return

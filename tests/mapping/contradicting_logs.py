@@ -135,6 +135,13 @@ def _times() -> Iterator[Case]:
     yield Case("stamps_advance", False, "one frame late", HEADER, stamps(1.0, 1.2))
     yield Case("stamps_advance", False, "not used", BOT, stamps(1.0, 3.0))
 
+    def counted(factor: float) -> list[Said]:
+        return _run({"x": 0.1 * k, "y": 0.0, "ms": round((5000 + 100 * k) * factor)} for k in range(40))
+
+    counts = HEADER.replace("name: bot", "name: bot, stamp: {field: ms, unit: ms}")
+    yield Case("stamp_unit", True, "microseconds as milliseconds", counts, counted(1000.0))
+    yield Case("stamp_unit", False, "a slow simulation", counts, counted(0.05))
+
     def clocks(late: Any) -> list[Said]:
         both = [
             (
@@ -236,8 +243,19 @@ def _places() -> Iterator[Case]:
 
     lat = "topics: {/t: {name: bot, position: [lat, lon], shape: {disc: 0.3}}}"
     yield Case("metres", True, "degrees", lat, _run({"lat": 48 + k * 1e-5, "lon": 11.0} for k in range(30)))
+    polar = BOT.replace("[x, y]", "[range, bearing_deg]")
+    yield Case("metres", True, "an angle", polar, _run({"range": 20.0, "bearing_deg": k} for k in range(30)))
     yield Case("metres", False, "a radar", lat, _run({"lat": -3.5, "lon": 80.0 - k} for k in range(30)))
     yield Case("latitude", True, "times 1e7", FIXES, fixes(52.0, scale=1e7))
+    away = [Said(0.1 * k, {"latitude": 91.0, "longitude": 181.0, "heading": 90.0}) for k in range(5)]
+    unavailable = [*away, *(fix._replace(log=fix.log + 1.0) for fix in fixes(52.0))]
+    yield Case(
+        "latitude",
+        False,
+        "numbers for not available",
+        FIXES.replace("{name", "{invalid: [91, 181], name"),
+        unavailable,
+    )
     yield Case("latitude", False, "near the pole", FIXES.replace("52,", "89,"), fixes(89.99))
     yield Case("origin", True, "of another town", FIXES, fixes(55.0))
     yield Case("origin", False, "a degree away", FIXES, fixes(52.9))
@@ -272,6 +290,7 @@ def _places() -> Iterator[Case]:
     sized = TWO.replace("disc: 0.3", "disc: size")
     yield Case("one_unit", True, "millimetres", sized, unit(100.0, 300.0))
     yield Case("one_unit", True, "places in millimetres", TWO, unit(100.0, 0.3))
+    yield Case("one_unit", True, "alone", BOT, _run({"x": 70.0 * k, "y": 0.0} for k in range(40)))
     yield Case("one_unit", False, "a lorry in a parked fleet", sized, unit(2.5, 12.0))
 
     def framed(other: str) -> list[Said]:

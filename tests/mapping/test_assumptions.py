@@ -11,7 +11,7 @@ from bags.bag_files import write_mcap
 from spatial_replay.cli import run as run_program
 from spatial_replay.mapping.assumptions import NAMES
 from spatial_replay.mapping.yaml_document import schema_of
-from tests.mapping.contradicting_logs import CASES, Case, read
+from tests.mapping.contradicting_logs import CASES, FIXES, Case, Said, read
 from tests.mapping.feeding import SECOND
 
 
@@ -99,3 +99,12 @@ def test_info_shows_the_evidence_of_each_topic_with_what_contradicts_first(
     facts = {topic["topic"]: topic for topic in document["evidence"]}
     assert facts["/bot"]["period_s"]["greatest"] == pytest.approx(1.1)
     assert (facts["/people"]["names"], facts["/people"]["most_at_once"]) == (["p0", "p1", "p2"], 3)
+
+
+def test_a_latitude_that_is_not_available_is_one_doubt_with_the_key_that_settles_it(tmp_path: Path) -> None:
+    fixes = [{"latitude": 52.0 + 1e-5 * k, "longitude": 5.0, "heading": 90.0} for k in range(20)]
+    fixes[7] = {"latitude": 91.0, "longitude": 181.0, "heading": 90.0}
+    trace = read(tmp_path, FIXES, [Said(0.1 * k, fix) for k, fix in enumerate(fixes)])
+    (doubt,) = trace.doubts
+    assert doubt.assumption == "latitude"
+    assert "`invalid: [91, 181]`" in str(doubt.text)
