@@ -39,6 +39,9 @@ _LONGEST_GAP: Final = 9
 _MOST_LEAPS: Final = 4
 """Reports by which an object counts as back where it was."""
 
+_MOST_ROWS: Final = 32_768
+"""Last reports of objects that wait for the next one; those of the oldest messages are dropped."""
+
 FAR_LEAP: Final = 5.0
 """Sizes of an object: a longer step is worth a look."""
 
@@ -289,6 +292,9 @@ class Motions:
         behind = np.repeat(last, np.diff(last, prepend=-1)) - np.arange(len(reports))
         self._tail = reports[behind < _MOST_LEAPS].copy()
         self._tail[:, _IS_NEW] = 0.0
+        if len(self._tail) > _MOST_ROWS:
+            message = self._tail[:, _MESSAGE]
+            self._tail = self._tail[message >= np.partition(message, -_MOST_ROWS)[-_MOST_ROWS]]
         after = np.flatnonzero(same & (reports[1:, _IS_NEW] > 0)) + 1
         if not len(after):
             return
