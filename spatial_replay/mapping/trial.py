@@ -188,6 +188,12 @@ def _bounds(fields: Fields) -> Iterator[Fields]:
         yield {**fields, "bounds": f"{{field: {bounds}, form: xywh}}"}
 
 
+def _latitudes(fields: Fields) -> Iterator[Fields]:
+    invalid = fields.get("invalid", "[]").strip("[]")
+    yield {**fields, "invalid": f"[{', '.join(filter(None, (invalid, '91, 181')))}]"}
+    yield {**fields, "scale": "1e-7"}
+
+
 _NOT_AVAILABLE = (511, 4095, 65535)
 """Numbers that stand for an angle that is not available: in AIS, in 12 and in 16 bits."""
 
@@ -198,7 +204,7 @@ _ALTERNATIVES: Mapping[str, Callable[[Fields], Iterator[Fields]]] = MappingProxy
         "quaternion_order": _orders,
         "corners": _bounds,
         "degrees": lambda fields: ({**fields, "invalid": f"[{number}]"} for number in _NOT_AVAILABLE),
-        "latitude": lambda fields: iter([{**fields, "scale": "1e-7"}]),
+        "latitude": _latitudes,
         "complete_list": lambda fields: iter([{**fields, "complete": "false"}]),
     }
 )

@@ -143,6 +143,13 @@ def test_angles_are_read_as_objects_move() -> None:
     assert "invalid: [511], since otherwise its yaw reaches 511 degrees" in text
 
 
+def test_places_that_are_not_available_are_left_out_rather_than_scaled() -> None:
+    fixes = [{"lat": 52.0 + 1e-5 * k, "lon": 4.5, "heading": 511 if k == 5 else 0} for k in range(20)]
+    fixes[7] |= {"lat": 91.0, "lon": 181.0}
+    topic = suggested_for(fixes)[1]
+    assert (topic.invalid, topic.scale) == ((511, 91, 181), 1.0)
+
+
 def test_lists_of_changes_are_not_complete() -> None:
     def part(second: int) -> dict[str, Any]:
         ids = (1, 2) if second % 2 else (3, 4)
