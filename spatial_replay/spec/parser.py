@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -341,6 +342,10 @@ FORMULA_NAME = "spec"
 TABLES_FILE = "grammar_tables.json"
 """Written by `tools/make_grammar`."""
 _OPENING = frozenset({"LPAR", "LSQB"})
+
+# other tools count objects as in (#people <= 2)
+_COUNTED = re.compile(r"# *\w+ *[<>=!]")
+_COUNTED_HINT = "# begins a comment; a plug-in counts objects"
 _STATEMENT_WORDS = (*(word for word, kind in KEYWORDS.items() if kind in STATEMENT_TYPES), "scale")
 
 
@@ -437,7 +442,9 @@ def _close(
     if brackets:
         opened = brackets[-1][0]
         closing = ")" if opened.type == "LPAR" else "]"
-        faults.add(span_of(opened), f"{opened.value!r} is never closed", f"add a {closing!r}")
+        rest = faults.source.text[tokens[-1].end_pos :].partition("\n")[0].lstrip()
+        hint = _COUNTED_HINT if _COUNTED.match(rest) else f"add a {closing!r}"
+        faults.add(span_of(opened), f"{opened.value!r} is never closed", hint)
     broken = bool(brackets) or any(token.type == "ERROR" for token in tokens)
     yield TokenGroup(tuple(tokens), is_bare_formula, broken)
 
@@ -638,7 +645,7 @@ def _report(
         return
     if token.type == "$END":
         rest = faults.source.text[span.start :].partition("\n")[0].lstrip()
-        hint = "# begins a comment; a plug-in counts objects" if rest.startswith("#") else ""
+        hint = _COUNTED_HINT if rest.startswith("#") else ""
         faults.add(span, f"the statement ends too early: expected {_expected(accepted)}", hint)
         return
     message = f"expected {_expected(accepted)}, found {token.value!r}"

@@ -298,7 +298,7 @@ def test_a_fault_names_the_place_and_the_remedy(statement: str, where: str, mess
     assert marked.startswith(where) if where else caret.index("^") == len(line)
 
 
-@pytest.mark.parametrize("text", ["spec s = #people <= 2", "#people <= 2"])
+@pytest.mark.parametrize("text", ["spec s = #people <= 2", "#people <= 2", "spec s = G (#people <= 2)"])
 def test_a_number_of_objects_is_no_comment(text: str) -> None:
     (fault,) = faults_of(text)
     assert "# begins a comment" in fault
