@@ -34,6 +34,7 @@ from spatial_replay.replay.selection import (
     clipped_source,
 )
 from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import Outline, Specification
 from spatial_replay.text import Instant, Sentence, counted_from
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
@@ -265,6 +266,7 @@ class ClipSearch:
             int(np.searchsorted(self._times_ns, first_ns)),
             min(last, int(np.searchsorted(self._times_ns, last_ns, side="right")) - 1),
         )
+        self._around_ns = around_ns
         self._known: dict[tuple[int, int], bool] = {}
 
     def reasons(self, start_ns: int, end_ns: int) -> Iterator[Sentence]:
@@ -276,7 +278,9 @@ class ClipSearch:
             window = [int(self._times_ns[place]) for place in shorter] if first < last else []
             changes = (part.change_over(*window) for part in self._parts if window)
             reason = next(filter(None, (*moments, *changes)), None)
-            # with --around, it may also be longer without any need
+            is_border = at in (0, len(self._times_ns) - 1)
+            if reason is None and self._around_ns and at in self._inner and not is_border:
+                reason = f", {format_duration(self._around_ns)} from the samples that decide, by --around"
             if window and reason is not None:
                 yield Sentence(f"it {verb} at ", Instant(time_ns, 0), reason)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.automata.compile import automaton
-from spatial_replay.compare.specifications import EditOutcome, evaluate_with, outcome_text
+from spatial_replay.compare.specifications import EditOutcome, difference_text, evaluate_with, outcome_text
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_rows
 from spatial_replay.geometry.footprint import FootprintBatch
@@ -518,9 +518,7 @@ class RunSpecDiff:
 
     def sentences(self, zeros_ns: tuple[int, int]) -> Iterator[Sentence]:
         """Yield what differs; times of each run count from its own start."""
-        yield Sentence(
-            " | ".join(map(outcome_text, (self.a, self.b))) + ("" if self.is_different else ", the same")
-        )
+        yield Sentence(" | ".join(map(outcome_text, (self.a, self.b))) + difference_text(self.a, self.b))
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, zeros_ns[0]))
         if self.parting is not None:

@@ -43,6 +43,7 @@ from spatial_replay.text import (
     interval_text,
     json_fields,
     json_value,
+    with_unit,
 )
 from spatial_replay.trace.trace import Trace
 
@@ -237,10 +238,8 @@ class SpecDiff(Displayed):
         Args:
             shown: declarations whose lines need not be repeated.
         """
-        outcome = outcome_text(self.old)
-        yield Sentence(
-            f"{outcome} → {outcome_text(self.new)}" if self.is_different else f"{outcome}, the same"
-        )
+        outcomes = (self.old, self.new) if self.is_different else (self.old,)
+        yield Sentence(" → ".join(map(outcome_text, outcomes)) + difference_text(self.old, self.new))
         if self.first is not None:
             pairs = (self.first.old, self.old.unit), (self.first.new, self.new.unit)
             values = " → ".join(interval_text(value, value, value, unit) for value, unit in pairs)
@@ -323,6 +322,18 @@ _MOST_LISTED: Final = 8
 def outcome_text(result: SpecResult) -> str:
     """Return a verdict with its robustness: "violated (-0.2 m)", "violated (between -inf and -0.2 m)"."""
     return f"{result.verdict} ({interval_text(*EditOutcome.of(result)[1:], result.unit)})"
+
+
+def difference_text(first: SpecResult, second: SpecResult) -> str:
+    """Return ", the same", or by how much two outcomes differ whose texts are equal; "" for other texts."""
+    outcomes = EditOutcome.of(first), EditOutcome.of(second)
+    if outcomes[0].same_as(outcomes[1]):
+        return ", the same"
+    if outcome_text(first) != outcome_text(second):
+        return ""
+    differences = (abs(a - b) for a, b in zip(outcomes[0][1:], outcomes[1][1:], strict=True) if a != b)
+    difference = max(filter(math.isfinite, differences), default=0.0)
+    return f", different by {with_unit(difference, first.unit)}" if difference else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -216,6 +216,15 @@ def test_runs_in_other_units_are_refused(capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.usefixtures("folder")
+def test_a_diff_names_a_difference_that_rounded_numbers_hide(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, apart in ("old", "0.08"), ("new", "0.08000001"):
+        Path(f"{name}.spatial").write_text(f"spec gap = G (red dist blue >= {apart})")
+    code, out, _ = said(capsys, "diff", "push.mcap", "--spec", "old.spatial", "--spec", "new.spatial")
+    assert code == 1
+    assert "gap: violated (-0.01458 m) → violated (-0.01458 m), different by 1e-08 m" in out
+
+
+@pytest.mark.usefixtures("folder")
 def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -227,6 +236,8 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     assert "it ends at 5.267 s, where the robustness of `gaps` is decided" in out
     longer = said(capsys, "clip", "push.mcap", "--spec", "push_edited.spatial", "-o", "long.mcap")[1]
     assert "it ends at 15.967 s: in a shorter clip `push` has another robustness" in longer
+    around = said(capsys, *arguments[:-1], "around.mcap", "--around", "2s")[1]
+    assert "it begins at 2.233 s, 2s from the samples that decide, by --around" in around
     size = Path("bug.mcap").stat().st_size
     assert f"{size:,} bytes" in out
     assert size < Path("push.mcap").stat().st_size / 4
