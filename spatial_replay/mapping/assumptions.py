@@ -289,12 +289,18 @@ _ROUNDING: Final = 0.01
 
 def _beyond_a_turn(evidence: TopicEvidence, log: Log) -> str | None:
     layout, turn = evidence.planned.layout, evidence.turn
-    if layout is None or abs(layout.angle_scale) == 1.0 or not turn.greatest > _A_TURN:
+    if layout is None or abs(layout.angle_scale) == 1.0:
         return None
-    if _is_unwrapped(evidence, _A_TURN):
+    a_turn = round(2 * pi / abs(layout.angle_scale))
+    limit = a_turn * _A_TURN / 360
+    if not turn.greatest > limit or _is_unwrapped(evidence, limit):
         return None
     reached = number_text(turn.greatest)
-    return f"its yaw reaches {reached} degrees, which is beyond a turn; {reached} often means not available"
+    if turn.median > a_turn:
+        return f"its yaw reaches {reached}, and mostly lies beyond a turn of {a_turn}"
+    return (
+        f"its yaw reaches {reached}, which is beyond a turn of {a_turn}; {reached} often means not available"
+    )
 
 
 _A_TURN: Final = 360.5
@@ -332,7 +338,7 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     if goes_along or _heading(evidence, log):
         return None
-    unit = "deg" if yaw.scale != 1.0 else "rad"
+    unit = {1.0: "rad", pi / 180: "deg"}.get(abs(yaw.scale), "cdeg")
     compass = f"{{field: {yaw.field}, unit: {unit}, zero: north, clockwise: true}}"
     return (
         f"{yaw.field} counts from the east, counter-clockwise; a heading from the north, clockwise, is"
@@ -730,7 +736,7 @@ ASSUMPTIONS: Final = (
         "Angles in degrees stay within a turn.",
         "the greatest angle; above 360.5 contradicts, unless angles count turns",
         _beyond_a_turn,
-        "`invalid: [NUMBER]` makes the object unknown there",
+        "`invalid: [NUMBER]` makes the object unknown there, `unit: cdeg` reads hundredths of a degree",
     ),
     Assumption(
         "heading",

@@ -430,7 +430,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
 def _angle(value: Any) -> Angle | None:
     if not isinstance(value, dict):
         return None if value is None else Angle(value)
-    scale = pi / 180 if value.get("unit") == "deg" else 1.0
+    scale = {"rad": 1.0, "deg": pi / 180, "cdeg": pi / 18_000}[value.get("unit", "rad")]
     return Angle(
         value["field"],
         -scale if value.get("clockwise") else scale,

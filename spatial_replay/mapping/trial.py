@@ -188,6 +188,12 @@ def _bounds(fields: Fields) -> Iterator[Fields]:
         yield {**fields, "bounds": f"{{field: {bounds}, form: xywh}}"}
 
 
+def _degrees(fields: Fields) -> Iterator[Fields]:
+    for number in _NOT_AVAILABLE:
+        yield {**fields, "invalid": f"[{number}]"}
+    yield {**fields, "yaw": fields.get("yaw", "").replace("unit: deg", "unit: cdeg")}
+
+
 def _latitudes(fields: Fields) -> Iterator[Fields]:
     invalid = fields.get("invalid", "[]").strip("[]")
     yield {**fields, "invalid": f"[{', '.join(filter(None, (invalid, '91, 181')))}]"}
@@ -203,7 +209,7 @@ _ALTERNATIVES: Mapping[str, Callable[[Fields], Iterator[Fields]]] = MappingProxy
         "heading": _yaws,
         "quaternion_order": _orders,
         "corners": _bounds,
-        "degrees": lambda fields: ({**fields, "invalid": f"[{number}]"} for number in _NOT_AVAILABLE),
+        "degrees": _degrees,
         "latitude": _latitudes,
         "complete_list": lambda fields: iter([{**fields, "complete": "false"}]),
     }

@@ -202,6 +202,10 @@ def _poses() -> Iterator[Case]:
     yield Case("radians", False, "turns are counted", *turning(*(0.1 * k for k in range(400))))
     yield Case("one_turn", True, "turns are counted", *turning(*(0.1 * k for k in range(100))))
     yield Case("one_turn", False, "up to 2 pi", *turning(*(0.062 * k for k in range(100))))
+    hundredths = [100.0 * (k * 10 % 360) for k in range(72)]
+    in_hundredths = DEGREES.replace("unit: deg", "unit: cdeg")
+    yield Case("degrees", True, "hundredths", *turning(*hundredths, mapping=DEGREES))
+    yield Case("degrees", False, "read as hundredths", *turning(*hundredths, mapping=in_hundredths))
     yield Case("degrees", True, "511", *turning(*([90.0] * 10 + [511.0] * 5), mapping=DEGREES))
     yield Case(
         "degrees", False, "turns are counted", *turning(*(5.0 * k for k in range(200)), mapping=DEGREES)
