@@ -208,7 +208,7 @@ class Violation(google.protobuf.message.Message):
     name: builtins.str
     """As in `results`."""
     since: builtins.float
-    """Since when that is certain: seconds after the first sample."""
+    """Since when that is certain: seconds after the log's zero."""
     by: builtins.float
     """By how much: what the value over all samples falls short of 0 at least."""
     unit: builtins.str
@@ -216,7 +216,7 @@ class Violation(google.protobuf.message.Message):
     over: builtins.str
     """What decided it: the atom, or the response that was missing. Empty if that is not known."""
     at: builtins.float
-    """When the value over all samples was first so low: seconds after the first sample."""
+    """When the value over all samples was first so low: seconds after the log's zero."""
     def __init__(
         self,
         *,
@@ -267,7 +267,7 @@ class RecentEvent(google.protobuf.message.Message):
     AT_FIELD_NUMBER: builtins.int
     EVENT_FIELD_NUMBER: builtins.int
     at: builtins.float
-    """When it was confirmed: seconds after the first sample."""
+    """When it was confirmed: seconds after the log's zero."""
     event: builtins.str
     """The sentence of /spatial/log."""
     def __init__(

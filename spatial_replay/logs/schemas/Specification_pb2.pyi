@@ -24,7 +24,9 @@ class Specification(google.protobuf.message.Message):
     RESULTS_FIELD_NUMBER: builtins.int
     START_NS_FIELD_NUMBER: builtins.int
     start_ns: builtins.int
-    """The time of the first sample, in nanoseconds: a live source sends this message again at later times."""
+    """The time that seconds in texts count from, in nanoseconds: the log's first sample. A part of a log keeps the
+    zero of the whole.
+    """
     @property
     def files(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___SpecificationFile]:
         """The files, in the order in which they were given."""
