@@ -542,10 +542,10 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
     sizes = [other.size.median for other in others if other.size.median > 0]
     speeds = [other.motions.speed.quantile(0.9) for other in others]
     speeds = [speed for speed in speeds if speed > 0]
-    size, speed = evidence.size.median, evidence.motions.speed.quantile(0.9)
+    size, arrivals = evidence.size.median, evidence.arrivals
     # messages that are recorded in bursts only seem to be fast
-    arrivals = evidence.arrivals
-    usual = evidence.motions.speed.median * min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
+    burst = min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
+    usual, speed = (evidence.motions.speed.quantile(share) * burst for share in (0.5, 0.9))
     # a size that the mapping gives has the unit of the mapping, and a place that of the log
     if usual > max(_SOUND, _SIZES_A_SECOND * size) and size > 0:
         return f"its objects are {number_text(size)} long and move at {number_text(usual)} a second"

@@ -295,6 +295,8 @@ def _places() -> Iterator[Case]:
     yield Case("one_unit", True, "millimetres", sized, unit(100.0, 300.0))
     yield Case("one_unit", True, "places in millimetres", TWO, unit(100.0, 0.3))
     yield Case("one_unit", True, "alone", BOT, _run({"x": 70.0 * k, "y": 0.0} for k in range(40)))
+    late = [Said(2.0 * (k // 20) + 2e-5 * (k % 20), {"x": 0.1 * k, "y": 0.0}) for k in range(200)]
+    yield Case("one_unit", False, "recorded in bursts", TWO, [*late, *unit(0.0, 0.3)[:40]])
     yield Case("one_unit", False, "a lorry in a parked fleet", sized, unit(2.5, 12.0))
 
     def framed(other: str) -> list[Said]:
