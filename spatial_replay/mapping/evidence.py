@@ -731,4 +731,6 @@ def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:
         radius = np.maximum.reduceat(shapes.radius, parts[:-1][has_parts])[:, None]
         low[has_parts] = np.minimum.reduceat(shapes.vertices, starts, axis=0) - radius
         high[has_parts] = np.maximum.reduceat(shapes.vertices, starts, axis=0) + radius
-    return (low + high) / 2, high - low
+    # coordinates of a log may be infinite
+    with np.errstate(invalid="ignore"):
+        return (low + high) / 2, high - low

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from bags.bag_files import write_mcap
 from spatial_replay.cli import run as run_program
 from spatial_replay.mapping.assumptions import NAMES
 from spatial_replay.mapping.yaml_document import schema_of
-from tests.mapping.contradicting_logs import CASES, FIXES, Case, Said, read
+from tests.mapping.contradicting_logs import BOT, CASES, FIXES, Case, Said, read
 from tests.mapping.feeding import SECOND
 
 
@@ -99,6 +100,14 @@ def test_info_shows_the_evidence_of_each_topic_with_what_contradicts_first(
     facts = {topic["topic"]: topic for topic in document["evidence"]}
     assert facts["/bot"]["period_s"]["greatest"] == pytest.approx(1.1)
     assert (facts["/people"]["names"], facts["/people"]["most_at_once"]) == (["p0", "p1", "p2"], 3)
+
+
+@pytest.mark.filterwarnings("error")
+def test_places_that_are_infinite_are_read_without_a_warning_of_python(tmp_path: Path) -> None:
+    trace = read(
+        tmp_path, BOT, [Said(0.1 * k, {"x": inf if k == 5 else 0.1 * k, "y": 0.0}) for k in range(9)]
+    )
+    assert trace.doubts == ()
 
 
 def test_a_latitude_that_is_not_available_is_one_doubt_with_the_key_that_settles_it(tmp_path: Path) -> None:
