@@ -149,7 +149,10 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             # the bag, by one of its files
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
-            names = sorted(each.name for each in file.iterdir())
+            names = sorted(entry.name for entry in file.iterdir())
+            if {"format.json", "rows"}.issubset(names):
+                remedy = "`results` shows them, and compares two such folders"
+                raise MissingFileError(f"{path}: this folder has results of a batch; {remedy}")
             logs = [name for name in names if name.endswith((".mcap", ".bag", ".jsonl", ".jsonl.gz", ".csv"))]
             what = "no file of a ROS 2 bag (.db3, .mcap)" if names else "nothing"
             such = f", such as {printable(str(file / logs[0]))}; batch takes a folder" if logs else ""

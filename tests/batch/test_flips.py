@@ -86,6 +86,9 @@ def test_two_folders_of_results_are_compared(fleet: Path) -> None:
     kinds = {(row["log"], row["spec"]): row["change"] for row in rows}
     assert kinds["logs/run-0.jsonl", "apart"] == "less" and kinds["logs/run-2.jsonl", "apart"] == "flipped"
     assert "less:" not in command("results", "a", "b", "--tolerance", "0.2").out
+    refused = command("diff", "a", "b")
+    assert refused.code == 2
+    assert "a: this folder has results of a batch; `results` shows them, and compares two" in refused.err
     gone = command("results", "b", "a").out.partition("gone:\n")[2]
     assert "  logs/new.jsonl: apart: satisfied (0.4)\n" in gone
     batch("logs/run-0.jsonl", "--spec", "new.spatial", "-o", "c")
