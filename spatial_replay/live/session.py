@@ -124,8 +124,12 @@ class ObjectsAssembler:
         """Return what is remarkable where nothing was lost: nothing."""
         return ()
 
-    def take_doubts(self) -> tuple[Doubt, ...]:
+    def find_doubts(self) -> tuple[Doubt, ...]:
         """Return no doubts: samples are read without a mapping."""
+        return ()
+
+    def take_doubts(self) -> tuple[Doubt, ...]:
+        """Return no doubts, as `find_doubts`."""
         return ()
 
 
@@ -229,6 +233,9 @@ _STAMPING_SERVERS: Final = frozenset({"foxglove_bridge"})
 _PAUSE_S: Final = 0.005
 """How long is waited before a log that is full is asked again."""
 
+_SAMPLES_BEFORE_DOUBTS: Final = 100
+"""After so many samples, and after twice as many each time, a run is compared with its mapping."""
+
 _USUAL: Final = 9
 """Intervals between messages of a topic that show which one is usual."""
 
@@ -315,6 +322,8 @@ class LiveSession:
         self._remarked: set[Diagnostic] = set()
         self._members = ClassMembers(self._ends.needs.classes)
         self._is_closed = False
+        self._next_doubts = _SAMPLES_BEFORE_DOUBTS
+        self._doubted: set[tuple[str, str]] = set()
         self.remarks: tuple[str, ...] = ()
         self.doubts: tuple[Doubt, ...] = ()
         """Assumptions that the run contradicts; known after `close`, or at the end of `updates`."""
@@ -740,6 +749,16 @@ class LiveSession:
                 )
         return counting[0] if len(counting) == 1 else Trace.concatenate(counting)
 
+    def _note_doubts(self) -> None:
+        """Note new contradictions of the run so far; the next look is after twice as many samples."""
+        self._next_doubts *= 2
+        if self._assembler is None:
+            return
+        for doubt in distinct_doubts(self._assembler.find_doubts(), self._ends.begin_ns or 0):
+            if (doubt.assumption, doubt.topic) not in self._doubted:
+                self._doubted.add((doubt.assumption, doubt.topic))
+                self._notes.append(doubt.remark(self._address))
+
     def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
         updates = tuple(monitor.update(sample) for monitor in self._monitors)
         for monitor in self._monitors:
@@ -749,6 +768,8 @@ class LiveSession:
                 self._remarked.add(each)
                 self._notes.append(f"{each.filename}:{each.line}:{each.column}: {each.message}; {each.hint}")
         self._samples += 1
+        if self._samples >= self._next_doubts:
+            self._note_doubts()
         self._time_ns = sample.time_ns
         now_s = time.monotonic()
         if self._assembler is not None:

@@ -214,6 +214,11 @@ class _Assembling:
         """Return what was lost since the last call, each with its place."""
         return self._faults.take(last=last or self._settled_ns == LATEST_NS)
 
+    def find_doubts(self) -> tuple[Doubt, ...]:
+        """Return the assumptions that the messages so far contradict, and the mapping does not accept."""
+        doubts = contradictions(self._tracker.evidence, self._plan.mapping)
+        return tuple(doubt for doubt in doubts if isinstance(doubt, Doubt) and not doubt.is_accepted)
+
     def take_doubts(self) -> tuple[Doubt, ...]:
         """Return the assumptions that the log contradicts; none before `finish`."""
         doubts, self._doubts = tuple(self._doubts), []

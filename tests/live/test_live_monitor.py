@@ -1102,3 +1102,15 @@ def test_the_log_of_a_run_that_is_left_in_python_is_doubtful_too(tmp_path: Path)
     with rude_server(*sent) as address:
         asyncio.run(updates_of(address, spec, mapped, 9, output=tmp_path / "live.mcap"))
     assert [doubt.assumption for doubt in sr.read_trace(tmp_path / "live.mcap").doubts] == ["radians"]
+
+
+def test_a_long_run_says_what_it_contradicts_before_its_end(tmp_path: Path) -> None:
+    mapping = "topics: {/robot: {position: [x, y], yaw: yaw}, /vase: {position: [x, y]}}"
+    mapped, spec = files(tmp_path, mapping, "spec goal = G (robot dist vase >= 1)")
+    turned = b'{"x": 2.0, "y": 0.0, "yaw": 200}'
+    sent = [each for tick in range(300) for each in (pose(2, tick), frame(1, tick * 10 * MS, turned))]
+    with rude_server(*sent) as address:
+        updates = asyncio.run(updates_of(address, spec, mapped, 250))
+    notes = [note for update in updates for note in update.notes if "its angles reach 200" in note]
+    # once, although the run is compared again and again
+    assert len(notes) == 1
