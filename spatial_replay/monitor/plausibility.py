@@ -127,6 +127,7 @@ class LogNumbers:
         box: xmin, ymin, xmax, ymax of all footprints; empty (xmin > xmax) without any.
         samples: how many there are.
         times_ns: of the first and the last one.
+        classes: of its objects; "" for objects without one.
         missing: by object and signal of the specification, how many samples lack it, and the first of them.
     """
 
@@ -134,6 +135,7 @@ class LogNumbers:
         """Start before the first sample."""
         self.box: tuple[float, float, float, float] = (inf, inf, -inf, -inf)
         self.samples = 0
+        self.classes: set[str] = set()
         self._pauses = Pauses()
         self.times_ns = (0, 0)
         self._regions = specification.regions
@@ -166,6 +168,7 @@ class LogNumbers:
             int(trace.times_ns[-1]),
         )
         self.samples += len(trace)
+        self.classes.update(trace.classes[code] or "" for code in np.unique(trace.class_code).tolist())
         self._pauses.add(trace.times_ns)
         for part in self._parts:
             lacking = np.flatnonzero(is_missing(trace, part))
@@ -310,6 +313,12 @@ def plausibility_warnings(
             doubts = _doubts_of_window(key, node.bound, log)
         for message, hint in doubts:
             found.setdefault(key, source.diagnostic("warning", node.span, message, hint))
+    for node, _ in bound_nodes(specification):
+        if isinstance(node, Quantified) and (name := _empty_class(node.group, log)) is not None:
+            listed = ", ".join(sorted(filter(None, log.classes))) or "none"
+            hint = f"its classes are {listed}; over no object, forall is +inf and exists -inf"
+            message = f"no object of class {name!r} is ever in this log"
+            found.setdefault(name, source.diagnostic("warning", node.span, message, hint))
     for spec in specification.results:
         reach_s, windows = _reach(spec.formula, log.rate or inf)
         name = _nested(windows)
@@ -321,6 +330,14 @@ def plausibility_warnings(
             if not any(f"{node.operator}{format_bound(bound)}" in found for node, bound in windows):
                 found[name] = source.diagnostic("warning", windows[0][0].span, message, hint)
     return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
+
+
+def _empty_class(group: Group, log: LogNumbers) -> str | None:
+    """Return the class of a group that no object of the log has; None for other groups."""
+    name = group.class_name
+    if name is None or name == ANY_CLASS or name.casefold() in map(str.casefold, log.classes):
+        return None
+    return name
 
 
 def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterator[tuple[str, str]]:

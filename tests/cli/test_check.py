@@ -293,6 +293,22 @@ def test_an_empty_group_holds_and_rates_are_known_where_a_log_is_read_in_parts(
     assert counts == [(20_000, 0), (5, 19_996), (0, 20_001)]
 
 
+def test_a_class_that_a_log_never_has_does_not_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "run.jsonl", tmp_path / "s.spatial"
+    box = {"name": "cup", "class": "dish", "polygon": [[0, 0], [1, 0], [1, 1]]}
+    log.write_text("".join(json.dumps({"time_ns": n * 10**8, "objects": [box]}) + "\n" for n in range(3)))
+    spec.write_text('spec s = G (forall p in class "Dish": p leftof cup)\n')
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    assert "all names, thresholds and windows fit" in capsys.readouterr().out
+    spec.write_text('spec s = G (forall p in class "person": p leftof cup)\n')
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    output = capsys.readouterr()
+    assert "no object of class 'person' is ever in this log" in output.err
+    assert "its classes are dish" in output.err
+
+
 def test_errors_are_marked_at_their_lines_for_github_and_for_code_scanning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
