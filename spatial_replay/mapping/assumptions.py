@@ -556,7 +556,7 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     return (
         f"its objects are {number_text(size)} long and move at {number_text(speed)} a second, and others at"
-        f" most {number_text(max(sizes))} and {number_text(max(speeds))}: it may be in mm or cm"
+        f" most {number_text(max(sizes))} and {number_text(max(speeds))}: it may be in mm"
     )
 
 

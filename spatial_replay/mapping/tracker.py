@@ -872,7 +872,10 @@ class Remarks:
         for (topic, is_gap, name), (count, first_ns) in sorted(self.stale.items()):
             by_topic.setdefault((topic, is_gap), []).append((name, count, first_ns))
         for (topic, is_gap), stale in by_topic.items():
-            limit = "`max_gap`" if is_gap else "max_age; `max_age: forever` keeps its last message"
+            reason = "the topic was silent for longer than `max_gap`"
+            if not is_gap:
+                # other objects of the topic may have been reported
+                reason = "no report came for longer than max_age; `max_age: forever` keeps the last one"
             names = ", ".join(name for name, _, _ in stale[:_MOST_NAMES])
             more = f" and {len(stale) - _MOST_NAMES} more" if len(stale) > _MOST_NAMES else ""
             are = "is" if len(stale) == 1 else "are"
@@ -881,7 +884,7 @@ class Remarks:
             yield Sentence(
                 f"{topic}: {names}{more} {are} unknown in up to {counted(most, 'sample')}, the first at ",
                 Instant(first_ns, 0),
-                f": the topic was silent for longer than {limit}",
+                f": {reason}",
             )
 
 

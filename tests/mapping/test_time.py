@@ -367,10 +367,8 @@ def test_signals_follow_the_same_rules() -> None:
     assert charge[:5] == [0.5, 0.5, 0.25, 0.25, 0.25]
     assert charge[5] != charge[5]
     (remark,) = made.remarks
-    assert (
-        "/battery: charge is unknown in up to 1 sample, the first at 2.500 s: the topic was silent" in remark
-    )
-    assert remark.endswith("`max_age: forever` keeps its last message")
+    assert "/battery: charge is unknown in up to 1 sample, the first at 2.500 s: no report came" in remark
+    assert remark.endswith("`max_age: forever` keeps the last one")
 
 
 def test_a_topic_may_have_objects_and_signals() -> None:
