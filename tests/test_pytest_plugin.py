@@ -158,6 +158,6 @@ def test_a_doubtful_result_fails_with_the_contradiction_unless_the_suite_allows_
     for allow, outcome in (("", {"failed": 1}), ("allow: doubtful\n", {"passed": 1})):
         suite.write_text(f"{allow}cases: [{case}]")
         result = pytester.runpytest_inprocess(*options)
-        assert result.parseoutcomes() == outcome
+        result.assert_outcomes(**outcome)
         if "failed" in outcome:
             result.stdout.fnmatch_lines(["degrees.jsonl: *: doubtful: its angles reach 90*"])
