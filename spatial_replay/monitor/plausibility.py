@@ -20,6 +20,7 @@ from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
     Bound,
+    Earlier,
     Expression,
     Formula,
     Group,
@@ -314,11 +315,12 @@ def plausibility_warnings(
         for message, hint in doubts:
             found.setdefault(key, source.diagnostic("warning", node.span, message, hint))
     for node, _ in bound_nodes(specification):
-        if isinstance(node, Quantified) and (name := _empty_class(node.group, log)) is not None:
+        empty_class = _empty_class(node.group, log) if isinstance(node, Quantified) else None
+        if empty_class is not None:
             listed = ", ".join(sorted(filter(None, log.classes))) or "none"
             hint = f"its classes are {listed}; over no object, forall is +inf and exists -inf"
-            message = f"no object of class {name!r} is ever in this log"
-            found.setdefault(name, source.diagnostic("warning", node.span, message, hint))
+            message = f"no object of class {empty_class!r} is ever in this log"
+            found.setdefault(empty_class, source.diagnostic("warning", node.span, message, hint))
     for spec in specification.results:
         reach_s, windows = _reach(spec.formula, log.rate or inf)
         name = _nested(windows)
@@ -332,9 +334,9 @@ def plausibility_warnings(
     return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
 
 
-def _empty_class(group: Group, log: LogNumbers) -> str | None:
+def _empty_class(group: Group | Earlier, log: LogNumbers) -> str | None:
     """Return the class of a group that no object of the log has; None for other groups."""
-    name = group.class_name
+    name = group.class_name if isinstance(group, Group) else None
     if name is None or name == ANY_CLASS or name.casefold() in map(str.casefold, log.classes):
         return None
     return name
