@@ -175,7 +175,12 @@ def _end_waiting_threads(code: int) -> None:
     """End the process if a thread waits for something that may never come, such as the data of a pipe."""
     until_s = time.monotonic() + _PATIENCE_S
     main_thread = threading.main_thread()
-    threads = [thread for thread in threading.enumerate() if thread is not main_thread and not thread.daemon]
+    # an interruption may come between the making of a thread and its start; such a one cannot be joined
+    threads = [
+        thread
+        for thread in threading.enumerate()
+        if thread is not main_thread and not thread.daemon and thread.ident is not None
+    ]
     for thread in threads:
         thread.join(max(until_s - time.monotonic(), 0.0))
     if any(thread.is_alive() for thread in threads):
