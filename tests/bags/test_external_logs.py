@@ -176,14 +176,12 @@ def test_a_window_of_an_indexed_log_reads_only_its_chunks(tmp_path: Path, mappin
     window = (START_NS + 50 * SECOND, START_NS + 51 * SECOND)
     # the first time, modules are read, too
     blocks_of(log, mapping, *window)
-    reads = []
-    for _ in range(3):
-        before = bytes_read()
-        blocks = blocks_of(log, mapping, *window)
-        reads.append(bytes_read() - before)
+    before = bytes_read()
+    blocks = blocks_of(log, mapping, *window)
+    read = bytes_read() - before
     assert sum(len(block.trace) for block in blocks) == 10
-    # some ten seconds before and after count for what is late, old or silent; the process may read more
-    assert min(reads) < 0.35 * size
+    # some ten seconds before and after count for what is late, old or silent, and chunks are read ahead
+    assert read < 0.5 * size
 
 
 def test_a_definition_is_added_to_a_copy_of_a_log_without(data_folder: Path, tmp_path: Path) -> None:
