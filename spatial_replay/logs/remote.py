@@ -126,18 +126,20 @@ def each_ahead(
 ) -> Iterator[_Read]:
     """Yield what a function reads for each item, in order, while threads read the next ones.
 
-    As many as there are threads are always read ahead, and more as long as their sizes are `most` together.
+    As many as there are threads are always read ahead. More are as long as their sizes together are neither
+    above `most` nor above twice what was yielded: a caller that takes only the first item reads few.
     """
     threads = ThreadPoolExecutor(at_once, "reading-ahead")
     waiting: deque[tuple[int, Future[_Read]]] = deque()
-    ahead = 0
+    ahead = yielded = 0
     try:
         for item in items:
             waiting.append((size(item), threads.submit(read, item)))
             ahead += size(item)
-            while ahead > most and len(waiting) > at_once:
+            while ahead > min(most, 2 * yielded) and len(waiting) > at_once:
                 first, reading = waiting.popleft()
                 ahead -= first
+                yielded += first
                 yield reading.result()
         while waiting:
             yield waiting.popleft()[1].result()
