@@ -93,6 +93,9 @@ class Compiler:
             if is_cached:
                 compiler.config.CACHE_DIR = str(self._folder)
             try:
+                available = compiler.njit(function).targetdescr.options
+                # an option that another version of the compiler does not have changes speed only
+                options = {name: value for name, value in options.items() if hasattr(available, name)}
                 return compiler.njit(cache=is_cached, error_model="numpy", **options)(function)
             finally:
                 compiler.config.CACHE_DIR = before
@@ -172,12 +175,16 @@ def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
     return _Kernel(function, {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
-def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+def inlined(function: Callable[_Arguments, _Result], **options: bool) -> Callable[_Arguments, _Result]:
     """Return a piece that becomes part of every kernel that calls it.
 
     A call counts references to the arrays that it is given; within one function, that cancels out.
+
+    Args:
+        options: further ones of the compiler, ignored by versions that do not have them.
     """
-    return _Kernel(function, {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
+    options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return _Kernel(function, options)
 
 
 def compile_ahead() -> None:

@@ -150,3 +150,23 @@ def test_the_house_limits_names_of_its_dialect_but_not_its_size(tmp_path: Path) 
         "functions are named by a participle",
     ]
     assert "2 modules\n" in check.stdout
+
+
+def test_the_house_allows_the_private_option_of_distances_there_alone(tmp_path: Path) -> None:
+    pytest.importorskip("grimp")
+    tool = tmp_path / "tools/check_house"
+    tool.parent.mkdir()
+    tool.write_text(TOOL.read_text())
+    package = tmp_path / "spatial_replay"
+    (package / "geometry").mkdir(parents=True)
+    for name in ("__init__.py", "geometry/__init__.py"):
+        (package / name).write_text("")
+    for name in ("geometry/kernels.py", "geometry/measure.py"):
+        (package / name).write_text("OPTIONS = {'_nrt': False}\n")
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+
+    check = subprocess.run([sys.executable, str(tool)], capture_output=True, text=True, check=False)
+
+    assert check.returncode == 1, check.stderr
+    refusals = [line for line in check.stdout.splitlines() if "is private" in line]
+    assert refusals == ["spatial_replay/geometry/measure.py:1: _nrt is private; write a plain kernel"]

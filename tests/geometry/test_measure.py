@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spatial_replay import Footprint, GeometryError
-from spatial_replay.compiled import only
+from spatial_replay.compiled import inlined, kernel, only
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
@@ -204,3 +204,23 @@ def test_the_number_of_cores_changes_no_bit() -> None:
         finally:
             os.sched_setaffinity(0, cores)
     assert everywhere.tobytes() == alone.tobytes()
+
+
+def _half_of(numbers, place):
+    return numbers[place] / 2
+
+
+_half = inlined(_half_of, of_another_version=True)
+
+
+@kernel
+def _fill_halves(numbers, halves):
+    for place in range(len(numbers)):
+        halves[place] = _half(numbers, place)
+
+
+def test_options_that_the_compiler_does_not_have_are_left_out():
+    halves = np.zeros(3)
+    with only("compiled"):
+        _fill_halves(np.array([1.0, 2.0, 4.0]), halves)
+    assert halves.tolist() == [0.5, 1.0, 2.0]

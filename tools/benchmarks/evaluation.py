@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,9 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
+from spatial_replay.compiled import only
+from spatial_replay.geometry.footprint import FootprintBatch
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 PUBLISHED_S = 34.3e-3
 """What the published implementation of the logic takes for one sample of the blocks recording, every prefix,
@@ -32,26 +36,74 @@ def bench_blocks(measure: Any) -> None:
     for old, new in EDITED:
         edited_text = edited_text.replace(old, new)
     edited = sr.parse_specification(edited_text)
-    sr.evaluate(specification, trace)
-    measure(
-        "first time",
-        lambda fresh: sr.evaluate(specification, fresh),
-        prepare=lambda: replace(trace),
-        per=len(trace),
-        unit="sample",
-        runs=21,
-        limit_s=3e-6,
-        reference_s=PUBLISHED_S,
+    with only("compiled"):
+        sr.evaluate(specification, trace)
+        measure(
+            "first time",
+            lambda fresh: sr.evaluate(specification, fresh),
+            prepare=lambda: replace(trace),
+            per=len(trace),
+            unit="sample",
+            runs=21,
+            limit_s=3e-6,
+            reference_s=PUBLISHED_S,
+        )
+        measure(
+            "temporal part edited",
+            lambda _: sr.evaluate(edited, trace),
+            per=len(trace),
+            unit="sample",
+            runs=21,
+            limit_s=1e-6,
+            reference_s=PUBLISHED_S,
+        )
+
+
+def box_trace(count: int, boxes: int, side: float = 0.1) -> sr.Trace:
+    """Return turned boxes at random places, so that some overlap and some are far from each other."""
+    random = np.random.default_rng(3)
+    corners = 0.5 * side * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    turns = random.uniform(0.0, 2.0 * np.pi, (count, boxes))
+    places = random.uniform(-0.5, 0.5, (count, boxes, 2))
+    rows = np.arange(count * boxes)
+    turning = np.array([[np.cos(turns), -np.sin(turns)], [np.sin(turns), np.cos(turns)]])
+    vertices = np.einsum("xytk,cy->tkcx", turning, corners) + places[:, :, None]
+    return sr.Trace(
+        times_ns=np.arange(count) * 10_000_000,
+        names=tuple(f"o{number}" for number in range(boxes)),
+        rows=rows.reshape(count, boxes),
+        footprints=FootprintBatch(
+            part_start=np.arange(len(rows) + 1),
+            vertex_start=4 * np.arange(len(rows) + 1),
+            vertices=vertices.reshape(-1, 2),
+            radius=np.zeros(len(rows)),
+            bottom=np.full(len(rows), np.nan),
+            top=np.full(len(rows), np.nan),
+        ),
+        yaw=turns.reshape(-1),
+        uncertainty=np.zeros(len(rows)),
+        class_code=np.zeros(len(rows), np.int64),
+        classes=(None,),
     )
-    measure(
-        "temporal part edited",
-        lambda _: sr.evaluate(edited, trace),
-        per=len(trace),
-        unit="sample",
-        runs=21,
-        limit_s=1e-6,
-        reference_s=PUBLISHED_S,
-    )
+
+
+def bench_box_distances(bench: Any) -> None:
+    """Six boxes, the distance of each two, without a specification."""
+    trace = box_trace(3000, 6)
+    operands = [Operand(column[:, None]) for column in trace.rows.T]
+    requests = [
+        MeasureRequest("signed_distance", first, second)
+        for first, second in itertools.combinations(range(6), 2)
+    ]
+    with only("compiled"):
+        bench.measure(
+            "boxes alone",
+            lambda _: measure(trace.footprints, operands, requests),
+            per=len(trace) * len(requests),
+            unit="pair",
+            runs=11,
+            limit_s=0.3e-6,
+        )
 
 
 CORNERS = 1000

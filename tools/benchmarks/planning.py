@@ -12,8 +12,9 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.automata.compile import automaton
+from spatial_replay.compiled import only
 from spatial_replay.planning import Grid, Workspace, map_layers, moved_object, redo_decisions
-from spatial_replay.planning.maps import gradient_map, proposition_maps
+from spatial_replay.planning.maps import distance_between, gradient_map, proposition_maps
 from spatial_replay.planning.paths import shortest_path
 from spatial_replay.sources import open_source
 
@@ -75,6 +76,35 @@ def bench_gradient_map(bench: Any) -> None:
                 limit_s=limit_s,
                 reference_s=2.1 * (side / 90) ** 2,
             )
+
+
+def bench_map_distances(bench: Any) -> None:
+    """A box at 90 x 90 cells among 10 boxes: the distance to each, beside the same by vectorised shapely."""
+    import shapely
+
+    random, names = np.random.default_rng(3), [f"o{number}" for number in range(11)]
+    shape = sr.TrackedObject(sr.Footprint.box(-0.03, -0.02, 0.03, 0.02), yaw=0.0)
+    poses = random.uniform((0.05, 0.05, 0.0), (0.85, 0.85, 3.0), (len(names), 3)).tolist()
+    objects = {name: moved_object(shape, *pose) for name, pose in zip(names, poses, strict=True)}
+    sample, workspace = sr.Sample(0, objects), Workspace(Grid.over(0.0, 0.0, 0.9, 0.9, 0.01))
+    atoms = [distance_between("o0", name) for name in names[1:]]
+    corners = [tracked.footprint.parts[0].vertices for tracked in objects.values()]
+    others = shapely.polygons(corners[1:])
+    shifts = workspace.grid.centres() - np.array(poses[0][:2])
+
+    def by_shapely(_: object) -> object:
+        moved = shapely.polygons(corners[0] + shifts[:, None])
+        return shapely.distance(moved[:, None], others)
+
+    peer = bench.measure("shapely, vectorised", by_shapely, unit="map", runs=7)
+    with only("compiled"):
+        maps = bench.measure(
+            "one moved box, 10 others",
+            lambda _: proposition_maps(atoms, {}, sample, "o0", workspace),
+            unit="map",
+            runs=7,
+        )
+    bench.ratio("a map to shapely", maps.median_s / peer.median_s, 1 / 3)
 
 
 def bench_map_layers(bench: Any) -> None:
