@@ -7,11 +7,12 @@ divided among calls.
 from __future__ import annotations
 
 import struct
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import accumulate, chain
 from pathlib import Path
 from threading import local
 from types import TracebackType
@@ -84,6 +85,30 @@ class _Lane:
     sizes: list[int] = field(default_factory=list)
     size: int = 0
     began_s: float = 0.0
+
+
+class _Columns(NamedTuple):
+    """Messages of one call.
+
+    Attributes:
+        parts: head and payload of each in turn.
+        channels, times_ns, sizes: of each message, as in a lane.
+        total: bytes of the records before each message, and of all.
+    """
+
+    parts: list[bytes]
+    channels: list[int]
+    times_ns: list[int]
+    sizes: list[int]
+    total: list[int]
+
+
+def _run_ends(times_ns: Integers, lanes: Integers) -> list[int]:
+    """Return where each run of messages of one lane ends within which times do not fall."""
+    if len(lanes) == 1:
+        return [1]
+    breaks = np.flatnonzero((np.diff(times_ns) < 0) | (np.diff(lanes) != 0)) + 1
+    return [*breaks.tolist(), len(lanes)]
 
 
 class _PackedChunk(NamedTuple):
@@ -285,23 +310,38 @@ class LogWriter:
         heads["sequence"] = messages.sequence
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
-        encoded_heads, at = heads.tobytes(), 0
-        columns = lanes.tolist(), numbers.tolist(), messages.log_time_ns.tolist(), sizes.tolist()
-        for payload, number, channel, time_ns, size in zip(messages.payloads, *columns, strict=True):
-            for other, lane in enumerate(self._lanes):
-                if lane.records and time_ns - lane.times_ns[0] >= self._chunk_ns:
-                    self._end(other)
+        parts = [b""] * (2 * len(messages))
+        parts[::2] = heads.view(f"V{_HEAD_BYTES}").tolist()
+        parts[1::2] = messages.payloads
+        times_ns, lengths = messages.log_time_ns.tolist(), sizes.tolist()
+        columns = _Columns(parts, numbers.tolist(), times_ns, lengths, [0, *accumulate(lengths)])
+        begin = 0
+        for end in _run_ends(messages.log_time_ns, lanes):
+            self._fill(int(lanes[begin]), columns, begin, end)
+            begin = end
+
+    def _fill(self, number: int, columns: _Columns, begin: int, end: int) -> None:
+        """Add messages of one lane whose times do not fall, as many at once as the open chunks take."""
+        times_ns, total = columns.times_ns, columns.total
+        while begin < end:
+            for place, lane in enumerate(self._lanes):
+                if lane.records and times_ns[begin] - lane.times_ns[0] >= self._chunk_ns:
+                    self._end(place)
             lane = self._lanes[number]
             if not lane.records:
                 lane.began_s = self._clock() if self._clock else 0.0
-            lane.records += encoded_heads[at : at + _HEAD_BYTES], payload
-            lane.channels.append(channel)
-            lane.times_ns.append(time_ns)
-            lane.sizes.append(size)
-            lane.size += size
-            at += _HEAD_BYTES
+            first_ns = min([times_ns[begin], *(lane.times_ns[0] for lane in self._lanes if lane.records)])
+            stop = bisect_left(times_ns, first_ns + self._chunk_ns, begin, end)
+            if total[stop] - total[begin] + lane.size >= CHUNK_BYTES:
+                stop = bisect_left(total, total[begin] + CHUNK_BYTES - lane.size, begin + 1, stop)
+            lane.records += columns.parts[2 * begin : 2 * stop]
+            lane.channels += columns.channels[begin:stop]
+            lane.times_ns += times_ns[begin:stop]
+            lane.sizes += columns.sizes[begin:stop]
+            lane.size += total[stop] - total[begin]
             if lane.size >= CHUNK_BYTES:
                 self._end(number)
+            begin = stop
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record, its keys in the order given, after closing the chunk."""
