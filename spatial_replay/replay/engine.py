@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,6 +82,8 @@ if TYPE_CHECKING:
 _MOST_DIGITS = 18
 """Greatest valid count in the metadata of a log."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
+_RESULTS_AT_ONCE = 2**16
+"""Messages are made and written for so many samples, times results, at once: about 200 MB."""
 """Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
 
 
@@ -262,16 +265,27 @@ class Replay:
                 begin(self._zero_ns)
             if write is not None:
                 self._evaluation.annotator.count_from(self._zero_ns)
-                derived = self._evaluation.annotator.messages(inside, stretches)
-                messages = merge([*derived, *([] if layer else [own])])
-                self._start_ns = min(self._start_ns, *messages.log_time_ns[:1].tolist(), LATEST_NS)
-                write(messages)
+                self._annotate(write, inside, stretches, Messages() if layer else own)
             advance(len(inside))
         replayed = self._replayed()
         if write is not None:
             annotator, finals = self._evaluation.annotator, self._evaluation.finals
             write(merge(annotator.end(self._end_ns, finals, replayed.results)))
         return replayed
+
+    def _annotate(
+        self, write: Callable[[Messages], None], trace: Trace, stretches: Sequence[SeriesBlock], own: Messages
+    ) -> None:
+        """Write the messages of a block, of some samples at a time: those of many results are large."""
+        most = max(1, _RESULTS_AT_ONCE // max(len(stretches), 1))
+        begins = range(0, max(len(trace), 1), most)
+        starts_ns = [-FOREVER, *(int(trace.times_ns[begin]) for begin in begins[1:]), FOREVER]
+        for begin, (start_ns, end_ns) in zip(begins, pairwise(starts_ns), strict=True):
+            part = trace.slice(begin, min(begin + most, len(trace)))
+            derived = self._evaluation.annotator.messages(*with_stretches(part, stretches))
+            messages = merge([*derived, own.within(start_ns, end_ns)])
+            self._start_ns = min(self._start_ns, *messages.log_time_ns[:1].tolist(), LATEST_NS)
+            write(messages)
 
     def draw_samples(
         self, results: Sequence[SpecResult], times_ns: Sequence[int], show: Callable[[SceneFrames], None]

@@ -395,3 +395,12 @@ class TestOutputs:
         with pytest.raises(OutputError, match="no space left on the device"):
             run_replay(open_source(log), [SPEC], output=full)
         assert full.is_char_device()
+
+
+def test_messages_of_many_results_do_not_depend_on_how_samples_are_cut(tmp_path):
+    # more than 65,536 samples times results are annotated in parts
+    names = (f"spec s{number} = G (battery >= {number})" for number in range(110))
+    specification = parse_specification("\n".join(names))
+    for name, size in (("whole", 600), ("cut", 250)):
+        run_replay(PiecewiseSource(run(600), size), [specification], output=tmp_path / name)
+    assert (tmp_path / "whole").read_bytes() == (tmp_path / "cut").read_bytes()

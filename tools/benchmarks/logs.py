@@ -147,6 +147,27 @@ def bench_annotating(measure: Any) -> None:
         measure("replay -o", annotate, limit_s=35e-6, **per_sample)
 
 
+def bench_annotating_many(measure: Any) -> None:
+    """`replay -o` with 100 results over 5,000 samples: time, and the peak memory of the whole command."""
+    count = 5000
+    with tempfile.TemporaryDirectory() as folder:
+        log, spec, annotated = (Path(folder) / name for name in ("run.mcap", "many.spatial", "out.mcap"))
+        pairs = (OBJECTS[number % 6] + " dist " + OBJECTS[(number + 1) % 6] for number in range(100))
+        spec.write_text("\n".join(f"spec s{number} = G ({pair} >= 1)" for number, pair in enumerate(pairs)))
+        record_source(Moving(count), log)
+        peaks: list[int] = []
+        measure(
+            "100 results",
+            lambda _: peaks.append(
+                _peak_bytes("replay", str(log), "--spec", str(spec), "-o", str(annotated))
+            ),
+            per=count,
+            unit="sample",
+            runs=1,
+        )
+        measure.size("100 results: peak memory", max(peaks), 420_000_000)
+
+
 @contextmanager
 def _as_the_command_line() -> Iterator[None]:
     """Look for garbage as seldom as the command line does."""
