@@ -1,0 +1,231 @@
+"""Episodes of robot-learning data sets as values: features and bodies as arrays, labels, and the data set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers
+from spatial_replay.geometry.footprint import FootprintBatch
+from spatial_replay.text import counted
+from spatial_replay.trace.trace import LATEST_NS
+
+
+class Feature(NamedTuple):
+    """A column of a data set.
+
+    Attributes:
+        places: the names of its numbers; () where they have none.
+        width: numbers a frame; 0 for images, videos and texts.
+    """
+
+    name: str
+    places: tuple[str, ...] = ()
+    width: int = 1
+
+
+class Label(NamedTuple):
+    """The success label of a data set.
+
+    Attributes:
+        field: its name in the data set.
+        is_about_next: whether it is about the state after the action of its frame.
+        is_stored: whether the data set stores the state after the last action.
+    """
+
+    field: str
+    is_about_next: bool = False
+    is_stored: bool = True
+
+
+class Episode(NamedTuple):
+    """An episode of a data set.
+
+    Attributes:
+        number: as in `push_v3#17`.
+        key: its name in the data set, such as `demo_10`; its number where it has no other.
+        frames: their number, where known without reading the episode.
+    """
+
+    number: int
+    key: str
+    frames: int | None = None
+    task: str | None = None
+    seed: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A body that the data set names itself.
+
+    Attributes:
+        positions: (T, 3) float64.
+        quaternions: (T, 4) float64, x y z w; None for a place.
+        shapes: T footprints with heights in the frame of the world; None for a point.
+    """
+
+    name: str
+    positions: Floats
+    quaternions: Floats | None = None
+    shapes: FootprintBatch | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpisodeColumns:
+    """One episode as arrays.
+
+    Attributes:
+        times_ns: (T,) int64, increasing.
+        features: by name, each (T,) or (T, W) float64.
+        bodies: those that the data set names itself.
+        success: (T,) the label of each frame; (1,) for one of the episode; None without a label.
+        faults: messages about lost frames.
+        remarks: other messages, each without the name of the data set.
+        unjudged: why the episode has no verdict, such as two runs in one episode; "" otherwise.
+    """
+
+    times_ns: Integers
+    features: Mapping[str, Floats] = field(default_factory=lambda: MappingProxyType({}))
+    bodies: tuple[Body, ...] = ()
+    success: Booleans | None = None
+    faults: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    unjudged: str = ""
+
+    @property
+    def label(self) -> bool | None:
+        """Whether the episode is labelled a success, in any frame; None without a label."""
+        return None if self.success is None else bool(self.success.any())
+
+
+class EpisodeReading(NamedTuple):
+    """What a mapping says about how a data set is read; None leaves it to the data set.
+
+    Attributes:
+        fps: frames a second.
+        label: the name of the field with the label.
+        model: a MuJoCo model, for data sets without one.
+        order: of the quaternions of bodies that the data set names.
+        assets: a folder with the meshes of models.
+    """
+
+    fps: float | None = None
+    label: str | None = None
+    model: Path | None = None
+    order: str | None = None
+    assets: Path | None = None
+
+
+AS_STORED: Final = EpisodeReading()
+
+
+class DataSet:
+    """A robot-learning data set: a folder or a file with episodes.
+
+    Attributes:
+        path: of the folder or file.
+        kind: its format with the version, such as `LeRobot v3.0`.
+        fps: frames a second; None where the data set does not say.
+        robot: its type; "" where the data set does not say.
+        features: columns that a mapping can use, in the data set's order.
+        episodes: in the order of their numbers.
+        label: None without a label.
+        remarks: messages about the whole data set.
+        names_bodies: whether it names its bodies, so that no mapping is needed.
+    """
+
+    path: Path
+    kind: str
+    fps: float | None = None
+    robot: str = ""
+    features: tuple[Feature, ...] = ()
+    episodes: tuple[Episode, ...] = ()
+    label: Label | None = None
+    remarks: tuple[str, ...] = ()
+    names_bodies: bool = False
+
+    @property
+    def name(self) -> str:
+        """The base name of its folder or file."""
+        return self.path.name or self.path.absolute().name
+
+    def columns(
+        self, number: int, reading: EpisodeReading = AS_STORED, features: Sequence[str] | None = None
+    ) -> EpisodeColumns:
+        """Read an episode; the files of the last one stay in memory.
+
+        Args:
+            number: of the episode.
+            features: those that are read; None for all with numbers.
+
+        Raises:
+            UsageError: no such episode, or the mapping has to say something, such as `fps`.
+            LogError: the data cannot be read.
+        """
+        raise NotImplementedError
+
+    def episode(self, number: int) -> Episode:
+        """Return the episode of a number.
+
+        Raises:
+            UsageError: there is none.
+        """
+        # numbers usually count from 0
+        nearest = self.episodes[number : number + 1]
+        for episode in (*nearest, *self.episodes):
+            if episode.number == number:
+                return episode
+        raise UsageError(f"{self.name} has no episode {number}; {self.range_text}")
+
+    @property
+    def range_text(self) -> str:
+        """The addresses of its episodes, in words."""
+        if not self.episodes:
+            return "it has no episodes"
+        first, last = self.episodes[0].number, self.episodes[-1].number
+        return f"it has {counted(len(self.episodes), 'episode')}, {self.name}#{first} to {self.name}#{last}"
+
+    def feature(self, name: str) -> Feature | None:
+        """Return the feature of a name."""
+        return next((feature for feature in self.features if feature.name == name), None)
+
+    def required_fps(self, reading: EpisodeReading) -> float:
+        """Return the frames a second that a mapping or the data set says.
+
+        Raises:
+            UsageError: neither does.
+        """
+        fps = self.fps if reading.fps is None else reading.fps
+        if fps is None:
+            raise UsageError(
+                f"{self.name} ({self.kind}) does not say how many frames a second it has; add `fps: 20`"
+                " to the mapping"
+            )
+        return fps
+
+
+def frame_times_ns(frames: Integers, fps: float) -> Integers:
+    """Return the times of frames (T,), exact to the nearest nanosecond.
+
+    Raises:
+        LogError: a frame before the first one, or one later than any time of a log.
+    """
+    period = Fraction(10**9) / Fraction(repr(float(fps)))
+    if len(frames) and (frames.min() < 0 or int(frames.max()) * period > LATEST_NS):
+        raise LogError(f"frame {int(frames.min())} to {int(frames.max())}: these are no numbers of frames")
+    if period.denominator == 1 and period.numerator < 2**31:
+        return frames.astype(np.int64) * period.numerator
+    return np.array([round(frame * period) for frame in frames.tolist()], np.int64)
+
+
+def natural_key(name: str) -> tuple[Any, ...]:
+    """Return a key that sorts `demo_2` before `demo_10`."""
+    digits = name[len(name.rstrip("0123456789")) :]
+    return (name[: len(name) - len(digits)], int(digits or -1), name)

@@ -1,0 +1,130 @@
+"""Robot-learning data sets: recognised by content, read by columns, with known positions."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
+
+DATA = os.environ.get("SPATIAL_REPLAY_DATA")
+needs_data = pytest.mark.skipif(DATA is None, reason="SPATIAL_REPLAY_DATA names no folder")
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "answers"),
+    [
+        ("push_v3", "answers"),
+        ("push_v21", "answers"),
+        ("push_v3_thirdparty", "answers"),
+        ("push_v3_stopped", "stopped_answers"),
+    ],
+)
+def test_lerobot_gives_the_positions_of_the_simulator(name: str, answers: str) -> None:
+    folder = Path(DATA or "") / "learning" / "lerobot"
+    data_set = open_data_set(folder / name)
+    assert data_set is not None and data_set.fps == 80 and not data_set.remarks
+    for answer in json.loads((folder / f"{answers}.json").read_text()):
+        columns = data_set.columns(answer["episode"])
+        assert len(columns.times_ns) == answer["frames"] and columns.label == answer["success_any"]
+        assert not columns.remarks and not columns.unjudged
+        for pose in answer["poses"]:
+            state = columns.features["observation.environment_state"][pose["frame"]]
+            assert np.abs(state[:3] - pose["puck"]).max() < 1e-7
+            assert np.abs(state[7:] - pose["goal"]).max() < 1e-7
+            assert columns.times_ns[pose["frame"]] == round(pose["timestamp"] * 1e9)
+
+
+@needs_data
+def test_ogbench_gives_the_positions_of_the_simulator() -> None:
+    folder = Path(DATA or "") / "learning" / "ogbench"
+    data_set = open_data_set(folder / "cube-double-tiny.npz")
+    assert data_set is not None and len(data_set.episodes) == 4
+    for answer in json.loads((folder / "answers.json").read_text()):
+        columns = data_set.columns(answer["episode"], data_set_reading(fps=20))
+        for pose in answer["poses"]:
+            qpos = columns.features["qpos"][pose["step"]]
+            assert np.abs(qpos[14:17] - pose["block_0"][:3]).max() < 1e-6
+            assert np.abs(qpos[21:24] - pose["block_1"][:3]).max() < 1e-6
+            assert columns.times_ns[pose["step"]] == pose["step"] * 50_000_000
+
+
+def data_set_reading(**options: float):  # type: ignore[no-untyped-def]
+    from spatial_replay.logs.formats.episodes import EpisodeReading
+
+    return EpisodeReading(**options)  # type: ignore[arg-type]
+
+
+def lerobot(folder: Path, frames: dict[str, list[object]], **info: object) -> Path:
+    """Write a small data set in LeRobot's layout of v2.1."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    about = {"codebase_version": "v2.1", "fps": 10, "features": {}, **info}
+    (folder / "meta" / "info.json").write_text(json.dumps(about))
+    numbers = sorted(set(frames["episode_index"]))  # type: ignore[type-var]
+    lines = [json.dumps({"episode_index": number, "tasks": ["go"]}) for number in numbers]
+    (folder / "meta" / "episodes.jsonl").write_text("\n".join(lines))
+    pq.write_table(pa.table(frames), folder / "data" / "chunk-000" / "episode_000000.parquet")
+    return folder
+
+
+def test_rows_are_found_by_their_episode_whatever_the_files_are_called(tmp_path: Path) -> None:
+    frames = {"episode_index": [7, 7, 9], "frame_index": [0, 1, 0], "state": [[1.0], [2.0], [3.0]]}
+    features = {"state": {"dtype": "float32", "shape": [1], "names": {"motors": ["x"]}}}
+    data_set = open_data_set(lerobot(tmp_path / "set", frames, features=features))
+    assert data_set is not None
+    assert [episode.number for episode in data_set.episodes] == [7, 9]
+    assert data_set.columns(9).features["state"].tolist() == [[3.0]]
+    assert data_set.features[0].places == ("x",)
+    with pytest.raises(UsageError, match="set has no episode 8; it has 2 episodes, set#7 to set#9"):
+        data_set.columns(8)
+
+
+def test_an_episode_of_two_runs_is_not_judged(tmp_path: Path) -> None:
+    frames = {"episode_index": [0, 0, 0, 0], "frame_index": [0, 1, 0, 1]}
+    data_set = open_data_set(lerobot(tmp_path / "set", frames))
+    assert data_set is not None
+    assert "goes from 1 to 0 at row 2" in data_set.columns(0).unjudged
+
+
+def test_times_unlike_those_of_frames_are_remarked(tmp_path: Path) -> None:
+    frames = {"episode_index": [0, 0], "frame_index": [0, 1], "timestamp": [2.0, 2.1]}
+    data_set = open_data_set(lerobot(tmp_path / "set", frames))
+    assert data_set is not None
+    columns = data_set.columns(0)
+    assert columns.times_ns.tolist() == [0, 100_000_000]
+    assert "its timestamp is 2 s at frame 0" in columns.remarks[0]
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    folder = lerobot(tmp_path / "set", {"episode_index": [0], "frame_index": [0]})
+    (folder / "data" / "chunk-000" / "episode_000000.parquet").unlink()
+    data_set = open_data_set(folder)
+    assert data_set is not None
+    with pytest.raises(LogError, match=r"set#0: no file in data/ has its rows \(episode_000000.parquet"):
+        data_set.columns(0)
+
+
+def test_pickles_are_never_loaded(tmp_path: Path) -> None:
+    file = tmp_path / "set.npz"
+    np.savez(file, terminals=[False, True], qpos=np.zeros((2, 3)), extra=np.array([{}, {}], object))
+    data_set = open_data_set(file)
+    assert data_set is not None and "a pickle" in data_set.remarks[0]
+    assert [feature.name for feature in data_set.features] == ["qpos"]
+
+
+def test_an_address_names_an_episode(tmp_path: Path) -> None:
+    folder = lerobot(tmp_path / "set", {"episode_index": [0], "frame_index": [0]})
+    assert data_set_address(f"{folder}#17") == (str(folder), 17)
+    assert data_set_address(f"{folder}") is None
+    (tmp_path / "set#17").write_text("")
+    assert data_set_address(f"{folder}#17") is None
