@@ -78,14 +78,14 @@ def open_data_set(path: str | PathLike[str]) -> DataSet | None:
     """
     folder = Path(path)
     try:
-        kind = next((kind for kind, known in FORMATS.items() if known.recognise(folder)), None)
-        return None if kind is None else _opened(kind, folder, _state(folder))
+        kind = next((name for name, kind in FORMATS.items() if kind.recognise(folder)), None)
+        return None if kind is None else _open_as(kind, folder, _state(folder))
     except (OSError, ValueError) as error:
         raise LogError(f"{folder.name} cannot be read: {system_reason(error)}") from error
 
 
 @lru_cache(maxsize=4)
-def _opened(kind: str, path: Path, state: tuple[object, ...]) -> DataSet:
+def _open_as(kind: str, path: Path, state: tuple[object, ...]) -> DataSet:
     return FORMATS[kind].open(path)
 
 
@@ -186,7 +186,7 @@ class _LeRobot(DataSet):
             {name: values[begin:end] for name, values in self._table(file, wanted).items()}
             for file, begin, end in self._places(number)
         ]
-        whole = pieces[0] if len(pieces) == 1 else _joined(pieces)
+        whole = pieces[0] if len(pieces) == 1 else _join_pieces(pieces)
         frames = whole.get("frame_index", np.arange(len(whole["episode_index"]), dtype=np.float64))
         remarks = list(_remarks(whole, frames, fps, episode.frames))
         back = np.flatnonzero(np.diff(frames) <= 0)
@@ -407,7 +407,7 @@ def _numbers(column: pa.ChunkedArray, library: Any) -> Floats | None:
     return filled
 
 
-def _joined(pieces: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
+def _join_pieces(pieces: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
     names = set.intersection(*(set(piece) for piece in pieces))
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 

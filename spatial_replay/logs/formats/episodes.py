@@ -106,7 +106,7 @@ class EpisodeColumns:
 
 
 class EpisodeReading(NamedTuple):
-    """What a mapping says about how a data set is read; None leaves it to the data set.
+    """Keys of a mapping about how a data set is read; None leaves it to the data set.
 
     Attributes:
         fps: frames a second.
