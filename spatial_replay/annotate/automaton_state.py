@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,15 +14,16 @@ from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, T
 from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.guards import Transition
 from spatial_replay.automata.text import size_words
-from spatial_replay.errors import NoAutomatonError
+from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Integers, combined, equal_places
 from spatial_replay.logs.messages import AUTOMATA_PREFIX, Attachment
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.wire import WireTemplate, placed
 from spatial_replay.monitor.offline import evaluate_offline
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.monitor.verdict import Semantics
+from spatial_replay.monitor.verdict import Semantics, require_ltlf
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -204,6 +205,25 @@ class AutomatonRun:
             message.guard = "" if taken is None else _shortened(self._guard(taken))
         message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
         return WireTemplate.of(message)
+
+
+def states_of_result(
+    result: SpecResult, specification: Specification, *, rate_hz: float | None = None
+) -> tuple[Automaton, NDArray[np.bool_] | Integers]:
+    """Return the automaton of a result and its states after each sample, (T,) or as sets (T, S).
+
+    Raises:
+        NoAutomatonError: the spec has none.
+        UsageError: under the paper's semantics, or the leaves of the samples were not stored.
+    """
+    require_ltlf(result.semantics, "an automaton")
+    if result.leaves is None:
+        raise UsageError("the states of an automaton need the leaves of every sample, which were not stored")
+    # of the very formula that was evaluated
+    machine = automaton(replace(specification, specs=(result.spec,)), result.spec.name, rate_hz=rate_hz)
+    leaves = result.evidence.instance.program.leaves
+    run = AutomatonRun(result.name, result.object, machine, result.formula, leaves)
+    return machine, run.states(SeriesBlock(result.times_ns, result.series, result.leaves))
 
 
 def _node_of(proposition: Formula, formula: Formula, numbers: Mapping[int, int]) -> int:

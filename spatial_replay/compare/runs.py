@@ -11,8 +11,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.annotate.automaton_state import AutomatonRun
-from spatial_replay.automata.compile import automaton
+from spatial_replay.annotate.automaton_state import states_of_result
 from spatial_replay.compare.specifications import EditOutcome, difference_text, evaluate_with, outcome_text
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_rows
@@ -23,7 +22,6 @@ from spatial_replay.logs.messages import Source
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
 from spatial_replay.monitor.result import Evaluation, SpecResult
 from spatial_replay.monitor.sentences import cause_reason
-from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import require_ltlf
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection
@@ -250,14 +248,9 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
     if file is None:
         return None
     try:
-        # of the very formula that was evaluated
-        machine = automaton(replace(file, specs=(result.spec,)), result.spec.name)
+        _, after = states_of_result(result, file)
     except NoAutomatonError:
         return None
-    run = AutomatonRun(
-        result.name, result.object, machine, result.formula, result.evidence.instance.program.leaves
-    )
-    after = run.states(SeriesBlock(result.times_ns, result.series, result.leaves))
     changed = after[1:] != after[:-1]
     entered = [0, *(np.flatnonzero(changed if after.ndim == 1 else changed.any(axis=1)) + 1).tolist()]
     return [
