@@ -1,0 +1,298 @@
+"""Stages of a task: how far a run has come in the automaton of a spec, and what it owes next."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from heapq import heappop, heappush
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.annotate.automaton_state import states_of_result
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.ltlf import counts_seconds
+from spatial_replay.errors import NoAutomatonError
+from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
+from spatial_replay.monitor.result import Evaluation, SpecResult
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import shortened_formula
+
+LOST: Final = "lost"
+"""Name of the stage in which acceptance is lost."""
+UNKNOWN: Final = "unknown"
+"""Name of the stage of samples that leave several stages possible."""
+
+_MOST_WAYS: Final = 1_000_000
+"""Pairs of a decision and a state that follows it, of an automaton whose stages are computed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A stage of a task.
+
+    Attributes:
+        name: such as "never reached" or "reached, not lifted".
+        owed: the proposition that must come true next; "" if nothing is owed, or acceptance is lost.
+    """
+
+    name: str
+    owed: str = ""
+
+
+@dataclass(frozen=True)
+class StagesOfStates:
+    """The stages of an automaton.
+
+    Attributes:
+        stages: the farthest from acceptance first; "lost" and "unknown" come last.
+        numbers: for each state, the number of its stage.
+        left: for each state, how many propositions must still come true; of a trap, that of the start.
+        progress: for each state, from 0 to 1: the share of the start's propositions that are not left.
+    """
+
+    stages: tuple[Stage, ...]
+    numbers: tuple[int, ...]
+    left: tuple[int, ...]
+    progress: tuple[float, ...]
+
+    def stage_of(self, states: Sequence[int]) -> tuple[int, float]:
+        """Return the stage of a run that may be in any of some states, and the progress that is certain."""
+        numbers = {self.numbers[state] for state in states}
+        number = numbers.pop() if len(numbers) == 1 else len(self.stages) - 1
+        return number, min(self.progress[state] for state in states)
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """The stages of one result, sample by sample.
+
+    Attributes:
+        result: the title of the result.
+        stages: all that there are, the farthest from acceptance first; "lost" and "unknown" come last.
+        times_ns: (T,), the samples.
+        numbers: (T,), the place in `stages` of the stage after each sample.
+        progress: (T,), from 0 to 1; 1 where the result is satisfied if the log ends there.
+    """
+
+    result: str
+    stages: tuple[Stage, ...]
+    times_ns: Integers = field(repr=False)
+    numbers: Integers = field(repr=False)
+    progress: Floats = field(repr=False)
+
+    def __getitem__(self, sample: int) -> Stage:
+        """Return the stage after a sample; -1 is the last one."""
+        return self.stages[int(self.numbers[sample])]
+
+
+def stages(
+    evaluation: Evaluation,
+    name: str | None = None,
+    object: str | None = None,
+    *,
+    rate_hz: float | None = None,
+) -> Stages:
+    """Return the stages of a result, by the automaton of its spec.
+
+    Args:
+        name, object: of the result, as in `Evaluation.result`.
+        rate_hz: how many samples a second has, for bounds in seconds; without it, that of evenly spaced
+            samples.
+
+    Raises:
+        NoAutomatonError: the spec has no automaton, or too large a one.
+        UsageError: no such result, several, or under the paper's semantics.
+    """
+    return stages_of_result(evaluation.result(name, object), evaluation.specification, rate_hz=rate_hz)
+
+
+def stages_of_result(
+    result: SpecResult, specification: Specification, *, rate_hz: float | None = None
+) -> Stages:
+    """Return the stages of a result of a specification (see `stages`)."""
+    if rate_hz is None and counts_seconds(result.formula):
+        rate_hz = _even_rate(result.times_ns)
+    machine, after = states_of_result(result, specification, rate_hz=rate_hz)
+    of_states = stages_of_automaton(machine)
+    if after.ndim == 1:
+        numbers = np.array(of_states.numbers, np.int64)[after]
+        progress = np.array(of_states.progress)[after]
+    else:
+        rows, places = np.unique(after, axis=0, return_inverse=True)
+        pairs = [of_states.stage_of(np.flatnonzero(row).tolist()) for row in rows]
+        numbers = np.array([number for number, _ in pairs], np.int64)[places.ravel()]
+        progress = np.array([share for _, share in pairs])[places.ravel()]
+    return Stages(
+        result.title,
+        of_states.stages,
+        result.times_ns,
+        read_only_integers(numbers),
+        read_only_floats(progress),
+    )
+
+
+def _even_rate(times_ns: Integers) -> float | None:
+    """Return the samples a second of evenly spaced samples, whose times are rounded to ns; None if uneven."""
+    gaps = np.diff(times_ns)
+    if not len(gaps) or np.ptp(gaps) > 1:
+        return None
+    return round(len(gaps) * 1e9 / float(times_ns[-1] - times_ns[0]), 6)
+
+
+@lru_cache(maxsize=64)
+def stages_of_automaton(automaton: Automaton) -> StagesOfStates:
+    """Return the stages of an automaton's states.
+
+    The number left at a state is the least number of propositions that come true on a way to acceptance.
+    Propositions that must only stay true, as in `G safe`, are not counted.
+
+    Raises:
+        NoAutomatonError: the automaton is too large.
+    """
+    moves = _cheapest_moves(automaton)
+    left, ways = _ways(automaton, moves)
+    start = ways[automaton.initial]
+    unmet = _unmet_propositions(automaton)
+    stage_of_state = {
+        state: _stage(automaton, state, start, way, unmet[state]) for state, way in ways.items()
+    }
+    # a state that does not accept owes something, if only that a proposition comes to be false
+    left = {state: count or int(automaton.distances[state] > 0) for state, count in left.items()}
+    most = left[automaton.initial] or max(left.values()) or 1
+    # of stages with one name, the place is that of the state with the most left
+    order = sorted(stage_of_state, key=lambda state: (-left[state], state))
+    ordered = [*dict.fromkeys(stage_of_state[state] for state in order), Stage(LOST), Stage(UNKNOWN)]
+    return StagesOfStates(
+        tuple(ordered),
+        tuple(ordered.index(stage_of_state.get(state, Stage(LOST))) for state in automaton.states),
+        tuple(left.get(state, most) for state in automaton.states),
+        tuple(max(0.0, 1.0 - left.get(state, most) / most) for state in automaton.states),
+    )
+
+
+def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
+    """Return for each state the states that follow it, each with the fewest propositions that come true.
+
+    Propositions come in the order of the text.
+    """
+    alive = automaton.can_accept
+    tables: list[dict[int, tuple[int, ...]]] = []
+    required: list[frozenset[int] | None] = []
+
+    def table(place: int) -> dict[int, tuple[int, ...]]:
+        return tables[place] if place >= 0 else {~place: ()} if ~place in alive else {}
+
+    def requires(place: int) -> frozenset[int] | None:
+        """Return the propositions without which acceptance is lost; None if it always is."""
+        return required[place] if place >= 0 else frozenset() if ~place in alive else None
+
+    size = 0
+    for proposition, low, high in automaton.decisions:
+        targets = dict(table(low))
+        for target, rest in table(high).items():
+            if target not in targets or len(rest) + 1 < len(targets[target]):
+                targets[target] = (proposition, *rest)
+        size += len(targets)
+        if size > _MOST_WAYS:
+            raise NoAutomatonError(f"the automaton of {automaton.name} is too large for stages")
+        tables.append(targets)
+        false, true = requires(low), requires(high)
+        if true is not None:
+            true |= {proposition}
+        required.append(true if false is None else false if true is None else false & true)
+    moves: list[dict[int, tuple[int, ...]]] = []
+    for state, entry in enumerate(automaton.entries):
+        targets = table(entry)
+        # a run that may stay here only keeps true what it needs for that
+        constant = (requires(entry) or frozenset()) if state in targets else frozenset()
+        moves.append({target: tuple(p for p in way if p not in constant) for target, way in targets.items()})
+    return moves
+
+
+def _ways(
+    automaton: Automaton, moves: Sequence[Mapping[int, Sequence[int]]]
+) -> tuple[dict[int, int], dict[int, tuple[int, ...]]]:
+    """Return for each state that can accept how many propositions are left, and these in their order."""
+    sources: dict[int, list[int]] = {}
+    for state, targets in enumerate(moves):
+        for target in targets:
+            sources.setdefault(target, []).append(state)
+    left: dict[int, int] = {}
+    ways: dict[int, tuple[int, ...]] = {}
+    waiting = [(0, state) for state, steps in automaton.distances.items() if steps == 0]
+    while waiting:
+        count, state = heappop(waiting)
+        if state in left:
+            continue
+        left[state] = count
+        ways[state] = () if automaton.distances[state] == 0 else _way(moves[state], left, ways, state)
+        for source in sources.get(state, ()):
+            if source not in left:
+                heappush(waiting, (count + len(moves[source][state]), source))
+    return left, ways
+
+
+def _way(
+    targets: Mapping[int, Sequence[int]],
+    left: Mapping[int, int],
+    ways: Mapping[int, tuple[int, ...]],
+    state: int,
+) -> tuple[int, ...]:
+    """Return the propositions that are left at a state, by the way that takes the most steps."""
+    nearest = [
+        target
+        for target, way in targets.items()
+        if target != state and target in ways and len(way) + left[target] == left[state]
+    ]
+    # one proposition after the other, rather than all in one sample, shows the order of the formula
+    target = min(nearest, key=lambda target: (len(targets[target]) or len(targets), target))
+    return (*targets[target], *ways[target])
+
+
+def _unmet_propositions(automaton: Automaton) -> list[frozenset[int]]:
+    """Return for each state the propositions that have never been true when a run is there."""
+    count = len(automaton.propositions)
+    unmet: list[set[int]] = [set(range(count)) for _ in automaton.states]
+    for proposition in range(count):
+        symbol: list[bool | None] = [None] * count
+        symbol[proposition] = True
+        after = automaton.step_set(automaton.states, symbol)
+        pending = set(after)
+        while pending:
+            state = pending.pop()
+            unmet[state].discard(proposition)
+            pending |= {target for target in automaton.successors[state] if proposition in unmet[target]}
+    return [frozenset(propositions) for propositions in unmet]
+
+
+def _stage(
+    automaton: Automaton, state: int, start: Sequence[int], way: Sequence[int], unmet: frozenset[int]
+) -> Stage:
+    """Return the stage of a state that can accept.
+
+    Args:
+        start, way: what is left at the start, and at the state.
+        unmet: the propositions that have never been true when a run is in the state.
+    """
+    words = [p.name or shortened_formula(p.text) for p in automaton.propositions]
+    if not way and automaton.distances[state]:
+        # only propositions that come to be false are left
+        (move, *_) = next(automaton.paths(state))
+        return Stage(
+            f"{words[start[-1]]}, not finished" if start else "not finished", automaton.guard_words(move, 80)
+        )
+    if not way:
+        return Stage(words[start[-1]] if start else "nothing owed")
+    owed = words[way[0]]
+    if tuple(start[-len(way) :]) == tuple(way):
+        past = start[: -len(way)]
+    else:
+        past = list((Counter(start) - Counter(way)).elements())
+    if not past:
+        return Stage(f"{'never' if way[0] in unmet else 'not'} {owed}", owed)
+    if past[-1] == way[0]:
+        return Stage(f"{owed}, not long enough", owed)
+    return Stage(f"{words[past[-1]]}, not {owed}", owed)
