@@ -1,0 +1,524 @@
+"""MuJoCo models: poses, footprints and heights of free bodies, from recorded states.
+
+A recorded model names meshes on the disk of its recorder. Everything that kinematics do without is removed
+before a model is compiled, and MuJoCo itself never reads a file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+from xml.etree import ElementTree
+
+import numpy as np
+
+from spatial_replay.errors import LogError, importing
+from spatial_replay.geometry.arrays import Booleans, Floats, starts_from_counts
+from spatial_replay.geometry.footprint import FootprintBatch
+from spatial_replay.geometry.outline import normalise_polygons
+from spatial_replay.logs.formats.episodes import Body
+
+LARGEST_MODEL: Final = 2**24
+"""Characters of XML."""
+LARGEST_ASSET: Final = 2**27
+"""Bytes of one mesh."""
+DEEPEST: Final = 200
+"""Elements inside each other."""
+MOST_COPIES: Final = 10_000
+"""Elements that one model may generate by a `count`."""
+RIM_CORNERS: Final = 32
+"""Corners of each rim of a tilted cylinder."""
+ELLIPSE_CORNERS: Final = 64
+UPRIGHT_COSINE: Final = math.cos(math.radians(5.6))
+"""A cylinder tilted less is a segment with a radius, at most 0.5 % of the radius too long."""
+
+_UNUSED: Final = frozenset(
+    [
+        "actuator",
+        "camera",
+        "contact",
+        "custom",
+        "deformable",
+        "equality",
+        "extension",
+        "hfield",
+        "keyframe",
+        "light",
+        "material",
+        "model",
+        "plugin",
+        "sensor",
+        "size",
+        "skin",
+        "statistic",
+        "tendon",
+        "texture",
+        "visual",
+    ]
+)
+"""Elements without influence on the poses of bodies, or that load code or files."""
+_FOLDERS: Final = ("meshdir", "texturedir", "assetdir")
+_LOST: Final = "spatial-replay lost mesh "
+"""Beginning of the names of geoms whose mesh is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Geom:
+    """A geom in the frame of its body: its type, size, position (3,), rotation (3, 3) and vertices (v, 3)."""
+
+    kind: int
+    size: Floats
+    position: Floats
+    rotation: Floats
+    vertices: Floats
+
+
+class SceneModel:
+    """A compiled model.
+
+    Attributes:
+        names: the names of its free bodies.
+        nq, nv: the lengths of qpos and qvel.
+        remarks: facts that a reader of its states should know.
+    """
+
+    def __init__(self, model: Any, place: str, remarks: Sequence[str]) -> None:
+        with importing("models of MuJoCo need mujoco", extra="mujoco"):
+            import mujoco
+        self._mujoco, self._model, self._place = mujoco, model, place
+        self.nq, self.nv = int(model.nq), int(model.nv)
+        free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        self._bodies: dict[str, int] = {
+            model.body(body).name or f"body {body}": body for body in model.jnt_bodyid[free].tolist()
+        }
+        self.names = tuple(self._bodies)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        geoms = {name: self._geoms_of(body, data) for name, body in self._bodies.items()}
+        self._geoms = {name: counting or () for name, counting in geoms.items()}
+        shapeless = [name for name, counting in geoms.items() if counting is None]
+        mocap = [model.body(body).name for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
+        self.remarks = (*remarks, *_remarks(shapeless, mocap))
+
+    def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...] | None:
+        """Return the geoms that count for a body's footprint; None if one of them has lost its mesh."""
+        model, kinds = self._model, self._mujoco.mjtGeom
+        indices = np.flatnonzero(model.body_weldid[model.geom_bodyid] == body)
+        indices = indices[~np.isin(model.geom_type[indices], (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD))]
+        collides = (model.geom_contype[indices] != 0) | (model.geom_conaffinity[indices] != 0)
+        counting = (indices[collides] if collides.any() else indices).tolist()
+        if any(model.geom(index).name.startswith(_LOST) for index in counting):
+            return None
+        turn = data.xmat[body].reshape(3, 3).T
+        return tuple(
+            _Geom(
+                kind=int(model.geom_type[index]),
+                size=model.geom_size[index].copy(),
+                position=turn @ (data.geom_xpos[index] - data.xpos[body]),
+                rotation=turn @ data.geom_xmat[index].reshape(3, 3),
+                vertices=self._vertices_of(index),
+            )
+            for index in counting
+        )
+
+    def _vertices_of(self, geom: int) -> Floats:
+        """Return the vertices (v, 3) of a geom's mesh, those of its hull where MuJoCo computed it."""
+        model = self._model
+        mesh = int(model.geom_dataid[geom])
+        if model.geom_type[geom] != self._mujoco.mjtGeom.mjGEOM_MESH or mesh < 0:
+            return np.empty((0, 3))
+        begin, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+        vertices = np.asarray(model.mesh_vert[begin : begin + count], np.float64)
+        graph = int(model.mesh_graphadr[mesh])
+        if graph < 0:
+            return vertices
+        corners = int(model.mesh_graph[graph])
+        return np.asarray(vertices[model.mesh_graph[graph + 2 + corners : graph + 2 + 2 * corners]])
+
+    def states(self, states: Floats, place: str) -> tuple[Floats, list[Body]]:
+        """Return times (n,) in seconds and the free bodies of states (n, 1 + nq + nv): time, qpos, qvel.
+
+        Raises:
+            LogError: states of another length.
+        """
+        expected = 1 + self.nq + self.nv
+        if states.ndim != 2 or states.shape[1] != expected:
+            raise LogError(
+                f"{place} has the shape {states.shape}, but a state of {self._place} has"
+                f" {expected} numbers: time, {self.nq} of qpos, {self.nv} of qvel;"
+                " give the model that recorded these states"
+            )
+        return np.asarray(states[:, 0], np.float64), self.bodies(states[:, 1 : 1 + self.nq], place)
+
+    def bodies(self, qpos: Floats, place: str) -> list[Body]:
+        """Return the free bodies at positions (n, nq) of the joints.
+
+        Raises:
+            LogError: positions of another length.
+        """
+        if qpos.ndim != 2 or qpos.shape[1] != self.nq:
+            raise LogError(
+                f"{place} has the shape {qpos.shape}, but {self._place} has {self.nq} numbers of qpos;"
+                " give the model that recorded it"
+            )
+        if not self._bodies:
+            raise LogError(f"{self._place} has no body with a free joint; name objects by `features:`")
+        positions, quaternions = self._kinematics(np.ascontiguousarray(qpos, np.float64))
+        return [
+            Body(
+                name,
+                positions[:, column],
+                quaternions[:, column][:, [1, 2, 3, 0]],
+                footprints_of(self._geoms[name], positions[:, column], quaternions[:, column]),
+            )
+            for column, name in enumerate(self._bodies)
+        ]
+
+    def _kinematics(self, qpos: Floats) -> tuple[Floats, Floats]:
+        """Return positions (n, b, 3) and quaternions (n, b, 4), w x y z; NaN where a state is not finite."""
+        mujoco, model = self._mujoco, self._model
+        data, indices = mujoco.MjData(model), list(self._bodies.values())
+        positions = np.full((len(qpos), len(indices), 3), np.nan)
+        quaternions = np.full((len(qpos), len(indices), 4), np.nan)
+        state = int(mujoco.mjtState.mjSTATE_QPOS)
+        for row in np.flatnonzero(np.isfinite(qpos).all(axis=1)).tolist():
+            mujoco.mj_setState(model, data, qpos[row], state)
+            mujoco.mj_kinematics(model, data)
+            positions[row], quaternions[row] = data.xpos[indices], data.xquat[indices]
+        return positions, quaternions
+
+
+def _remarks(shapeless: Sequence[str], mocap: Sequence[str]) -> Iterator[str]:
+    for name in shapeless:
+        yield (
+            f"{name} is a point, because its mesh is not in the data; give the folder of meshes by `assets:`,"
+            f" or its shape: `shapes: {{{name}: …}}`"
+        )
+    if mocap:
+        yield (
+            f"mocap bodies are not in the states of the model: {', '.join(mocap)}; name such goals by"
+            " `features:`, from observations"
+        )
+
+
+# ------------------------------------------------------------------------------------------------ footprints
+
+
+def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats) -> FootprintBatch | None:
+    """Return the projections of a body's geoms onto the plane; None without geoms.
+
+    Args:
+        positions: (n, 3) of the body, quaternions: (n, 4), w x y z.
+    """
+    if not geoms:
+        return None
+    is_finite = np.asarray(np.isfinite(np.hstack([positions, quaternions])).all(axis=1))
+    turns, places = _rotations(quaternions[is_finite]), positions[is_finite]
+    count = len(places)
+    parts = FootprintBatch.concatenate(
+        [_projection(geom, places + turns @ geom.position, turns @ geom.rotation) for geom in geoms]
+    )
+    # rows of one geom after the other become rows of one state after the other
+    by_state = np.arange(len(geoms) * count).reshape(len(geoms), count).T.reshape(-1)
+    joined = parts.select(by_state)
+    merged = replace(
+        joined,
+        part_start=np.arange(count + 1, dtype=np.int64) * len(geoms),
+        bottom=parts.bottom.reshape(len(geoms), count).min(axis=0),
+        top=parts.top.reshape(len(geoms), count).max(axis=0),
+    )
+    return _with_unknown(merged, is_finite)
+
+
+def _with_unknown(batch: FootprintBatch, is_finite: Booleans) -> FootprintBatch:
+    """Return a batch with a row for each state: the batch's own where finite, else an unknown one."""
+    if is_finite.all():
+        return batch
+    rows = np.where(is_finite, np.cumsum(is_finite) - 1, len(batch))
+    return FootprintBatch.concatenate([batch, FootprintBatch.unknown(1)]).select(rows)
+
+
+def _rotations(quaternions: Floats) -> Floats:
+    """Return the rotation matrices (n, 3, 3) of unit quaternions (n, 4), w x y z."""
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows).reshape(3, 3, -1), 2, 0)
+
+
+def _projection(geom: _Geom, centres: Floats, turns: Floats) -> FootprintBatch:
+    """Return the projections of one geom, at centres (n, 3) with rotations (n, 3, 3): n rows of one part."""
+    from mujoco import mjtGeom
+
+    size, height = geom.size, centres[:, 2]
+    axis = turns[:, :, 2]
+    if geom.kind == mjtGeom.mjGEOM_SPHERE:
+        return _hulls(centres[:, None, :2], size[0], height - size[0], height + size[0])
+    if geom.kind == mjtGeom.mjGEOM_CAPSULE:
+        reach = size[0] + size[1] * np.abs(axis[:, 2])
+        return _hulls(_ends(centres, axis * size[1]), size[0], height - reach, height + reach)
+    if geom.kind == mjtGeom.mjGEOM_CYLINDER:
+        return _cylinders(size, centres, turns)
+    if geom.kind == mjtGeom.mjGEOM_ELLIPSOID:
+        reach = np.linalg.norm(turns[:, 2] * size, axis=1)
+        outline = centres[:, None, :2] + _ellipses(turns[:, :2] * size)
+        return _hulls(outline, 0.0, height - reach, height + reach)
+    local = geom.vertices
+    if geom.kind == mjtGeom.mjGEOM_BOX:
+        local = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
+    points = centres[:, None] + local @ turns.transpose(0, 2, 1)
+    return _hulls(points[..., :2], 0.0, points[..., 2].min(axis=1), points[..., 2].max(axis=1))
+
+
+def _ends(centres: Floats, halves: Floats) -> Floats:
+    """Return the projected ends (n, 2, 2) of segments, given their middles and halves (n, 3)."""
+    return np.stack([centres - halves, centres + halves], axis=1)[..., :2]
+
+
+def _cylinders(size: Floats, centres: Floats, turns: Floats) -> FootprintBatch:
+    radius, half = float(size[0]), float(size[1])
+    axis, height = turns[:, :, 2], centres[:, 2]
+    reach = half * np.abs(axis[:, 2]) + radius * np.sqrt(np.maximum(0.0, 1.0 - axis[:, 2] ** 2))
+    angles = np.arange(RIM_CORNERS) * (2 * np.pi / RIM_CORNERS)
+    x, y = radius * np.cos(angles), radius * np.sin(angles)
+    rims = np.concatenate([np.stack([x, y, np.full(RIM_CORNERS, z)], axis=1) for z in (half, -half)])
+    upright = np.abs(axis[:, 2]) > UPRIGHT_COSINE
+    tilted = ~upright
+    corners = centres[tilted][:, None] + rims @ turns[tilted].transpose(0, 2, 1)
+    bottom, top = height - reach, height + reach
+    batches = [
+        _hulls(_ends(centres[upright], axis[upright] * half), radius, bottom[upright], top[upright]),
+        _hulls(corners[..., :2], 0.0, bottom[tilted], top[tilted]),
+    ]
+    order = np.argsort(np.concatenate([np.flatnonzero(upright), np.flatnonzero(tilted)]))
+    return FootprintBatch.concatenate(batches).select(order)
+
+
+def _ellipses(axes: Floats) -> Floats:
+    """Return outlines (n, k, 2) of the ellipses that (n, 2, 3) matrices make of the unit ball."""
+    squared = axes @ axes.transpose(0, 2, 1)
+    first = np.sqrt(squared[:, 0, 0])
+    across = squared[:, 0, 1] / first
+    second = np.sqrt(np.maximum(0.0, squared[:, 1, 1] - across**2))
+    angles = np.arange(ELLIPSE_CORNERS) * (2 * np.pi / ELLIPSE_CORNERS)
+    cosines, sines = np.cos(angles), np.sin(angles)
+    return np.stack([first[:, None] * cosines, across[:, None] * cosines + second[:, None] * sines], axis=-1)
+
+
+def _hulls(points: Floats, radius: float, bottom: Floats, top: Floats) -> FootprintBatch:
+    """Return n rows, each the hull of its points (n, k, 2), rounded by a radius."""
+    import shapely
+
+    count, corners, _ = points.shape
+    start, flat = np.arange(count + 1) * corners, np.ascontiguousarray(points).reshape(-1, 2)
+    if corners > 2 and count:
+        lines = shapely.linestrings(flat, indices=np.repeat(np.arange(count), corners))
+        flat, owner = shapely.get_coordinates(shapely.convex_hull(lines), return_index=True)
+        start = starts_from_counts(np.bincount(owner, minlength=count))
+    outlines = normalise_polygons(start, flat)
+    return FootprintBatch(
+        part_start=np.arange(count + 1, dtype=np.int64),
+        vertex_start=outlines.vertex_start,
+        vertices=outlines.vertices,
+        radius=np.full(count, float(radius)),
+        bottom=bottom,
+        top=top,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- models
+
+
+def model_from_file(path: Path, assets: Path | None = None) -> SceneModel:
+    """Compile the model in a file, with the meshes of a folder: by default its own.
+
+    Raises:
+        LogError: a model that cannot be read or compiled.
+    """
+    try:
+        if path.stat().st_size > LARGEST_MODEL:
+            raise LogError(f"{path.name} has over {LARGEST_MODEL >> 20} MiB; give the XML of a MuJoCo model")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise LogError(f"the model {path} cannot be read ({error}); give the XML of a MuJoCo model") from None
+    return model_from_xml(text, path.name, assets or path.absolute().parent)
+
+
+def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneModel:
+    """Compile a model from its XML, without what kinematics do without.
+
+    Args:
+        place: what names the model in messages.
+        assets: a folder in which meshes and included files are searched by the ends of their paths; no file
+            outside it is read.
+
+    Raises:
+        LogError: XML that is broken or too large, or no model of MuJoCo.
+    """
+    with importing("models of MuJoCo need mujoco", extra="mujoco"):
+        import mujoco
+    root = _element(text, place)
+    folder = _Folder(assets)
+    _include(root, folder, place, depth=0)
+    _refuse_many(root, place)
+    directories = [compiler.get(key, "") for compiler in root.iter("compiler") for key in _FOLDERS[::2]]
+    files = _strip(root, folder, next((name for name in directories if name), ""))
+    try:
+        model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"), files)
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise LogError(f"MuJoCo {mujoco.__version__} does not compile {place}: {reason}") from None
+    return SceneModel(model, place, folder.remarks())
+
+
+class _Folder:
+    """The files of a folder, found by the ends of paths that were written elsewhere."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = None if folder is None else folder.resolve()
+        self._too_large: list[str] = []
+
+    def read(self, name: str, directory: str = "") -> bytes | None:
+        """Return a file's bytes; None if the folder does not have it."""
+        if self._folder is None:
+            return None
+        path = PurePosixPath(directory.replace("\\", "/")) / name.replace("\\", "/")
+        parts = [part for part in path.parts if part not in ("/", ".", "..")]
+        for begin in range(len(parts)):
+            file = self._folder.joinpath(*parts[begin:]).resolve()
+            if not file.is_relative_to(self._folder) or not file.is_file():
+                continue
+            if file.stat().st_size > LARGEST_ASSET:
+                self._too_large.append(file.name)
+                return None
+            return file.read_bytes()
+        return None
+
+    def remarks(self) -> list[str]:
+        return [
+            f"the mesh {name} has over {LARGEST_ASSET >> 20} MiB, and is left out" for name in self._too_large
+        ]
+
+
+def _element(text: str, place: str) -> ElementTree.Element:
+    if len(text) > LARGEST_MODEL:
+        raise LogError(f"{place} has {len(text):,} characters; a model has at most {LARGEST_MODEL:,}")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise LogError(f"{place} declares a document type, which no model of MuJoCo needs; remove it")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise LogError(f"the XML of {place} is broken ({error}); give a model of MuJoCo") from None
+    level, depth = [root], 0
+    while level:
+        level, depth = [child for element in level for child in element], depth + 1
+    if depth > DEEPEST:
+        raise LogError(f"{place} has elements inside each other more than {DEEPEST} deep; MuJoCo has fewer")
+    if root.tag != "mujoco":
+        raise LogError(f"{place} is not a model of MuJoCo: its root is <{root.tag}>; give one with <mujoco>")
+    return root
+
+
+def _include(parent: ElementTree.Element, folder: _Folder, place: str, depth: int) -> None:
+    """Replace includes by the content of files of the folder, or remove them."""
+    for index, child in reversed(list(enumerate(parent))):
+        if child.tag != "include":
+            _include(child, folder, place, depth)
+            continue
+        parent.remove(child)
+        content = folder.read(child.get("file", "")) if depth < 8 else None
+        if content is not None:
+            included = _element(content.decode("utf-8", "replace"), f"{place}, {child.get('file')}")
+            _include(included, folder, place, depth + 1)
+            for offset, element in enumerate(list(included)):
+                parent.insert(index + offset, element)
+
+
+def _refuse_many(root: ElementTree.Element, place: str) -> None:
+    """Refuse a model that would generate more elements than memory holds."""
+
+    def copies(element: ElementTree.Element) -> float:
+        numbers = (_number(text) for text in element.get("count", "1").split())
+        return math.prod(numbers) * max([1.0, *map(copies, element)])
+
+    if copies(root) > MOST_COPIES:
+        raise LogError(f"{place} copies elements more than {MOST_COPIES:,} times; give a smaller model")
+
+
+def _number(text: str) -> float:
+    try:
+        return max(1.0, float(text))
+    except ValueError:
+        return 1.0
+
+
+def _strip(root: ElementTree.Element, folder: _Folder, directory: str) -> dict[str, bytes]:
+    """Remove what kinematics do without; return the meshes that the folder has, by new names."""
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag in _UNUSED or "hfield" in child.attrib:
+                parent.remove(child)
+    files: dict[str, bytes] = {}
+    lost: set[str] = set()
+    for asset in root.findall("asset"):
+        for mesh in asset.findall("mesh"):
+            if not _has_content(mesh, folder, directory, files):
+                asset.remove(mesh)
+                lost.add(mesh.get("name", PurePosixPath(mesh.get("file", "")).stem))
+    for number, geom in enumerate(root.iter("geom")):
+        if geom.get("mesh") in lost:
+            _lose_mesh(geom, number)
+    for element in root.iter():
+        element.attrib.pop("material", None)
+        if element.tag != "mesh":
+            element.attrib.pop("file", None)
+    _set_compiler(root)
+    return files
+
+
+def _has_content(mesh: ElementTree.Element, folder: _Folder, directory: str, files: dict[str, bytes]) -> bool:
+    """Return whether a mesh has its vertices in the XML, or a file that the folder has."""
+    name = mesh.attrib.pop("file", None)
+    if name is None:
+        return "vertex" in mesh.attrib or "builtin" in mesh.attrib
+    content = folder.read(name, directory)
+    if content is None:
+        mesh.set("file", name)
+        return False
+    mesh.set("name", mesh.get("name", PurePosixPath(name).stem))
+    mesh.set("file", f"{len(files)}{PurePosixPath(name).suffix.lower()}")
+    files[mesh.attrib["file"]] = content
+    return True
+
+
+def _lose_mesh(geom: ElementTree.Element, number: int) -> None:
+    """Make a geom without its mesh a small sphere with a name that says so."""
+    for key in ("mesh", "fromto", "fitscale"):
+        geom.attrib.pop(key, None)
+    geom.attrib |= {"type": "sphere", "size": "0.001", "name": f"{_LOST}{number}"}
+
+
+_COMPILER: Final[Mapping[str, str]] = {
+    # bodies whose meshes are missing have no mass
+    "boundmass": "1e-6",
+    "boundinertia": "1e-9",
+    "balanceinertia": "true",
+    # names and geoms stay
+    "fusestatic": "false",
+    "discardvisual": "false",
+}
+
+
+def _set_compiler(root: ElementTree.Element) -> None:
+    if root.find("compiler") is None:
+        root.insert(0, ElementTree.Element("compiler"))
+    for compiler in root.iter("compiler"):
+        for key in _FOLDERS:
+            compiler.attrib.pop(key, None)
+        compiler.attrib |= _COMPILER
