@@ -48,9 +48,9 @@ class StagesOfStates:
 
     Attributes:
         stages: the farthest from acceptance first; "lost" and "unknown" come last.
-        numbers: for each state, the number of its stage.
-        left: for each state, how many propositions must still come true; of a trap, that of the start.
-        progress: for each state, from 0 to 1: the share of the start's propositions that are not left.
+        numbers: the place in `stages` of each state's stage.
+        left: the propositions that must still come true from each state; a trap has those of the start.
+        progress: from 0 to 1, the share of the start's propositions that each state no longer owes.
     """
 
     stages: tuple[Stage, ...]

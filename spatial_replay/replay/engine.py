@@ -82,9 +82,9 @@ if TYPE_CHECKING:
 _MOST_DIGITS = 18
 """Greatest valid count in the metadata of a log."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
-_RESULTS_AT_ONCE = 2**16
-"""Messages are made and written for so many samples, times results, at once: about 200 MB."""
 """Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
+_RESULTS_AT_ONCE = 2**16
+"""Samples, times results, whose messages are made and written together: about 200 MB."""
 
 
 @dataclass(frozen=True, slots=True)
