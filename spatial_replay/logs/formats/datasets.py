@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, cast
+from typing import Any, BinaryIO, Final, NamedTuple, cast
 
 import numpy as np
 
-from spatial_replay.errors import LogError, UsageError, importing, system_reason
+from spatial_replay.errors import LogError, UsageError, system_reason
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.formats.episodes import (
     AS_STORED,
@@ -28,14 +28,10 @@ from spatial_replay.logs.formats.episodes import (
     Label,
     frame_times_ns,
 )
+from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
 from spatial_replay.text import counted, listed, nearest_hint
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 _ADDRESS: Final = re.compile(r"(.+)#([0-9]{1,9})", re.DOTALL)
-_LARGEST_INFO: Final = 64 * 2**20
-"""Bytes of a metadata file."""
 _MOST_BYTES: Final = 8 * 2**30
 """Bytes of the columns of one file, uncompressed."""
 
@@ -108,41 +104,7 @@ _TIME_ERROR_S: Final = 1e-3
 
 
 def _is_lerobot(path: Path) -> bool:
-    return path.is_dir() and b'"codebase_version"' in _head(path / "meta" / "info.json")
-
-
-def _head(file: Path) -> bytes:
-    if not file.is_file():
-        return b""
-    with file.open("rb") as stream:
-        return stream.read(_LARGEST_INFO)
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        LogError: the file holds something else.
-    """
-    try:
-        value = json.loads(_head(file))
-    except (ValueError, RecursionError) as error:
-        raise LogError(f"{file.name} is not JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise LogError(f"{file.name} holds no JSON object")
-    return value
-
-
-def arrow() -> Any:
-    """Return the library for Arrow and Parquet.
-
-    Raises:
-        UsageError: it is not installed.
-    """
-    with importing("data sets in Parquet need pyarrow", extra="datasets"):
-        import pyarrow
-        import pyarrow.parquet
-    return pyarrow
+    return path.is_dir() and b'"codebase_version"' in read_head(path / "meta" / "info.json")
 
 
 class _LeRobot(DataSet):
@@ -341,7 +303,7 @@ def _episode_rows(path: Path) -> Iterator[Mapping[str, Any]]:
             except library.ArrowException as error:
                 raise LogError(f"{file.relative_to(path)} cannot be read: {error}") from None
         return
-    for number, line in enumerate(_head(path / "meta" / "episodes.jsonl").splitlines(), 1):
+    for number, line in enumerate(read_head(path / "meta" / "episodes.jsonl").splitlines(), 1):
         if line.strip():
             try:
                 row = json.loads(line)
@@ -369,42 +331,8 @@ def _read_columns(file: Path, wanted: Iterable[str]) -> dict[str, Floats]:
         raise LogError(
             f"{file.name} cannot be read: {str(error).splitlines()[0]}; download it again"
         ) from None
-    columns = ((name, _numbers(table.column(name), library)) for name in table.column_names)
+    columns = ((name, numbers_from_column(table.column(name))) for name in table.column_names)
     return {name: values for name, values in columns if values is not None}
-
-
-def _numbers(column: pa.ChunkedArray, library: Any) -> Floats | None:
-    """Return a column as (T,) or (T, W) float64; null is NaN; None for texts, and rows of several lengths."""
-    types = library.types
-    array, widths = column.combine_chunks(), list[int]()
-    if isinstance(array, library.ChunkedArray):
-        array = array.chunk(0) if array.num_chunks else library.array([], column.type)
-    count, is_null = len(array), np.zeros(0, np.bool_)
-    while (
-        types.is_list(array.type) or types.is_large_list(array.type) or types.is_fixed_size_list(array.type)
-    ):
-        if array.null_count and not widths:
-            is_null = array.is_null().to_numpy(zero_copy_only=False)
-        lengths = np.unique(library.compute.list_value_length(array).drop_null().to_numpy())
-        if len(lengths) > 1:
-            return None
-        widths.append(int(lengths[0]) if len(lengths) else 0)
-        array = array.flatten()
-    if not (types.is_floating(array.type) or types.is_integer(array.type) or types.is_boolean(array.type)):
-        return None
-    if types.is_boolean(array.type):
-        array = array.cast(library.uint8())
-    if array.null_count or not types.is_float64(array.type):
-        array = array.cast(library.float64(), safe=False)
-    numbers = array.to_numpy(zero_copy_only=False)
-    if not widths:
-        return cast("Floats", numbers)
-    width = int(np.prod(widths))
-    if len(is_null) == 0:
-        return cast("Floats", numbers.reshape(count, width))
-    filled = np.full((count, width), np.nan)
-    filled[~is_null] = numbers.reshape(-1, width)
-    return filled
 
 
 def _join_pieces(pieces: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
