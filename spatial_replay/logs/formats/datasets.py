@@ -1,4 +1,4 @@
-"""Find robot-learning data sets and their episodes; read those of LeRobot (v2, v3) and OGBench.
+"""Find robot-learning data sets and their episodes by format; read those of LeRobot (v2, v3) and OGBench.
 
 Only files below the folder of a data set are read: templates of paths in its metadata are not followed.
 """
@@ -20,6 +20,7 @@ from spatial_replay.errors import LogError, UsageError, system_reason
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.formats.episodes import (
     AS_STORED,
+    Body,
     DataSet,
     Episode,
     EpisodeColumns,
@@ -28,6 +29,9 @@ from spatial_replay.logs.formats.episodes import (
     Label,
     frame_times_ns,
 )
+from spatial_replay.logs.formats.hdf5 import is_hdf5, open_hdf5
+from spatial_replay.logs.formats.minari import is_minari, open_minari
+from spatial_replay.logs.formats.mujoco import model_from_file
 from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
 from spatial_replay.text import counted, listed, nearest_hint
 
@@ -87,8 +91,14 @@ def _open_as(kind: str, path: Path, state: tuple[object, ...]) -> DataSet:
 
 def _state(path: Path) -> tuple[object, ...]:
     """Return what changes with the files that say what is in a data set."""
-    files = [path, *(path / name for name in ("meta", "meta/info.json", "metadata.json", "meta/episodes"))]
-    files += [path.with_suffix(".json"), path / "meta/episodes.jsonl"]
+    files = [
+        path,
+        *(
+            path / name
+            for name in ("meta", "meta/info.json", "metadata.json", "meta/episodes", "data/metadata.json")
+        ),
+    ]
+    files += [path.with_suffix(".json"), path / "meta/episodes.jsonl", path / "data/main_data.hdf5"]
     states = [file.stat() for file in files if file.exists()]
     return tuple((state.st_ino, state.st_size, state.st_mtime_ns) for state in states)
 
@@ -424,10 +434,16 @@ class _Npz(DataSet):
         names = [feature.name for feature in self.features] if features is None else features
         frames: Integers = np.arange(rows.stop - rows.start, dtype=np.int64)
         success = None if reading.label is None else self._array(reading.label)[rows].reshape(-1) > 0
+        bodies, remarks = list[Body](), tuple[str, ...]()
+        if reading.model is not None:
+            model = model_from_file(reading.model, reading.assets)
+            bodies, remarks = model.bodies(self._array("qpos")[rows], f"{self.name}: qpos"), model.remarks
         return EpisodeColumns(
             frame_times_ns(frames, self.required_fps(reading)),
             {name: self._array(name)[rows] for name in names},
-            success=success,
+            tuple(bodies),
+            success,
+            remarks=remarks,
         )
 
     def _array(self, name: str) -> Floats:
@@ -461,4 +477,6 @@ def _npy_header(stream: BinaryIO, what: str) -> tuple[tuple[int, ...], np.dtype[
 FORMATS: Final[dict[str, Format]] = {
     "LeRobot": Format(_is_lerobot, _LeRobot),
     "OGBench npz": Format(_is_npz, _Npz),
+    "HDF5": Format(is_hdf5, open_hdf5),
+    "Minari": Format(is_minari, open_minari),
 }

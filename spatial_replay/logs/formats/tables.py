@@ -49,6 +49,7 @@ def arrow() -> Any:
     """
     with importing("data sets in Parquet need pyarrow", extra="datasets"):
         import pyarrow
+        import pyarrow.compute
         import pyarrow.parquet
     return pyarrow
 
