@@ -57,18 +57,18 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
     if not of:
         violated = [result for result in results if result.verdict is Verdict.VIOLATED]
         return [KeptNode(result, 0, result.title) for result in violated or results]
-    found, known = [], dict[str, None]()
+    nodes, spec_names = [], dict[str, None]()
     for result in results:
         names = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}
-        known |= dict.fromkeys([result.title, *names])
+        spec_names |= dict.fromkeys([result.title, *names])
         if result.title in of or result.name in of:
-            found.append(KeptNode(result, 0, result.title))
-        found += [KeptNode(result, names[name], name) for name in of if names.get(name)]
+            nodes.append(KeptNode(result, 0, result.title))
+        nodes += [KeptNode(result, names[name], name) for name in of if names.get(name)]
     for name in of:
-        if name not in known and all(name != result.name for result in results):
-            hint = nearest_hint(name, known) or f"there are {', '.join(known)}"
+        if name not in spec_names and all(name != result.name for result in results):
+            hint = nearest_hint(name, spec_names) or f"there are {', '.join(spec_names)}"
             raise UsageError(f"no spec is named {name!r}; {hint}")
-    return found
+    return nodes
 
 
 class _Path(NamedTuple):
@@ -135,7 +135,7 @@ class _Part:
         if result.object is not None and trace is not None:
             column = trace.names.index(result.object)
             self._seen_ns = trace.times_ns[trace.rows[:, column] != ABSENT]
-        self._decision = self._decided(result, self._leaves)
+        self._decision = self._decide(result, self._leaves)
         # the last one of equal times is the one that is said
         self._moments = {
             self._decision.settled.decided_ns: f", where `{kept.title}` was settled",
@@ -176,7 +176,7 @@ class _Part:
         stream = InstanceStream(self._result.evidence.instance)
         block = stream.extend_leaves(leaves, self._times_ns[begin:end])
         result = SpecResult.from_stream(stream, self._result.evidence, block)
-        return self._decided(result, leaves)
+        return self._decide(result, leaves)
 
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
         """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
@@ -194,27 +194,27 @@ class _Part:
         if not len(head):
             return leaves
         instance = self._result.evidence.instance
-        known = leaf_values(TraceScene(head, self._regions), self._order, instance.bindings)
-        channels = max(len(known), len(leaves))
+        head_leaves = leaf_values(TraceScene(head, self._regions), self._order, instance.bindings)
+        channels = max(len(head_leaves), len(leaves))
         leaves = np.array(in_channels(leaves, channels))
-        leaves[:, :, : len(head)] = in_channels(known, channels)
+        leaves[:, :, : len(head)] = in_channels(head_leaves, channels)
         return leaves
 
-    def _decided(self, result: SpecResult, leaves: Floats) -> _Decision:
+    def _decide(self, result: SpecResult, leaves: Floats) -> _Decision:
         """Return the verdict over the samples of a result, given their leaves, and its reason."""
         times_ns, certain_ns = result.times_ns, result.certain_ns(self._node)
         cause = result.first_cause(self._node)
         part, settled_ns = (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
-        done = evaluate_offline(result.formula, self._order, leaves, times_ns)
-        path = _path(done, self._node)
+        evaluation = evaluate_offline(result.formula, self._order, leaves, times_ns)
+        path = _path(evaluation, self._node)
         if settled_ns is None:
-            settled = _path(done, part)
+            settled = _path(evaluation, part)
         else:
             count = int(np.searchsorted(times_ns, settled_ns, side="right"))
             first = evaluate_unfinished(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
             settled = _path(first, part)
-        numbers = (*_deciding_numbers(done, self._node), *_deciding_numbers(done, part))
-        verdict = final_verdict(*done.interval(self._node))
+        numbers = (*_deciding_numbers(evaluation, self._node), *_deciding_numbers(evaluation, part))
+        verdict = final_verdict(*evaluation.interval(self._node))
         return _Decision(verdict, certain_ns, numbers, None if cause is None else part, path, settled)
 
 
@@ -250,15 +250,15 @@ class ClipSearch:
         kept: Sequence[KeptNode],
         around_ns: int,
     ) -> None:
-        results = [each.result for each in kept]
+        results = [node.result for node in kept]
         needs_samples = any(result.object is not None or look_back([result.formula]) for result in results)
         trace = Selection(source, files, options).trace() if needs_samples else None
         self._parts = []
-        for each in kept:
-            if len(each.result.times_ns):
-                file = file_of(files, each.result)
-                self._parts.append(_Part(each, trace, {} if file is None else file.regions))
-        self._times_ns = _joined_times([result.times_ns for result in results])
+        for node in kept:
+            if len(node.result.times_ns):
+                file = file_of(files, node.result)
+                self._parts.append(_Part(node, trace, {} if file is None else file.regions))
+        self._times_ns = _join_times([result.times_ns for result in results])
         first_ns = min(part.span_ns[0] for part in self._parts) - around_ns
         last_ns = max(part.span_ns[1] for part in self._parts) + around_ns
         last = len(self._times_ns) - 1
@@ -319,10 +319,10 @@ class ClipSearch:
         return self._known[first, last]
 
 
-def _joined_times(times_ns: Sequence[Integers]) -> Integers:
+def _join_times(times_ns: Sequence[Integers]) -> Integers:
     first = times_ns[0]
     # objects of a template may come one after the other, each for as many samples
-    if all(np.array_equal(each, first) for each in times_ns):
+    if all(np.array_equal(sample_times, first) for sample_times in times_ns):
         return first
     return np.unique(np.concatenate(times_ns))
 
@@ -351,11 +351,11 @@ class Clip:
     @property
     def left_out(self) -> tuple[str, ...]:
         """The titles of results of which nothing is kept, in the order of the log."""
-        kept = {*self.kept}
+        kept_names = {*self.kept}
         return tuple(
-            each.title
-            for each in self.whole.results
-            if kept.isdisjoint({each.title, *(node.name for node in each.nodes if node.name)})
+            result.title
+            for result in self.whole.results
+            if kept_names.isdisjoint({result.title, *(node.name for node in result.nodes if node.name)})
         )
 
     @property
@@ -376,13 +376,13 @@ class Clip:
     @property
     def added(self) -> tuple[str, ...]:
         """The named parts that fail in the clip alone, of results with the verdict of the log."""
-        known = {result.title: result for result in self.whole.results}
+        results = {result.title: result for result in self.whole.results}
         parts = (
             cause.spec
             for result in self.replayed.results
             if result.title not in self.changed
             for cause in result.causes
-            if cause.spec not in {each.spec for each in known[result.title].causes}
+            if cause.spec not in {cause.spec for cause in results[result.title].causes}
         )
         return tuple(dict.fromkeys(parts))
 
@@ -419,8 +419,8 @@ def cut_clip(
     require_ltlf(options.semantics, "a clip")
     first_pass = replace(options, keep=())
     whole = Replay(source, files, first_pass, keep_leaves=True, certify=False).run(advance=advance)
-    chosen = chosen_nodes(whole.results, of)
-    search = ClipSearch(source, files, first_pass, chosen, around_ns)
+    nodes = chosen_nodes(whole.results, of)
+    search = ClipSearch(source, files, first_pass, nodes, around_ns)
     start_ns, end_ns = search.window()
     keep = KEEP_ALL if options.keep is None else options.keep
     about = {
@@ -430,7 +430,7 @@ def cut_clip(
         "end_ns": str(end_ns),
         ZERO: str(whole.first_ns),
         "keep": json.dumps(list(keep)),
-        "kept": ", ".join(each.title for each in chosen),
+        "kept": ", ".join(node.title for node in nodes),
     }
     clipped = clipped_source(source, about)
     replayed = run_replay(
@@ -446,7 +446,7 @@ def cut_clip(
         replayed,
         start_ns,
         end_ns,
-        tuple(each.title for each in chosen),
+        tuple(node.title for node in nodes),
         _size_of(source),
         output.stat().st_size,
         counted_from(search.reasons(start_ns, end_ns), whole.first_ns),

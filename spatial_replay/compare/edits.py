@@ -64,30 +64,30 @@ def unify_regions(
     joined = dict(others)
     for name, outline in regions.items():
         if others.get(name, outline) != outline:
-            own = f"{name} (before)"
-            while own in others or own in regions:
-                own += "'"
-            renamed[name] = own
+            new_name = f"{name} (before)"
+            while new_name in others or new_name in regions:
+                new_name += "'"
+            renamed[name] = new_name
         joined[renamed.get(name, name)] = outline
     if not renamed:
         return list(formulas), joined
-    change = partial(_renamed, regions=renamed)
+    change = partial(_rename_regions, regions=renamed)
 
-    def changed(atom: Atom) -> Atom:
+    def change_atom(atom: Atom) -> Atom:
         expression = map_leaves(atom.expression, partial(changed_leaf, change=change))
         return replace(atom, expression=expression, terms=tuple(map(change, atom.terms)))
 
-    return [rewritten(formula, changed) for formula in formulas], joined
+    return [rewritten(formula, change_atom) for formula in formulas], joined
 
 
-def _renamed(term: Any, regions: Mapping[str, str], *, without_groups: bool = False) -> Any:
+def _rename_regions(term: Any, regions: Mapping[str, str], *, without_groups: bool = False) -> Any:
     """Return a term with other names of regions and, on request, with groups known by their members alone."""
     if isinstance(term, Group) and without_groups:
         return replace(term, name="")
     if isinstance(term, RegionName):
         return RegionName(regions.get(term.name, term.name))
     if isinstance(term, DerivedTerm):
-        return replace(term, term=_renamed(term.term, regions, without_groups=without_groups))
+        return replace(term, term=_rename_regions(term.term, regions, without_groups=without_groups))
     return term
 
 
@@ -148,12 +148,16 @@ class TextVersions:
         self._units = units
         self.old, self.new = with_numbers(old, units), with_numbers(new, units)
         self._statements = statements_of(old), statements_of(new)
-        one, other = self._statements
+        old_statements, new_statements = self._statements
         # specs are compared node by node
-        keys = [key for key in dict.fromkeys((*one, *other)) if key[0] != "SPEC"]
-        self._keys = [key for key in keys if _words(one, key) != _words(other, key)][:_MOST_CHANGES]
+        keys = [key for key in dict.fromkeys((*old_statements, *new_statements)) if key[0] != "SPEC"]
+        self._keys = [key for key in keys if _words(old_statements, key) != _words(new_statements, key)][
+            :_MOST_CHANGES
+        ]
         self.changes = tuple(
-            DeclarationChange(_KINDS[key[0]], key[1], _place(one, key), _place(other, key))
+            DeclarationChange(
+                _KINDS[key[0]], key[1], _place(old_statements, key), _place(new_statements, key)
+            )
             for key in self._keys
         )
         self._known: dict[tuple[bool, frozenset[int]], Specification | None] = {}
@@ -168,9 +172,11 @@ class TextVersions:
         if version not in self._known:
             keys = [self._keys[number] for number in changes]
             # what is exchanged may need declarations that only the other text has
-            texts = (self._exchanged(keys, is_undone, is_strict) for is_strict in (True, False))
-            found = (self._parsed(text, keys, is_undone) for text in texts)
-            self._known[version] = next((each for each in found if each is not None), None)
+            texts = (self._exchange(keys, is_undone, is_strict) for is_strict in (True, False))
+            versions = (self._parse(text, keys, is_undone) for text in texts)
+            self._known[version] = next(
+                (specification for specification in versions if specification is not None), None
+            )
         return self._known[version]
 
     def edited_lines(
@@ -185,41 +191,47 @@ class TextVersions:
             spans: of several lines that differ, that of either of these is looked for.
         """
         for names in specs:
-            found = [of.get(("SPEC", name)) for of, name in zip(self._statements, names, strict=True)]
-            one, other = found
-            if one is not None and other is not None and one.words != other.words:
+            statements = [of.get(("SPEC", name)) for of, name in zip(self._statements, names, strict=True)]
+            old_statement, new_statement = statements
+            if (
+                old_statement is not None
+                and new_statement is not None
+                and old_statement.words != new_statement.words
+            ):
                 break
         else:
             return None, None
-        old = _lines_of(self.old, one.span, spans[0])
-        new = _lines_of(self.new, other.span, spans[1])
+        old = _lines_of(self.old, old_statement.span, spans[0])
+        new = _lines_of(self.new, new_statement.span, spans[1])
         one_words, other_words = (
             [tuple(line.place.text.partition("#")[0].split()) for line in lines] for lines in (old, new)
         )
         codes = SequenceMatcher(None, one_words, other_words, autojunk=False).get_opcodes()
         blocks = [(old[a:b], new[c:d]) for kind, a, b, c, d in codes if kind != "equal"]
-        return _chosen(max(blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1]))))
+        return _edited_places(
+            max(blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1])))
+        )
 
-    def _exchanged(self, keys: Collection[_Key], is_undone: bool, is_strict: bool) -> str:
-        base, other = self._statements[::-1] if is_undone else self._statements
+    def _exchange(self, keys: Collection[_Key], is_undone: bool, is_strict: bool) -> str:
+        base, donor = self._statements[::-1] if is_undone else self._statements
         file, source = (self.new, self.old) if is_undone else (self.old, self.new)
         pieces: list[tuple[Span, str]] = []
         first = []
         for key in self._keys:
-            if key in base and key in other and key in keys:
-                pieces.append((base[key].span, _text(source, other[key].span)))
+            if key in base and key in donor and key in keys:
+                pieces.append((base[key].span, _text(source, donor[key].span)))
             elif key not in base and (key in keys or not is_strict):
-                first.append(_text(source, other[key].span))
-            elif key not in other and key in keys and is_strict:
+                first.append(_text(source, donor[key].span))
+            elif key not in donor and key in keys and is_strict:
                 pieces.append((base[key].span, ""))
         text = file.source
         for span, piece in sorted(pieces, reverse=True):
             text = text[: span.start] + piece + text[span.end :]
         return "\n".join((*first, text))
 
-    def _parsed(self, text: str, keys: Iterable[_Key], is_undone: bool) -> Specification | None:
-        file, other = (self.new, self.old) if is_undone else (self.old, self.new)
-        profile = other.profile if any(word == "USE" for word, _ in keys) else file.profile
+    def _parse(self, text: str, keys: Iterable[_Key], is_undone: bool) -> Specification | None:
+        file, donor = (self.new, self.old) if is_undone else (self.old, self.new)
+        profile = donor.profile if any(word == "USE" for word, _ in keys) else file.profile
         with suppress(SpecificationError, UsageError):
             version = parse_specification(text, filename=file.filename, profile=profile)
             atoms = (atom for spec in version.specs for atom in iter_atoms(spec.formula))
@@ -239,20 +251,22 @@ class _Line(NamedTuple):
 
 def _lines_of(file: Specification, statement: Span, span: Span | None) -> list[_Line]:
     first, last = (file.source.count("\n", 0, at) for at in (statement.start, statement.end))
-    wanted = -1 if span is None or span == Span(0, 0) else file.source.count("\n", 0, span.start)
+    wanted_line = -1 if span is None or span == Span(0, 0) else file.source.count("\n", 0, span.start)
     lines = file.source.split("\n")
     return [
-        _Line(TextPlace(file.filename, number + 1, lines[number].strip()), number == wanted)
+        _Line(TextPlace(file.filename, number + 1, lines[number].strip()), number == wanted_line)
         for number in range(first, last + 1)
     ]
 
 
-def _chosen(block: tuple[Sequence[_Line], Sequence[_Line]]) -> tuple[TextPlace | None, TextPlace | None]:
+def _edited_places(
+    block: tuple[Sequence[_Line], Sequence[_Line]],
+) -> tuple[TextPlace | None, TextPlace | None]:
     """Return the wanted line of either text, or else the one as far down as that of the other."""
-    wanted = [number for lines in block for number, line in enumerate(lines) if line.is_wanted]
+    wanted_lines = [number for lines in block for number, line in enumerate(lines) if line.is_wanted]
     old, new = (
         next((line.place for line in lines if line.is_wanted), None)
-        or (lines[min(next(iter(wanted), 0), len(lines) - 1)].place if lines else None)
+        or (lines[min(next(iter(wanted_lines), 0), len(lines) - 1)].place if lines else None)
         for lines in block
     )
     return old, new
@@ -262,7 +276,7 @@ def statements_of(file: Specification) -> dict[_Key, _Statement]:
     """Return the statements of a specification's text by what they declare."""
     source = SourceText.of(file.source, file.filename)
     faults = Faults(source)
-    found: dict[_Key, _Statement] = {}
+    statements: dict[_Key, _Statement] = {}
     for group in split_statements(tokenize(file.source, RELATION_NAMES | file.relations, faults), faults):
         first, last = group.tokens[0], group.tokens[-1]
         if first.type not in (*_KINDS, "SPEC") or first is last:
@@ -271,8 +285,8 @@ def statements_of(file: Specification) -> dict[_Key, _Statement]:
         place = TextPlace(file.filename, source.line_of(span.start), _on_one_line(file.source, group.tokens))
         name = "profile" if first.type == "USE" else str(group.tokens[1].value)
         words = tuple(f"{token.type} {token.value}" for token in group.tokens)
-        found.setdefault((first.type, name), _Statement(span, place, words))
-    return found
+        statements.setdefault((first.type, name), _Statement(span, place, words))
+    return statements
 
 
 def _on_one_line(source: str, tokens: Sequence[Token]) -> str:
@@ -384,12 +398,12 @@ class Place:
     @property
     def operands(self) -> list[Place]:
         """The nodes below, through specs that only repeat another."""
-        found, identifier = [], self.id + 1
+        places, identifier = [], self.id + 1
         for operand in operands_of(self.node):
             specs = self.specs if operand.name is None else (operand.name, *self.specs)
-            found.append(Place(operand, identifier, specs, self.depth + 1))
+            places.append(Place(operand, identifier, specs, self.depth + 1))
             identifier += _size(operand)
-        return found
+        return places
 
     def members(self, operator: str, *, through_names: bool = False) -> list[Place]:
         """The operands of a conjunction or disjunction, and in place of those that are one, too, theirs.
@@ -397,12 +411,12 @@ class Place:
         Args:
             through_names: look into specs, too.
         """
-        found: list[Place] = []
+        places: list[Place] = []
         for place in self.operands:
             inner = place.bare if through_names else place
             is_more = operator_of(inner.node) == operator and (through_names or inner.node.name is None)
-            found += inner.members(operator, through_names=through_names) if is_more else [place]
-        return found
+            places += inner.members(operator, through_names=through_names) if is_more else [place]
+        return places
 
     @property
     def bare(self) -> Place:
@@ -491,17 +505,19 @@ class TreeDiff:
     def formula(self, units: Collection[int]) -> Formula:
         """Return the old formula with only these of the units made, by number."""
         sites = frozenset(site for site, unit in self._unit_of_site.items() if unit in units)
-        built = _built(self._merged, sites)
+        built = _build(self._merged, sites)
         return Truth(True) if built is None else built
 
 
-def _built(merged: Merged, chosen: frozenset[int]) -> Formula | None:
+def _build(merged: Merged, chosen: frozenset[int]) -> Formula | None:
     if isinstance(merged, Site):
         return merged.new if merged.site in chosen else merged.old
     if not isinstance(merged, Inner):
         return merged
     head = merged.new if merged.site in chosen else merged.old
-    operands = tuple(each for operand in merged.operands if (each := _built(operand, chosen)) is not None)
+    operands = tuple(
+        formula for operand in merged.operands if (formula := _build(operand, chosen)) is not None
+    )
     if head.operator in ("and", "or") and len(operands) < 2:
         return operands[0] if operands else Truth(head.operator == "and")
     return replace(head, operands=operands)
@@ -511,11 +527,11 @@ def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
     """Return what of a node was edited, and the region or group if that is it."""
     if isinstance(old, Atom) and isinstance(new, Atom) and old.relation == new.relation:
         if old.text == new.text:
-            for one, other in zip(iter_terms([old]), iter_terms([new]), strict=False):
-                if one != other and isinstance(base_of(other), RegionName):
-                    return "region", format_term(base_of(other))
-                if one != other and isinstance(base_of(other), Group):
-                    return "group", format_term(base_of(other))
+            for old_term, new_term in zip(iter_terms([old]), iter_terms([new]), strict=False):
+                if old_term != new_term and isinstance(base_of(new_term), RegionName):
+                    return "region", format_term(base_of(new_term))
+                if old_term != new_term and isinstance(base_of(new_term), Group):
+                    return "group", format_term(base_of(new_term))
             return "definition", None
         if _without_numbers(old) == _without_numbers(new):
             return "constant", None
@@ -525,7 +541,7 @@ def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
 
 
 def _without_numbers(atom: Atom) -> Hashable:
-    texts = tuple(each for each in atom.parameters if isinstance(each, str))
+    texts = tuple(parameter for parameter in atom.parameters if isinstance(parameter, str))
     # the number of a signal's comparison is a text too: NAME, comparison, number
     texts = texts[:2] if atom.relation == "signal" else texts
     if atom.relation == "sum":
@@ -536,16 +552,16 @@ def _without_numbers(atom: Atom) -> Hashable:
 
 def similarity(old: Formula, new: Formula) -> float:
     """Return how much of what two nodes are about is the same, 0 to 1."""
-    one, other = _subjects(old), _subjects(new)
-    return (one & other).total() / max((one | other).total(), 1)
+    old_subjects, new_subjects = _subjects(old), _subjects(new)
+    return (old_subjects & new_subjects).total() / max((old_subjects | new_subjects).total(), 1)
 
 
 def _subjects(formula: Formula) -> Counter[str]:
-    found = Counter(format_term(base_of(term)) for term in iter_terms([formula]))
+    subjects = Counter(format_term(base_of(term)) for term in iter_terms([formula]))
     atoms = [node for _, _, node in iter_nodes(formula) if isinstance(node, Atom)]
-    found.update(str(atom.parameters[0]) for atom in atoms if not atom.terms and atom.relation != "sum")
-    found.update(name for atom in atoms if atom.relation == "sum" for name in signals_in(atom.expression))
-    return found
+    subjects.update(str(atom.parameters[0]) for atom in atoms if not atom.terms and atom.relation != "sum")
+    subjects.update(name for atom in atoms if atom.relation == "sum" for name in signals_in(atom.expression))
+    return subjects
 
 
 def compare_trees(
@@ -565,7 +581,7 @@ def compare_trees(
     """
     comparison = _Comparison(regions, specs)
     merged = comparison.align(Place(old, 0, (name,), 0), Place(new, 0, (name,), 0))
-    return comparison.finished(merged, origins)
+    return comparison.join_sites(merged, origins)
 
 
 def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) -> frozenset[int]:
@@ -584,7 +600,7 @@ class _Comparison:
     ) -> None:
         first: dict[Outline, str] = {}
         shapes = {name: first.setdefault(outline, name) for name, outline in regions.items()}
-        self._alike = partial(_renamed, regions=shapes, without_groups=True)
+        self._alike = partial(_rename_regions, regions=shapes, without_groups=True)
         self._specs = specs
         self._renamed: set[tuple[str | None, str | None]] = set()
         self._numbers: dict[Hashable, int] = {}
@@ -593,10 +609,10 @@ class _Comparison:
 
     def meaning(self, node: Formula) -> int:
         """Return a number that nodes of equal meaning share: names and the order of operands do not count."""
-        known = self._known.get(id(node))
-        if known is None:
-            known = self._known[id(node)] = (node, self._meaning(node))
-        return known[1]
+        entry = self._known.get(id(node))
+        if entry is None:
+            entry = self._known[id(node)] = (node, self._meaning(node))
+        return entry[1]
 
     def _meaning(self, node: Formula) -> int:
         key: Hashable
@@ -613,7 +629,7 @@ class _Comparison:
             case Boolean(operator="and" | "or" as operator):
                 # brackets around some of the operands mean nothing
                 members = Place(node, 0, ("",), 0).members(operator, through_names=True)
-                key = (operator, tuple(sorted(self.meaning(each.node) for each in members)))
+                key = (operator, tuple(sorted(self.meaning(member.node) for member in members)))
             case Boolean(operator="xor" | "<->"):
                 key = (node.operator, tuple(sorted(map(self.meaning, node.operands))))
             case Boolean():
@@ -638,12 +654,14 @@ class _Comparison:
             return new.node
         old, new = old.bare, new.bare
         match old.node, new.node:
-            case Boolean(operator="and" | "or" as one), Boolean(operator=other) if one == other:
-                return self._matched(old.node, old.members(one), new.node, new.members(one))
-            case _, Boolean(operator="and" | "or" as one) if self._is_among(old, new.members(one)):
-                return self._matched(new.node, [old], new.node, new.members(one))
-            case Boolean(operator="and" | "or" as one), _ if self._is_among(new, old.members(one)):
-                return self._matched(old.node, old.members(one), old.node, [new])
+            case Boolean(operator="and" | "or" as operator), Boolean(operator=new_operator) if (
+                operator == new_operator
+            ):
+                return self._match(old.node, old.members(operator), new.node, new.members(operator))
+            case _, Boolean(operator="and" | "or" as operator) if self._is_among(old, new.members(operator)):
+                return self._match(new.node, [old], new.node, new.members(operator))
+            case Boolean(operator="and" | "or" as operator), _ if self._is_among(new, old.members(operator)):
+                return self._match(old.node, old.members(operator), old.node, [new])
             case Boolean(), Boolean() if old.node.operator == new.node.operator:
                 return Inner(None, old.node, new.node, self._pairwise(old, new))
             case Temporal(), Temporal() if old.node.operator == new.node.operator:
@@ -671,62 +689,66 @@ class _Comparison:
         def inside(place: Place | None, whole: Place) -> Place | None:
             return None if place is None else replace(place, id=whole.id)
 
-        parts = chain(*(each.parts or (each,) for each in inner))
-        return tuple(each._replace(old=inside(each.old, old), new=inside(each.new, new)) for each in parts)
+        parts = chain(*(site.parts or (site,) for site in inner))
+        return tuple(site._replace(old=inside(site.old, old), new=inside(site.new, new)) for site in parts)
 
-    def finished(self, merged: Merged, origins: Sequence[Origin]) -> TreeDiff:
+    def join_sites(self, merged: Merged, origins: Sequence[Origin]) -> TreeDiff:
         """Join the sites of one edit, wherever they occur, and return the edits."""
         declared = [origin for origin in origins if origin.change is not None]
         shared: list[tuple[set[int], list[int]]] = []
         rest: list[int] = []
         for number, site in enumerate(self.sites):
-            own = {index for index, origin in enumerate(declared) if site.follows_from(origin)}
-            if not own:
+            followed = {index for index, origin in enumerate(declared) if site.follows_from(origin)}
+            if not followed:
                 rest.append(number)
                 continue
             # declarations that share a node are edited together
-            joined = [each for each in shared if each[0] & own]
-            shared = [each for each in shared if not each[0] & own]
+            joined = [unit for unit in shared if unit[0] & followed]
+            shared = [unit for unit in shared if not unit[0] & followed]
             shared.append(
-                (own.union(*(each[0] for each in joined)), [*chain(*(each[1] for each in joined)), number])
+                (
+                    followed.union(*(unit[0] for unit in joined)),
+                    [*chain(*(unit[1] for unit in joined)), number],
+                )
             )
-        units = [(min(sites), sites, sorted(own)) for own, sites in shared]
-        joined_rest = self._joined([self.sites[number] for number in rest])
+        units = [(min(sites), sites, sorted(followed)) for followed, sites in shared]
+        joined_rest = self._join([self.sites[number] for number in rest])
         units += [(rest[sites[0]], [rest[number] for number in sites], []) for sites in joined_rest]
         units.sort()
         numbers = {site: unit for unit, (_, sites, _) in enumerate(units) for site in sites}
         text = [origin for origin in origins if origin.change is None]
         return TreeDiff(
             tuple(
-                tuple(self._unit(sites, [declared[index] for index in own], text)) for _, sites, own in units
+                tuple(self._unit(sites, [declared[index] for index in followed], text))
+                for _, sites, followed in units
             ),
             merged,
             numbers,
         )
 
-    def _joined(self, found: Sequence[FoundSite]) -> Iterable[list[int]]:
+    def _join(self, sites: Sequence[FoundSite]) -> Iterable[list[int]]:
         """Join places that follow from one edit of the text of the specs, by number."""
         removed, added = (
             {
                 self.meaning(place.node)
-                for each in found
-                for place in (each.old, each.new)
-                if place is not None and each.kind == kind
+                for site in sites
+                for place in (site.old, site.new)
+                if place is not None and site.kind == kind
             }
             for kind in ("removed", "added")
         )
         joined: dict[Hashable, list[int]] = {}
-        for number, each in enumerate(found):
-            places = each.old, each.new
+        for number, site in enumerate(sites):
+            places = site.old, site.new
             meanings = [None if place is None else self.meaning(place.node) for place in places]
-            known = {meaning for meaning in meanings if meaning is not None}
+            known_meanings = {meaning for meaning in meanings if meaning is not None}
             spans = tuple(None if place is None else place.node.span for place in places)
-            specs = self._specs_of(each.old, each.new)[:1]
-            key: Hashable = ("place", each.kind == "renamed", specs, *spans)
-            if each.kind in ("added", "removed") and known <= removed & added:
-                key = ("moved", *known)
+            specs = self._specs_of(site.old, site.new)[:1]
+            key: Hashable = ("place", site.kind == "renamed", specs, *spans)
+            if site.kind in ("added", "removed") and known_meanings <= removed & added:
+                key = ("moved", *known_meanings)
             elif Span(0, 0) in spans:
-                key = (each.kind, specs, *(_place_text(place, each.kind) for place in places), *meanings)
+                key = (site.kind, specs, *(_place_text(place, site.kind) for place in places), *meanings)
             joined.setdefault(key, []).append(number)
         return joined.values()
 
@@ -734,30 +756,30 @@ class _Comparison:
         """Return the specs that have the two places in their text, innermost first, by both names."""
         if old is None or new is None:
             return tuple((name, name) for place in (old, new) if place is not None for name in place.around)
-        pairs = [(one, other) for other in new.specs for one in old.specs]
+        pairs = [(old_name, new_name) for new_name in new.specs for old_name in old.specs]
         return tuple(pair for pair in pairs if pair[0] == pair[1] or pair in self._renamed)
 
     def _unit(
         self, sites: Sequence[int], declared: Sequence[Origin], text: Sequence[Origin]
     ) -> Iterator[Edit]:
         """Yield the edits that sites follow from together: of each declaration, and of the specs' text."""
-        found = [self.sites[site] for site in sites]
+        unit_sites = [self.sites[site] for site in sites]
         for origin in declared:
             if origin.change is not None:
-                edit = self._edit([each for each in found if each.follows_from(origin)])
+                edit = self._edit([site for site in unit_sites if site.follows_from(origin)])
                 yield replace(edit, kind=origin.change.kind, subject=origin.change.name, change=origin.change)
         if declared:
-            own = [each for each in found if any(each.follows_from(origin) for origin in text)]
+            text_sites = [site for site in unit_sites if any(site.follows_from(origin) for origin in text)]
         else:
-            own = list(chain(*(each.parts or (each,) for each in found)))
-        for numbers in self._joined(own):
-            yield self._edit([own[number] for number in numbers])
+            text_sites = list(chain(*(site.parts or (site,) for site in unit_sites)))
+        for numbers in self._join(text_sites):
+            yield self._edit([text_sites[number] for number in numbers])
 
-    def _edit(self, found: Sequence[FoundSite]) -> Edit:
-        olds = [each.old for each in found if each.old is not None]
-        news = [each.new for each in found if each.new is not None]
-        kinds = {each.kind for each in found}
-        kind: EditKind = "moved" if kinds == {"added", "removed"} else found[0].kind
+    def _edit(self, sites: Sequence[FoundSite]) -> Edit:
+        olds = [site.old for site in sites if site.old is not None]
+        news = [site.new for site in sites if site.new is not None]
+        kinds = {site.kind for site in sites}
+        kind: EditKind = "moved" if kinds == {"added", "removed"} else sites[0].kind
         first_old, first_new = next(iter(olds), None), next(iter(news), None)
         if kind == "moved":
             specs = self._specs_of(first_old, None), self._specs_of(None, first_new)
@@ -773,41 +795,44 @@ class _Comparison:
             None if first_old is None else first_old.node.span,
             None if first_new is None else first_new.node.span,
             max(place.depth for place in (*olds, *news)),
-            found[0].subject,
+            sites[0].subject,
             old_specs=specs[0],
             new_specs=specs[1],
         )
 
-    def _site(self, found: FoundSite) -> Site:
-        self.sites.append(found)
-        old, new = (None if place is None else place.node for place in (found.old, found.new))
+    def _site(self, site: FoundSite) -> Site:
+        self.sites.append(site)
+        old, new = (None if place is None else place.node for place in (site.old, site.new))
         return Site(len(self.sites) - 1, old, new)
 
     def _align_names(self, old: Place, new: Place) -> None:
         """Note the nodes within equal ones that have other names."""
-        for one, other in zip(old.operands, new.operands, strict=False):
-            if self.meaning(one.node) == self.meaning(other.node):
-                if one.node.name != other.node.name and None not in (one.node.name, other.node.name):
-                    self.sites.append(FoundSite("renamed", one, other))
-                self._align_names(one, other)
+        for old_operand, new_operand in zip(old.operands, new.operands, strict=False):
+            if self.meaning(old_operand.node) == self.meaning(new_operand.node):
+                if old_operand.node.name != new_operand.node.name and None not in (
+                    old_operand.node.name,
+                    new_operand.node.name,
+                ):
+                    self.sites.append(FoundSite("renamed", old_operand, new_operand))
+                self._align_names(old_operand, new_operand)
 
     def _pairwise(self, old: Place, new: Place) -> tuple[Merged, ...]:
         return tuple([self.align(*pair) for pair in zip(old.operands, new.operands, strict=True)])
 
     def _is_among(self, place: Place, operands: Sequence[Place]) -> bool:
-        return any(self.meaning(place.node) == self.meaning(each.node) for each in operands)
+        return any(self.meaning(place.node) == self.meaning(operand.node) for operand in operands)
 
-    def _matched(self, old_node: Any, olds: Sequence[Place], new_node: Any, news: Sequence[Place]) -> Inner:
+    def _match(self, old_node: Any, olds: Sequence[Place], new_node: Any, news: Sequence[Place]) -> Inner:
         """Match the operands of a conjunction or disjunction: equal ones, those of one name, similar ones."""
         partner: dict[int, int] = {}
-        taken: set[int] = set()
+        matched_indices: set[int] = set()
 
         def match(fits: Any) -> None:
             for number, new in enumerate(news):
                 for index, old in enumerate(olds if number not in partner else ()):
-                    if index not in taken and fits(old, new):
+                    if index not in matched_indices and fits(old, new):
                         partner[number] = index
-                        taken.add(index)
+                        matched_indices.add(index)
                         break
 
         match(lambda old, new: self.meaning(old.node) == self.meaning(new.node))
@@ -821,15 +846,17 @@ class _Comparison:
             else self._site(FoundSite("added", None, new))
             for number, new in enumerate(news)
         ]
-        left = [old for index, old in enumerate(olds) if index not in taken]
+        left = [old for index, old in enumerate(olds) if index not in matched_indices]
         operands += [self._site(FoundSite("removed", old, None)) for old in left]
         return Inner(None, old_node, new_node, tuple(operands))
 
 
 def _is_alike(old: Place, new: Place, least: float, *, by_operator: bool) -> bool:
     """Say whether two nodes are about the same, of one operator or of any."""
-    one, other = old.bare.node, new.bare.node
-    return (not by_operator or operator_of(one) == operator_of(other)) and similarity(one, other) >= least
+    old_node, new_node = old.bare.node, new.bare.node
+    return (not by_operator or operator_of(old_node) == operator_of(new_node)) and similarity(
+        old_node, new_node
+    ) >= least
 
 
 def _ranges_alike(old: Quantified, new: Quantified) -> bool:

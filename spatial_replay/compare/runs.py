@@ -113,15 +113,15 @@ def align_runs(
     a, b = times_ns
     if align == "time":
         return _alignment("time", None, [Knot(*zeros_ns)], a, b)
-    kind, colon, wanted = align.partition(":")
-    if kind != "progress" or (colon and not wanted):
+    kind, colon, name = align.partition(":")
+    if kind != "progress" or (colon and not name):
         return _alignment("event", align, [_event(results, align)], a, b)
-    if wanted:
-        results = _titled(results, wanted)
-    found: list[tuple[str, list[Knot]]] = []
-    for one, other in results:
-        require_ltlf(one.semantics, "the progress of an automaton")
-        paths = [_path(result, files) for result in (one, other)]
+    if name:
+        results = _find_pairs(results, name)
+    candidates: list[tuple[str, list[Knot]]] = []
+    for result_a, result_b in results:
+        require_ltlf(result_a.semantics, "the progress of an automaton")
+        paths = [_path(result, files) for result in (result_a, result_b)]
         if paths[0] is None or paths[1] is None:
             continue
         common = _common(paths[0], paths[1])
@@ -130,27 +130,27 @@ def align_runs(
         ]
         if common == len(paths[0]) == len(paths[1]):
             knots.append(Knot(int(a[-1]), int(b[-1])))
-        found.append((one.title, knots))
-    if not found:
+        candidates.append((result_a.title, knots))
+    if not candidates:
         raise UsageError(
-            f"{wanted + ' has no' if wanted else 'no spec has an'} automaton to align by (past operators and "
+            f"{name + ' has no' if name else 'no spec has an'} automaton to align by (past operators and "
             "bounds in seconds have none); align by time, or by a spec's name"
         )
     # without temporal operators, an automaton ends where it begins
-    name, knots = max(found, key=lambda each: len(each[1]))
+    name, knots = max(candidates, key=lambda candidate: len(candidate[1]))
     return _alignment("progress", name, knots, a, b)
 
 
-def _titled(
+def _find_pairs(
     results: Sequence[tuple[SpecResult, SpecResult]], wanted: str
 ) -> list[tuple[SpecResult, SpecResult]]:
     """Return the pair of results of a name or title."""
-    found = [pair for pair in results if wanted in (pair[0].title, pair[0].name)]
-    if not found:
-        titles = [one.title for one, _ in results]
+    pairs = [pair for pair in results if wanted in (pair[0].title, pair[0].name)]
+    if not pairs:
+        titles = [result.title for result, _ in results]
         hint = nearest_hint(wanted, titles) or f"there are {', '.join(titles) or 'none'}"
         raise UsageError(f"no result is named {wanted!r} to align by the progress of; {hint}")
-    return found
+    return pairs
 
 
 def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification]) -> Parting | None:
@@ -177,7 +177,7 @@ def _alignment(
     for knot in knots[1:]:
         if knot.a_ns > increasing[-1].a_ns and knot.b_ns > increasing[-1].b_ns:
             increasing.append(knot)
-    beside_ns = _mapped(a_ns, increasing)
+    beside_ns = _times_beside(a_ns, increasing)
     after = np.clip(np.searchsorted(b_ns, beside_ns), 1, max(len(b_ns) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(b_ns) - 1)
@@ -191,7 +191,7 @@ def _alignment(
     return Alignment(kind, about, tuple(increasing), inside, nearest[inside])
 
 
-def _mapped(a_ns: Integers, knots: Sequence[Knot]) -> Integers:
+def _times_beside(a_ns: Integers, knots: Sequence[Knot]) -> Integers:
     """Return the times in B that stand beside times in A."""
     first, last = knots[0], knots[-1]
     # relative to the first knot, so that doubles hold every nanosecond of a long log
@@ -205,13 +205,13 @@ def _mapped(a_ns: Integers, knots: Sequence[Knot]) -> Integers:
 def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
     """Return the times at which the value of a named spec first changes its sign in each run."""
     names: list[str] = []
-    for one, other in results:
-        names += [node.name for node in one.nodes if node.name is not None]
+    for result_a, result_b in results:
+        names += [node.name for node in result_a.nodes if node.name is not None]
         if name not in names:
             continue
         # the value of a spec without temporal operators is that of the first sample, and stays
         pairs = [
-            [_first_change(result.times_ns, series(result.node(name))) for result in (one, other)]
+            [_first_change(result.times_ns, series(result.node(name))) for result in (result_a, result_b)]
             for series in (attrgetter("value"), attrgetter("now"))
         ]
         times = next((pair for pair in pairs if None not in pair), pairs[0])
@@ -222,15 +222,15 @@ def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
                     "align by time, or by another spec"
                 )
         return Knot(*(time_ns for time_ns in times if time_ns is not None))
-    known = nearest_hint(name, names) or f"there are {', '.join(dict.fromkeys(names)) or 'none'}"
-    raise UsageError(f"no spec is named {name!r} to align by; {known}; or give time or progress")
+    remedy = nearest_hint(name, names) or f"there are {', '.join(dict.fromkeys(names)) or 'none'}"
+    raise UsageError(f"no spec is named {name!r} to align by; {remedy}; or give time or progress")
 
 
 def _first_change(times_ns: Integers, values: Floats) -> int | None:
-    known = np.flatnonzero(~np.isnan(values))
-    holds = values[known] >= 0.0
-    turned = np.flatnonzero(holds != holds[0]) if len(known) else known
-    return int(times_ns[known[turned[0]]]) if len(turned) else None
+    known_places = np.flatnonzero(~np.isnan(values))
+    holds = values[known_places] >= 0.0
+    turned = np.flatnonzero(holds != holds[0]) if len(known_places) else known_places
+    return int(times_ns[known_places[turned[0]]]) if len(turned) else None
 
 
 class _Visit(NamedTuple):
@@ -265,7 +265,7 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
 def file_of(files: Sequence[Specification], result: SpecResult) -> Specification | None:
     """Return the file that a result comes from; None if it is another one."""
     as_evaluated = [with_numbers(file, result.evidence.units) for file in files]
-    pairs = [(file, each.formula) for file in as_evaluated for each in file.specs]
+    pairs = [(file, spec.formula) for file in as_evaluated for spec in file.specs]
     same = (file for file, formula in pairs if formula is result.formula)
     # one that was parsed by another profile is evaluated as it is logged: equal, and another object
     equal = (file for file, formula in pairs if formula == result.formula)
@@ -334,15 +334,18 @@ def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDif
     times_ns = a.times_ns[alignment.a]
     diffs = []
     for name in sorted(set(a.signals) & set(b.signals)):
-        one, other = a.signals[name][alignment.a], b.signals[name][alignment.b]
-        differs = (one != other) & ~(np.isnan(one) & np.isnan(other))
+        values_a, values_b = a.signals[name][alignment.a], b.signals[name][alignment.b]
+        differs = (values_a != values_b) & ~(np.isnan(values_a) & np.isnan(values_b))
         if not differs.any():
             continue
         # texts are not apart by an amount
-        known = np.flatnonzero((one > TEXTS) & (other > TEXTS))
-        apart = np.abs(other - one)
-        farthest = int(known[apart[known].argmax()]) if len(known) else None
-        sizes = [float(np.median(np.abs(each[known]))) if len(known) else 0.0 for each in (one, other)]
+        numeric = np.flatnonzero((values_a > TEXTS) & (values_b > TEXTS))
+        apart = np.abs(values_b - values_a)
+        farthest = int(numeric[apart[numeric].argmax()]) if len(numeric) else None
+        sizes = [
+            float(np.median(np.abs(values[numeric]))) if len(numeric) else 0.0
+            for values in (values_a, values_b)
+        ]
         diffs.append(
             SignalDiff(
                 name,
@@ -370,22 +373,26 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
         )
     require_same_units(a, b)
     # (P, K) observations
-    one, other = (
+    rows_a, rows_b = (
         trace.rows[rows][:, [trace.names.index(name) for name in names]]
         for trace, rows in ((a, alignment.a), (b, alignment.b))
     )
-    in_both = np.flatnonzero((one >= 0) & (other >= 0))
-    moved, shift, distances = np.zeros(one.shape, np.bool_), np.zeros(one.shape), np.full(one.shape, np.nan)
+    in_both = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
+    moved, shift, distances = (
+        np.zeros(rows_a.shape, np.bool_),
+        np.zeros(rows_a.shape),
+        np.full(rows_a.shape, np.nan),
+    )
     for start in range(0, len(in_both), _PAIRS_AT_ONCE):
         places = in_both[start : start + _PAIRS_AT_ONCE]
-        found = _object_diff(a, one.flat[places], b, other.flat[places])
-        for values, part in zip((moved, shift, distances), found, strict=True):
+        differences = _object_diff(a, rows_a.flat[places], b, rows_b.flat[places])
+        for values, part in zip((moved, shift, distances), differences, strict=True):
             values.flat[places] = part
     times_ns = a.times_ns[alignment.a]
-    only = (one >= 0) & (other < 0), (other >= 0) & (one < 0)
+    only = (rows_a >= 0) & (rows_b < 0), (rows_b >= 0) & (rows_a < 0)
     diffs = []
     for number, name in enumerate(names):
-        only_a, only_b = (each[:, number] for each in only)
+        only_a, only_b = (absent[:, number] for absent in only)
         differs = moved[:, number] | only_a | only_b
         if not differs.any():
             continue
@@ -405,7 +412,7 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
             )
         )
     never = int(a.times_ns[-1]) + 1
-    diffs.sort(key=lambda each: (each.apart_ns or never, -each.greatest_shift, each.first_ns, each.name))
+    diffs.sort(key=lambda diff: (diff.apart_ns or never, -diff.greatest_shift, diff.first_ns, diff.name))
     return tuple(diffs)
 
 
@@ -434,9 +441,11 @@ def _object_diff(a: Trace, one: Integers, b: Trace, other: Integers) -> tuple[Bo
 
 def _are_equal(one: FootprintBatch, other: FootprintBatch) -> Booleans:
     """Return which rows have the same parts."""
-    sizes = [(np.diff(each.part_start), np.diff(each.vertex_start[each.part_start])) for each in (one, other)]
+    sizes = [
+        (np.diff(batch.part_start), np.diff(batch.vertex_start[batch.part_start])) for batch in (one, other)
+    ]
     alike = (sizes[0][0] == sizes[1][0]) & (sizes[0][1] == sizes[1][1])
-    one, other = (each.select(np.flatnonzero(alike)) for each in (one, other))
+    one, other = (batch.select(np.flatnonzero(alike)) for batch in (one, other))
     parts = (np.diff(one.vertex_start) != np.diff(other.vertex_start)) | (one.radius != other.radius)
     vertices = (one.vertices != other.vertices).any(axis=1)
     unequal = count_in_rows(parts, one.part_start)
@@ -449,33 +458,33 @@ def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
     """Return the mean of each row's vertices, (2, R), relative to a point of its own."""
     counts = np.diff(batch.vertex_start[batch.part_start])
     rows = np.repeat(np.arange(len(batch)), counts)
-    sums = [np.bincount(rows, each, len(batch)) for each in (batch.vertices - origin[rows]).T]
+    sums = [np.bincount(rows, coordinates, len(batch)) for coordinates in (batch.vertices - origin[rows]).T]
     return np.stack(sums) / counts
 
 
-def _movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
+def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when an object moved differently, and how far the two are apart."""
-    parts: list[str | Instant] = [f"{each.name}: differs since ", Instant(each.first_ns, start_ns)]
-    if each.greatest_shift:
-        parts.append(f", by up to {with_unit(each.greatest_shift, unit)}")
-    if each.apart_ns is not None:
-        farthest = with_unit(each.greatest_distance, unit)
-        parts += ["; apart from itself since ", Instant(each.apart_ns, start_ns)]
-        parts += [f", farthest by {farthest} at ", Instant(each.greatest_ns, start_ns)]
-    for which, count in (("A", each.samples_only_in_a), ("B", each.samples_only_in_b)):
+    parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
+    if diff.greatest_shift:
+        parts.append(f", by up to {with_unit(diff.greatest_shift, unit)}")
+    if diff.apart_ns is not None:
+        farthest = with_unit(diff.greatest_distance, unit)
+        parts += ["; apart from itself since ", Instant(diff.apart_ns, start_ns)]
+        parts += [f", farthest by {farthest} at ", Instant(diff.greatest_ns, start_ns)]
+    for which, count in (("A", diff.samples_only_in_a), ("B", diff.samples_only_in_b)):
         if count:
             parts.append(f"; only {which} has it in {counted(count, 'sample')}")
     return Sentence(*parts)
 
 
-def _signal_sentence(each: SignalDiff, start_ns: int, unit: str) -> Sentence:
+def _signal_sentence(diff: SignalDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when a signal has other values, by how much, and whether its unit may be another."""
-    parts: list[str | Instant] = [f"{each.name}: differs since ", Instant(each.first_ns, start_ns)]
-    greatest = each.greatest_difference
+    parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
+    greatest = diff.greatest_difference
     if greatest > 0.0 and not names_from_unit(unit):
-        parts += [f", by up to {with_unit(greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
-    if each.has_other_unit:
-        times, which = (each.ratio, "B") if each.ratio > 1.0 else (1.0 / each.ratio, "A")
+        parts += [f", by up to {with_unit(greatest, unit)} at ", Instant(diff.greatest_ns, start_ns)]
+    if diff.has_other_unit:
+        times, which = (diff.ratio, "B") if diff.ratio > 1.0 else (1.0 / diff.ratio, "A")
         parts.append(f"; {times:,.0f} times as large in {which}: it may be in another unit there")
     return Sentence(*parts)
 
@@ -518,9 +527,9 @@ class RunSpecDiff:
             where = self.parting
             yield Sentence(
                 "they part in the automaton: ",
-                *_entered(where.a_ns, where.a_states, zeros_ns[0]),
+                *_entry_parts(where.a_ns, where.a_states, zeros_ns[0]),
                 " | ",
-                *_entered(where.b_ns, where.b_states, zeros_ns[1]),
+                *_entry_parts(where.b_ns, where.b_states, zeros_ns[1]),
             )
         for node in self.nodes:
             yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
@@ -529,7 +538,7 @@ class RunSpecDiff:
                 reason = cause_reason(result.causes[0], start_ns)
                 yield Sentence(f"{which}: ", *reason.parts)
         if self.moved:
-            names = ", ".join(each.name for each in self.moved)
+            names = ", ".join(diff.name for diff in self.moved)
             yield Sentence(f"of what it is about, these moved differently: {names}")
 
     @property
@@ -544,7 +553,7 @@ class RunSpecDiff:
             "first_ns": self.first_ns,
             "nodes": [{"id": node, "text": self.a.nodes[node].text} for node in self.nodes],
             "parting": json_value(self.parting),
-            "moved": [each.name for each in self.moved],
+            "moved": [diff.name for diff in self.moved],
         }
 
 
@@ -561,8 +570,8 @@ def compare_results(
     Args:
         objects: those that moved differently.
     """
-    moved = {each.name: each for each in objects}
-    nodes = _deepest_flipped(one, other)
+    moved = {diff.name: diff for diff in objects}
+    nodes = _deepest_flips(one, other)
     if not nodes and one.can_explain and one.robustness != other.robustness:
         nodes = (one.deciding_node(),)
     names = [name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved]
@@ -576,7 +585,7 @@ def compare_results(
     )
 
 
-def _deepest_flipped(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
+def _deepest_flips(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
     """Return the nodes with other verdicts that have no such node below."""
     flipped = {
         node.id
@@ -609,15 +618,15 @@ def _first_sign(
 ) -> int | None:
     """Return the first sample with a value of another sign than the one beside it."""
     signs = []
-    for result, trace, chosen in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
+    for result, trace, samples in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
         value = np.full(len(trace), np.nan)
         value[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
-        signs.append(np.where(np.isnan(value), 0, np.where(value >= 0.0, 1, -1))[chosen])
+        signs.append(np.where(np.isnan(value), 0, np.where(value >= 0.0, 1, -1))[samples])
     differs = signs[0] != signs[1]
     return int(traces[0].times_ns[alignment.a[differs.argmax()]]) if differs.any() else None
 
 
-def _entered(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple[str | Instant, ...]:
+def _entry_parts(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple[str | Instant, ...]:
     if time_ns is None:
         return ("the end of the run",)
     return f"state {', '.join(map(str, states))} at ", Instant(time_ns, start_ns)
@@ -653,14 +662,14 @@ def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
     decisions: list[tuple[PlanDecision, ...]] = []
     for source in sources:
         path = source.path
-        found: tuple[PlanDecision, ...] = ()
+        decisions_of_source: tuple[PlanDecision, ...] = ()
         if isinstance(path, Path) and source.kind == "MCAP":
             with suppress(UsageError):
-                found = read_decisions(path).decisions
-        decisions.append(found)
+                decisions_of_source = read_decisions(path).decisions
+        decisions.append(decisions_of_source)
     for number in range(max(map(len, decisions))):
-        pair = [own[number] if number < len(own) else None for own in decisions]
-        if _compared(pair[0]) != _compared(pair[1]):
+        pair = [of_source[number] if number < len(of_source) else None for of_source in decisions]
+        if _bytes_to_compare(pair[0]) != _bytes_to_compare(pair[1]):
             hashes = [_map_hashes(decision) for decision in pair]
             maps = sorted(
                 name for name in hashes[0].keys() & hashes[1].keys() if hashes[0][name] != hashes[1][name]
@@ -671,7 +680,7 @@ def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
     return None
 
 
-def _compared(decision: PlanDecision | None) -> bytes | None:
+def _bytes_to_compare(decision: PlanDecision | None) -> bytes | None:
     """Return what of a decision counts: what is to be done and why, not when it was made or how it went."""
     if decision is None:
         return None
@@ -748,13 +757,13 @@ class LogDiff(Printed, Displayed):
     def movements(self) -> list[Sentence]:
         """Sentences on `objects`."""
         unit = self.traces[0].units.get("", "")
-        return [_movement_sentence(each, self.zeros_ns[0], unit) for each in self.objects]
+        return [_movement_sentence(diff, self.zeros_ns[0], unit) for diff in self.objects]
 
     @property
     def signal_changes(self) -> list[Sentence]:
         """Sentences on `signals`."""
         units = self.traces[0].units
-        return [_signal_sentence(each, self.zeros_ns[0], units.get(each.name, "")) for each in self.signals]
+        return [_signal_sentence(diff, self.zeros_ns[0], units.get(diff.name, "")) for diff in self.signals]
 
     def lines(self) -> Iterator[str]:
         """Yield the diff as text, as the command `diff` prints it."""
@@ -801,7 +810,7 @@ class LogDiff(Printed, Displayed):
             "signals": json_value(self.signals),
             "only_a": list(self.only_a),
             "only_b": list(self.only_b),
-            "specifications": [each.document for each in self.specs],
+            "specifications": [diff.document for diff in self.specs],
             "decision": json_value(self.decision),
         }
 
@@ -832,17 +841,17 @@ def diff_sources(
         SpecificationError: names that a log never has, if names are strict.
     """
     selections = [
-        Selection(source, tuple(files), replace(each, keep=()))
-        for source, each in zip(sources, options, strict=True)
+        Selection(source, tuple(files), replace(reading, keep=()))
+        for source, reading in zip(sources, options, strict=True)
     ]
     checked = [selection.checked_trace(advance) for selection in selections]
     (a, b), zeros_ns = [read.trace for read in checked], (checked[0].zero_ns, checked[1].zero_ns)
     pairs = zip((a, b), options, strict=True)
-    evaluations = [[evaluate_with(own, file, trace) for file in files] for trace, own in pairs]
-    results = _paired(evaluations)
+    evaluations = [[evaluate_with(reading, file, trace) for file in files] for trace, reading in pairs]
+    results = _pair_results(evaluations)
     alignment = align_runs((a.times_ns, b.times_ns), zeros_ns, results, files, align)
     objects = compare_objects(a, b, alignment)
-    titles = [{result.title for evaluation in own for result in evaluation} for own in evaluations]
+    titles = [{result.title for evaluation in of_log for result in evaluation} for of_log in evaluations]
     return LogDiff(
         sources[0].name,
         sources[1].name,
@@ -853,7 +862,10 @@ def diff_sources(
         compare_signals(a, b, alignment),
         _only_in(a, b, titles[0] - titles[1]),
         _only_in(b, a, titles[1] - titles[0]),
-        tuple(compare_results(one, other, alignment, (a, b), objects, files) for one, other in results),
+        tuple(
+            compare_results(result_a, result_b, alignment, (a, b), objects, files)
+            for result_a, result_b in results
+        ),
         compare_decisions(sources),
         not objects and a == b,
         tuple(text for read in checked for text in counted_from(read.trace.faults, read.zero_ns)),
@@ -872,9 +884,9 @@ def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:
     return (*names, *sorted(titles))
 
 
-def _paired(evaluations: Sequence[Sequence[Evaluation]]) -> list[tuple[SpecResult, SpecResult]]:
+def _pair_results(evaluations: Sequence[Sequence[Evaluation]]) -> list[tuple[SpecResult, SpecResult]]:
     pairs = []
-    for one, other in zip(*evaluations, strict=True):
-        named = {result.title: result for result in other}
-        pairs += [(result, named[result.title]) for result in one if result.title in named]
+    for evaluation_a, evaluation_b in zip(*evaluations, strict=True):
+        named = {result.title: result for result in evaluation_b}
+        pairs += [(result, named[result.title]) for result in evaluation_a if result.title in named]
     return pairs

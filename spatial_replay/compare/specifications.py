@@ -79,24 +79,24 @@ class EditOutcomes:
         self._times_ns = one.times_ns
         self._semantics = one.semantics
         self._rows: dict[Atom | Quantified, Floats] = {}
-        blocks = [(each, each.leaves) for each in (one, other) if each.leaves is not None]
+        blocks = [(result, result.leaves) for result in (one, other) if result.leaves is not None]
         channels = max((len(leaves) for _, leaves in blocks), default=0)
-        for each, leaves in blocks:
+        for result, leaves in blocks:
             columns = in_channels(leaves, channels)
-            for index, leaf in enumerate(each.evidence.instance.program.leaves):
+            for index, leaf in enumerate(result.evidence.instance.program.leaves):
                 self._rows[leaf] = columns[:, index]
         self._known: dict[frozenset[int], EditOutcome] = {}
         self.count = 0
 
     def __call__(self, units: Sequence[int]) -> EditOutcome:
         """Return the outcome of the old formula with only these units of edits made."""
-        chosen = frozenset(units)
-        if chosen not in self._known:
+        edited_units = frozenset(units)
+        if edited_units not in self._known:
             self.count += 1
-            self._known[chosen] = self._evaluated(self._diff.formula(chosen))
-        return self._known[chosen]
+            self._known[edited_units] = self._evaluate(self._diff.formula(edited_units))
+        return self._known[edited_units]
 
-    def _evaluated(self, formula: Formula) -> EditOutcome:
+    def _evaluate(self, formula: Formula) -> EditOutcome:
         leaves = new_leaves(formula, ())
         shape = next(iter(self._rows.values())).shape if self._rows else (1, len(self._times_ns))
         rows = [self._rows[leaf] for leaf in leaves]
@@ -106,9 +106,9 @@ class EditOutcomes:
             run.extend(columns, self._times_ns)
             value = float(run.final[0, 0])
             return EditOutcome(final_verdict(value, value), value, value, value)
-        done = evaluate_offline(formula, leaves, columns, self._times_ns)
-        lower, upper = done.interval(0)
-        least, greatest = done.interval(0, wide=False)
+        evaluation = evaluate_offline(formula, leaves, columns, self._times_ns)
+        lower, upper = evaluation.interval(0)
+        least, greatest = evaluation.interval(0, wide=False)
         return EditOutcome(
             final_verdict(lower, upper), least if least == greatest else math.nan, lower, upper
         )
@@ -144,10 +144,10 @@ def find_cause(
     for number in units:
         if suffices((number,)):
             return (number,)
-    return tuple(minimised(units, suffices))
+    return tuple(minimise(units, suffices))
 
 
-def minimised(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
+def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
     """Return some of the parts for which a condition, which holds for all of them, still holds.
 
     None of these can be left out alone (delta debugging: larger pieces are left out first).
@@ -219,12 +219,12 @@ class SpecDiff(Displayed):
         """The first sample with another value; None if there is none."""
         if self.old.times_ns.shape != self.new.times_ns.shape:
             return None
-        one, other = self.old.series[0, 0], self.new.series[0, 0]
-        differs = np.flatnonzero((one != other) & ~(np.isnan(one) & np.isnan(other)))
+        old_values, new_values = self.old.series[0, 0], self.new.series[0, 0]
+        differs = np.flatnonzero((old_values != new_values) & ~(np.isnan(old_values) & np.isnan(new_values)))
         if not len(differs):
             return None
         at = int(differs[0])
-        return FirstDifference(int(self.old.times_ns[at]), float(one[at]), float(other[at]))
+        return FirstDifference(int(self.old.times_ns[at]), float(old_values[at]), float(new_values[at]))
 
     @property
     def title(self) -> str:
@@ -269,7 +269,8 @@ class SpecDiff(Displayed):
         """Say how the edits of a cause bring it about, if there are several."""
         new = EditOutcome.of(self.new)
         enough = sum(
-            each is not None and each.same_as(new, verdict_only=self.is_flipped) for each in self.alone
+            outcome is not None and outcome.same_as(new, verdict_only=self.is_flipped)
+            for outcome in self.alone
         )
         count, what = len(self.cause), "verdict" if self.is_flipped else "robustness"
         if not enough:
@@ -365,8 +366,8 @@ class SpecificationDiff(Printed, Displayed):
     @property
     def is_empty(self) -> bool:
         """Whether nothing differs: no formula, new names aside, no verdict, no number."""
-        is_edited = any(edit.kind != "renamed" for each in self.specs for edit in each.edits)
-        return not (self.removed or self.added or is_edited or any(each.is_different for each in self.specs))
+        is_edited = any(edit.kind != "renamed" for spec in self.specs for edit in spec.edits)
+        return not (self.removed or self.added or is_edited or any(spec.is_different for spec in self.specs))
 
     def spec(self, name: str) -> SpecDiff:
         """Return the first diff of a spec, by its new name.
@@ -374,24 +375,24 @@ class SpecificationDiff(Printed, Displayed):
         Raises:
             UsageError: no such spec.
         """
-        for each in self.specs:
-            if each.name == name:
-                return each
-        names = [each.name for each in self.specs]
+        for spec in self.specs:
+            if spec.name == name:
+                return spec
+        names = [spec.name for spec in self.specs]
         raise UsageError(f"no spec {name!r} to compare; {nearest_hint(name, names) or ', '.join(names)}")
 
     def lines(self) -> Iterator[str]:
         """Yield the diff as text, as the command `diff` prints it."""
         yield f"{self.log}: {counted(self.samples, 'sample')}; {self.old.filename} → {self.new.filename}"
         same = 0
-        shown: set[DeclarationChange] = set()
-        for each in self.specs:
-            if not each.edits and not each.is_different:
+        printed_changes: set[DeclarationChange] = set()
+        for spec in self.specs:
+            if not spec.edits and not spec.is_different:
                 same += 1
                 continue
-            first, *rest = each.sentences(self.first_ns, shown)
-            shown.update(edit.change for edit in each.edits if edit.change is not None)
-            yield f"  {each.title}: {first}"
+            first, *rest = spec.sentences(self.first_ns, printed_changes)
+            printed_changes.update(edit.change for edit in spec.edits if edit.change is not None)
+            yield f"  {spec.title}: {first}"
             yield from (f"    {sentence}" for sentence in rest)
         for names, where in ((self.removed, self.old), (self.added, self.new)):
             for name in names:
@@ -412,7 +413,7 @@ class SpecificationDiff(Printed, Displayed):
             "same": self.is_empty,
             "old": self.old.filename,
             "new": self.new.filename,
-            "specifications": [each.document for each in self.specs],
+            "specifications": [spec.document for spec in self.specs],
             "removed": list(self.removed),
             "added": list(self.added),
         }
@@ -444,33 +445,40 @@ def diff_over_source(
     trace, missing, zero_ns = selection.checked_trace(advance)
     versions = TextVersions(old, new, trace.units)
     old, new = versions.old, versions.new
-    pairs, removed, added = _paired(old, new)
-    formulas, regions = unify_regions([one.formula for one, _ in pairs], old.regions, new.regions)
-    olds = [replace(one, formula=formula) for (one, _), formula in zip(pairs, formulas, strict=True)]
-    news = [other for _, other in pairs]
+    pairs, removed, added = _pair_specs(old, new)
+    formulas, regions = unify_regions([old_spec.formula for old_spec, _ in pairs], old.regions, new.regions)
+    olds = [
+        replace(old_spec, formula=formula) for (old_spec, _), formula in zip(pairs, formulas, strict=True)
+    ]
+    news = [new_spec for _, new_spec in pairs]
 
-    def evaluated(
+    def evaluate_version(
         specs: Sequence[NamedSpec], file: Specification, shapes: Mapping[str, Outline] = regions
     ) -> Evaluation:
         results = tuple(replace(spec, is_result=True) for spec in specs)
         version = Specification(results, file.profile, dict(shapes), filename=file.filename)
         return evaluate_with(options, version, trace)
 
-    before, after = evaluated(olds, old), evaluated(news, new)
+    before, after = evaluate_version(olds, old), evaluate_version(news, new)
     spec_names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
-        id(other.formula): compare_trees(
-            one.formula, other.formula, other.name, regions, tuple(_origins(versions, *pair)), spec_names
+        id(new_spec.formula): compare_trees(
+            old_spec.formula,
+            new_spec.formula,
+            new_spec.name,
+            regions,
+            tuple(_origins(versions, *pair)),
+            spec_names,
         )
-        for one, other, pair in zip(olds, news, pairs, strict=True)
+        for old_spec, new_spec, pair in zip(olds, news, pairs, strict=True)
     }
 
     @cache
     def by_version(changes: frozenset[int], name: str, *, is_undone: bool) -> Evaluation | None:
         """Evaluate a spec of the new text with declarations undone, or of the old one with some edited."""
         file = versions.version(changes, is_undone=is_undone)
-        spec = _spec_named(file, name)
-        return None if file is None or spec is None else evaluated([spec], file, file.regions)
+        spec = _find_spec(file, name)
+        return None if file is None or spec is None else evaluate_version([spec], file, file.regions)
 
     return SpecificationDiff(
         source.name,
@@ -479,8 +487,8 @@ def diff_over_source(
         old,
         new,
         tuple(
-            _spec_diff(one, other, trees[id(other.formula)], versions, by_version)
-            for one, other in zip(before.results, after.results, strict=True)
+            _spec_diff(old_result, new_result, trees[id(new_result.formula)], versions, by_version)
+            for old_result, new_result in zip(before.results, after.results, strict=True)
         ),
         removed,
         added,
@@ -503,7 +511,7 @@ def evaluate_with(options: ReplayOptions, file: Specification, trace: Trace) -> 
     )
 
 
-def _paired(
+def _pair_specs(
     old: Specification, new: Specification
 ) -> tuple[list[tuple[NamedSpec, NamedSpec]], tuple[str, ...], tuple[str, ...]]:
     """Return the specs that are results in either file, in pairs, and the results without a counterpart."""
@@ -515,16 +523,16 @@ def _paired(
     ]
     removed = [spec for spec in old.results if spec.name not in news]
     added = [spec for spec in new.results if spec.name not in olds]
-    for other in tuple(added):
-        for one in removed:
-            (formula,), regions = unify_regions([one.formula], old.regions, new.regions)
+    for new_spec in tuple(added):
+        for old_spec in removed:
+            (formula,), regions = unify_regions([old_spec.formula], old.regions, new.regions)
             if (
-                one.parameter == other.parameter
-                and not compare_trees(formula, other.formula, other.name, regions).effective
+                old_spec.parameter == new_spec.parameter
+                and not compare_trees(formula, new_spec.formula, new_spec.name, regions).effective
             ):
-                pairs.append((one, other))
-                removed.remove(one)
-                added.remove(other)
+                pairs.append((old_spec, new_spec))
+                removed.remove(old_spec)
+                added.remove(new_spec)
                 break
     if not pairs:
         names = [f"{file.filename} has {', '.join(spec.name for spec in file.specs)}" for file in (old, new)]
@@ -532,11 +540,11 @@ def _paired(
             f"{old.filename} and {new.filename} have no spec in common: {'; '.join(names)}. "
             "Give what is to be compared one name"
         )
-    for one, other in pairs:
-        if one.parameter != other.parameter:
+    for old_spec, new_spec in pairs:
+        if old_spec.parameter != new_spec.parameter:
             raise UsageError(
-                f"{other.name} has the parameter {one.parameter or 'none'} in {old.filename} and "
-                f"{other.parameter or 'none'} in {new.filename}; give both the same"
+                f"{new_spec.name} has the parameter {old_spec.parameter or 'none'} in {old.filename} and "
+                f"{new_spec.parameter or 'none'} in {new.filename}; give both the same"
             )
     return pairs, tuple(spec.name for spec in removed), tuple(spec.name for spec in added)
 
@@ -545,35 +553,35 @@ def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterat
     """Yield which nodes of a spec follow from each declaration, and which from the text of the specs."""
     old, new = versions.old, versions.new
     for number, change in enumerate(versions.changes):
-        applied, undone = (versions.version({number}, is_undone=each) for each in (False, True))
+        applied, undone = (versions.version({number}, is_undone=is_undone) for is_undone in (False, True))
         yield Origin(
             change,
-            _changed(old, one, applied, one.name) or frozenset(),
-            _changed(new, other, undone, other.name) or frozenset(),
+            _changes(old, one, applied, one.name) or frozenset(),
+            _changes(new, other, undone, other.name) or frozenset(),
         )
     if versions.changes:
         every = range(len(versions.changes))
         nodes = (
-            _changed(old, one, versions.version(every, is_undone=True), other.name),
-            _changed(new, other, versions.version(every, is_undone=False), one.name),
+            _changes(old, one, versions.version(every, is_undone=True), other.name),
+            _changes(new, other, versions.version(every, is_undone=False), one.name),
         )
         # where the two cannot be distinguished, every node may follow from the text
         all_nodes = frozenset(range(MAX_SIZE))
-        yield Origin(None, *(all_nodes if each is None else each for each in nodes))
+        yield Origin(None, *(all_nodes if changed is None else changed for changed in nodes))
 
 
-def _changed(
+def _changes(
     file: Specification, spec: NamedSpec, version: Specification | None, name: str
 ) -> frozenset[int] | None:
     """Return the nodes of a spec that another version of its text does not have; None without a version."""
-    other = _spec_named(version, name)
-    if version is None or other is None:
+    counterpart = _find_spec(version, name)
+    if version is None or counterpart is None:
         return None
-    (formula,), regions = unify_regions([other.formula], version.regions, file.regions)
+    (formula,), regions = unify_regions([counterpart.formula], version.regions, file.regions)
     return changed_nodes(formula, spec.formula, regions)
 
 
-def _spec_named(file: Specification | None, name: str) -> NamedSpec | None:
+def _find_spec(file: Specification | None, name: str) -> NamedSpec | None:
     return None if file is None else next((spec for spec in file.specs if spec.name == name), None)
 
 
@@ -593,26 +601,32 @@ def _spec_diff(
         changes: Sequence[int] = range(len(versions.changes))
         if edit.change is not None:
             changes = (versions.changes.index(edit.change),)
-        elif sum(each.change is None and each.kind != "renamed" for each in tree.edits) > 1:
+        elif sum(other_edit.change is None and other_edit.kind != "renamed" for other_edit in tree.edits) > 1:
             return None
         else:
             # the only edit of the specs' text: the new one with all declarations undone has only this
             is_undone = not is_undone
-        found = by_version(frozenset(changes), other.name if is_undone else one.name, is_undone=is_undone)
-        results = () if found is None else found.results
-        return next((EditOutcome.of(each) for each in results if each.object == one.object), None)
+        evaluation = by_version(
+            frozenset(changes), other.name if is_undone else one.name, is_undone=is_undone
+        )
+        results = () if evaluation is None else evaluation.results
+        return next((EditOutcome.of(result) for result in results if result.object == one.object), None)
 
     def suffices(edit: Edit) -> bool:
         verdict_only = before.verdict is not after.verdict
-        found = (with_edit(edit, is_undone=False), after), (with_edit(edit, is_undone=True), before)
+        outcomes_and_goals = (
+            (with_edit(edit, is_undone=False), after),
+            (with_edit(edit, is_undone=True), before),
+        )
         return all(
-            each is not None and each.same_as(wanted, verdict_only=verdict_only) for each, wanted in found
+            outcome is not None and outcome.same_as(goal, verdict_only=verdict_only)
+            for outcome, goal in outcomes_and_goals
         )
 
     cause = [(edit, unit) for unit in units for edit in tree.units[unit]]
     if len(units) == 1 and len(cause) > 1:
         # edits that share a node: one of them may do
-        cause = next(([each] for each in cause if suffices(each[0])), cause)
+        cause = next(([pair] for pair in cause if suffices(pair[0])), cause)
     alone = [
         outcomes((unit,)) if len(tree.units[unit]) == 1 else with_edit(edit, is_undone=False)
         for edit, unit in cause
@@ -633,7 +647,7 @@ def _places(
     edits: Sequence[Edit], versions: TextVersions
 ) -> tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]]:
     """Return where each edit is in the two texts: the declaration, or a line of a spec, that changed."""
-    found: tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]] = {}, {}
+    places_by_edit: tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]] = {}, {}
     for edit in edits:
         spans = edit.old_span, edit.new_span
         if edit.change is not None:
@@ -643,7 +657,7 @@ def _places(
                 versions.edited_lines(edit.old_specs, spans)[0],
                 versions.edited_lines(edit.new_specs, spans)[1],
             )
-        for by_edit, place in zip(found, places, strict=True):
+        for by_edit, place in zip(places_by_edit, places, strict=True):
             if place is not None:
                 by_edit[edit] = place
-    return found
+    return places_by_edit
