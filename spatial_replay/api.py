@@ -7,6 +7,7 @@ from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
 from reprlib import repr as shortened
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 from spatial_replay.compare.clips import Clip, cut_clip
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from spatial_replay.batch.run import BatchResult
+    from spatial_replay.batch.suite import Conditions, Suite
+    from spatial_replay.judging.judgement import Judgement
 
 PathName: TypeAlias = str | PathLike[str]
 Log: TypeAlias = PathName | Trace
@@ -377,28 +380,85 @@ def evaluate_logs(
         ClusterError: the scheduler is lost; the results written so far stay.
     """
     from spatial_replay.batch.run import prepare, run_batch, workers_of
-    from spatial_replay.batch.suite import Conditions, Suite, load_suite
+    from spatial_replay.batch.suite import Conditions, load_suite
 
     refuse_unknown(reading, Reading.__annotations__)
-    fails, allowed = (
-        checked_kinds("fail_on", fail_on, FAILING_KINDS),
-        checked_kinds("allow", allow, ALLOWED_KINDS),
-    )
-    named = [logs] if isinstance(logs, str | PathLike) else list(logs)
-    for log in named:
-        if not isinstance(log, str | PathLike):
-            raise UsageError(f"logs holds {shortened(log)}; give paths; evaluate takes a trace")
+    fails = checked_kinds("fail_on", fail_on, FAILING_KINDS)
+    allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
     conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
     if specifications is None:
+        named = _paths(logs)
         if len(named) != 1 or conditions != Conditions():
             raise UsageError(
                 "without specifications, give the path of a suite file, and nothing that it says"
             )
         suite = load_suite(named[0])
     else:
-        files = [specifications] if isinstance(specifications, str | PathLike) else specifications
-        suite = Suite.of_logs([fspath(log) for log in named], [sendable(file) for file in files], conditions)
+        suite = _suite(logs, specifications, conditions)
     return run_batch(prepare(suite.allowing(allowed)), output, workers_of(jobs, dask), fail_on=fails)
+
+
+def judge(
+    logs: PathName | Sequence[PathName],
+    specifications: PathName | Sequence[PathName],
+    *,
+    labels: PathName | None = None,
+    result: str | None = None,
+    output: PathName | None = None,
+    jobs: int = 1,
+    allow: Sequence[str] = (),
+    constants: Mapping[str, float | str] | None = None,
+    each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
+    strict_names: bool = False,
+    **reading: Unpack[Reading],
+) -> Judgement:
+    """Judge episodes by a specification, and compare the verdicts with their success labels.
+
+    Args:
+        logs: episodes: files, folders, patterns, data sets.
+        labels: a JSON or CSV file, or a field of the data set. Without it, labels are in labels.json or
+            labels.csv next to the logs, or in the data set.
+        result: the name of the spec that judges; by default the last one that no other spec uses.
+        output: the folder of results; without one, results are not stored.
+
+    The other arguments and errors are those of `evaluate_logs`.
+
+    Returns:
+        `rows`, one for each episode, `rate`, `label_rate` and `agreement`. `to_pandas()` returns the rows as
+        a data frame.
+    """
+    from spatial_replay.batch.run import run_batch, workers_of
+    from spatial_replay.batch.suite import Conditions
+    from spatial_replay.judging.judgement import prepare_judgement
+
+    refuse_unknown(reading, Reading.__annotations__)
+    allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
+    conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
+    suite = _suite(logs, specifications, conditions).allowing(allowed)
+    prepared = prepare_judgement(suite, None if labels is None else fspath(labels), result)
+    with TemporaryDirectory() as folder:
+        batch = run_batch([prepared.case], folder if output is None else output, workers_of(jobs))
+    return prepared.judgement(batch, allowed)
+
+
+def _suite(
+    logs: PathName | Sequence[PathName],
+    specifications: PathName | Sequence[PathName],
+    conditions: Conditions,
+) -> Suite:
+    from spatial_replay.batch.suite import Suite
+
+    files = [specifications] if isinstance(specifications, str | PathLike) else specifications
+    return Suite.of_logs(_paths(logs), [sendable(file) for file in files], conditions)
+
+
+def _paths(logs: PathName | Sequence[PathName]) -> list[str]:
+    paths = [logs] if isinstance(logs, str | PathLike) else list(logs)
+    for log in paths:
+        if not isinstance(log, str | PathLike):
+            raise UsageError(f"logs holds {shortened(log)}; give paths; evaluate takes a trace")
+    return [fspath(path) for path in paths]
 
 
 def read_results(folder: PathName) -> pa.Table:

@@ -133,6 +133,12 @@ def test_what_changed_is_found_and_the_smallest_piece_that_shows_it_is_cut_out(
 
 
 @pytest.mark.usefixtures("desk")
+def test_labelled_episodes_are_judged_and_gated(capsys: pytest.CaptureFixture[str]) -> None:
+    follow("judge.md", {}, capsys)
+    assert Path("push.results").is_dir()
+
+
+@pytest.mark.usefixtures("desk")
 def test_the_way_out_needs_no_program_of_ours(capsys: pytest.CaptureFixture[str]) -> None:
     follow("limits.md", {}, capsys)
     assert len(Path("numbers.csv").read_text().splitlines()) == 301

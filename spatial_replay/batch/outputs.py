@@ -53,6 +53,9 @@ if TYPE_CHECKING:
     from spatial_replay.geometry.arrays import Floats
 
 
+LABEL: Final = "label"
+AGREEMENT: Final = "agreement"
+"""Columns of judged episodes: "success" or "failure", and how that compares with the verdict."""
 _ANNOTATIONS: Final = 10
 """GitHub shows no more of one kind for a step."""
 _WORST: Final = 10
@@ -515,7 +518,11 @@ def _matrix(
     """Yield a row for each log, the worst first, and a column for each spec."""
     columns = [(total.group["case"], total.group["file"], total.group["spec"]) for total in by_spec]
     cells: dict[str, dict[tuple[str, str, str], Values]] = {}
-    for row in worst_rows(table, len(table)):
+    rows = worst_rows(table, len(table))
+    is_judged = LABEL in table.column_names
+    if is_judged:
+        rows.sort(key=_agrees)
+    for row in rows:
         column = (row["case"], row["file"], row["spec"])
         log = cells.get(row["log"])
         if log is None:
@@ -532,13 +539,29 @@ def _matrix(
     yield element("p", "Marked results fail.")
     titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
     abouts = [total.about for total in by_spec]
-    head = [_sortable("log", ""), *map(_sortable, titles, ["number"] * len(titles), abouts)]
+    label = [_sortable(LABEL, "")] if is_judged else []
+    head = [_sortable("log", ""), *label, *map(_sortable, titles, ["number"] * len(titles), abouts)]
     body = []
     for name, of_log in cells.items():
         row_cells = [_cell(of_log.get(column)) for column in columns]
         report = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
+        if is_judged:
+            row_cells.insert(0, _label_cell(next(iter(of_log.values()))))
         body.append(element("tr", element("td", _linked(report, reports)), *row_cells))
     yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
+
+
+def _agrees(row: Values) -> bool:
+    """Return whether the label of a row agrees with the verdict, or is not compared with it."""
+    return row[AGREEMENT] not in ("only_theirs", "only_ours")
+
+
+def _label_cell(row: Values) -> Html:
+    if row[LABEL] is None:
+        return element("td", "")
+    kind = "is-satisfied" if row[LABEL] == "success" else "is-violated"
+    words = row[LABEL] if _agrees(row) else f"{row[LABEL]}, {row[AGREEMENT].replace('_', ' ')}"
+    return element("td", words, **{"class": kind if _agrees(row) else f"{kind} fails"})
 
 
 def _cell(row: Values | None) -> Html:

@@ -63,6 +63,7 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "Many logs": {
         "batch": "Evaluate many logs, and show the failures.",
+        "judge": "Judge episodes, and check their success labels.",
         "results": "Show the results of a batch.",
     },
     "Live": {"monitor": "Monitor a running robot."},

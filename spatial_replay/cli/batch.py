@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from spatial_replay.batch.run import BatchResult, PreparedCase
     from spatial_replay.batch.run_table import By, Difference, Tolerance, Total
-    from spatial_replay.batch.suite import Suite
+    from spatial_replay.batch.suite import Conditions, Suite
     from spatial_replay.batch.workers import Workers
     from spatial_replay.monitor.verdict import Semantics
 
@@ -289,9 +289,9 @@ def batch(
     if folder is None:
         folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
-    check_outputs({"--junit": outputs.junit, "--json": outputs.json_file}, _inputs(suite))
+    check_outputs({"--junit": outputs.junit, "--json": outputs.json_file}, inputs_of(suite))
     workers = workers_of(jobs or os.cpu_count() or 1, dask, warn)
-    evaluated = _run(cases, folder, workers, fail_on)
+    evaluated = evaluated_batch(cases, folder, workers, fail_on)
     differences = None if before is None else compare(evaluated.table, before, tolerance)
     # what is worse than the baseline fails wherever results are shown
     result = (
@@ -299,7 +299,7 @@ def batch(
         if before is None
         else replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
     )
-    inputs = _inputs(suite)
+    inputs = inputs_of(suite)
     pages = {}
     if outputs.html is not None:
         pages = write_pages(result, outputs.html, suite.name, workers, progress=progress)
@@ -334,33 +334,47 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     Raises:
         UsageError: both, no specification, or a suite that is not valid.
     """
-    from spatial_replay.batch.suite import Conditions, Suite, load_suite
+    from spatial_replay.batch.suite import Conditions, load_suite
 
-    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
-    objects = objects_by_parameter(given.choices)
-    conditions = Conditions.given(given.reading, objects, given.constants, semantics=semantics, **others)
     suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]
     if not suites:
-        if not given.specs:
-            raise UsageError(
-                "there is nothing to evaluate; give a specification with --spec FILE, or a suite"
-            )
-        for option, text in (("--from", given.start), ("--to", given.end)):
-            if text is not None:
-                with naming_option(option):
-                    time_point_from_text(text)
-        specs = dict.fromkeys(map(sendable, given.specs))
-        return Suite.of_logs(logs, tuple(specs), conditions)
+        return suite_of_logs(logs, given, semantics)
     if len(logs) > 1:
         raise UsageError(f"{suites[0]} is a suite, which names its logs; give it alone")
-    if given.specs or conditions != Conditions():
+    if given.specs or _conditions(given, semantics) != Conditions():
         raise UsageError(
             f"{suites[0]} says how its logs are evaluated; change it there, or give logs and options"
         )
     return load_suite(suites[0])
 
 
-def _inputs(suite: Suite) -> list[Path]:
+def suite_of_logs(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
+    """Return the suite that logs and options make up.
+
+    Raises:
+        UsageError: no specification, or a time that is none.
+    """
+    from spatial_replay.batch.suite import Suite
+
+    if not given.specs:
+        raise UsageError("there is nothing to evaluate; give a specification with --spec FILE, or a suite")
+    for option, text in (("--from", given.start), ("--to", given.end)):
+        if text is not None:
+            with naming_option(option):
+                time_point_from_text(text)
+    specs = dict.fromkeys(map(sendable, given.specs))
+    return Suite.of_logs(logs, tuple(specs), _conditions(given, semantics))
+
+
+def _conditions(given: ConditionArguments, semantics: Semantics) -> Conditions:
+    from spatial_replay.batch.suite import Conditions
+
+    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
+    objects = objects_by_parameter(given.choices)
+    return Conditions.given(given.reading, objects, given.constants, semantics=semantics, **others)
+
+
+def inputs_of(suite: Suite) -> list[Path]:
     """Return the files that are read, but for the logs, of which there may be very many."""
     mappings = [case.conditions.mapping for case in suite.cases if case.conditions.mapping is not None]
     specs = [spec for case in suite.cases for spec in case.specs]
@@ -389,9 +403,10 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     return tolerance, ResultsFolder.open(outputs.baseline).read_run()
 
 
-def _run(
-    cases: Sequence[PreparedCase], folder: str, workers: Workers, fail_on: frozenset[str]
+def evaluated_batch(
+    cases: Sequence[PreparedCase], folder: str, workers: Workers, fail_on: frozenset[str] = frozenset()
 ) -> BatchResult:
+    """Evaluate what is new; an interruption says where the results so far are."""
     from spatial_replay.batch.run import run_batch
 
     try:

@@ -1,0 +1,152 @@
+"""`spatial-replay judge`: success rates of episodes by a specification, beside their labels."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from spatial_replay.cli.application import ExitCode
+from spatial_replay.cli.batch import (
+    code_of_errors,
+    evaluated_batch,
+    inputs_of,
+    suite_of_logs,
+    warn_of_damage,
+    warn_of_names,
+    write_json_lines,
+)
+from spatial_replay.cli.options import (
+    ConditionArguments,
+    allow_option,
+    check_outputs,
+    condition_options,
+    plugin_option,
+    semantics_option,
+)
+from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
+from spatial_replay.monitor.verdict import Semantics
+from spatial_replay.text import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.judging.judgement import Judgement
+
+
+@click.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True)
+@condition_options
+@click.option(
+    "--labels",
+    metavar="FILE|FIELD",
+    help="Success labels: JSON, CSV, or a field of the data set.  [default: labels next to the logs]",
+)
+@click.option(
+    "--result", metavar="NAME", help="Spec that judges.  [default: the last one that no other spec uses]"
+)
+@plugin_option
+@semantics_option
+@click.option(
+    "-o",
+    "--output",
+    metavar="RESULTS",
+    help="Folder for results, or address of one.  [default: NAME.results]",
+)
+@click.option(
+    "--html",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder for a page over all episodes, and a report of each disagreement.",
+)
+@click.option("--json", "json_file", metavar="FILE|-", help="Judgement to write, as one JSON object.")
+@click.option(
+    "--at-least",
+    metavar="RATE",
+    type=click.FloatRange(0.0, 1.0),
+    help="Least success rate: exit with 1 if the lower end of the interval is below, such as 0.8.",
+)
+@click.option(
+    "--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one for each core]"
+)
+@allow_option
+def judge(
+    logs: tuple[str, ...],
+    conditions: ConditionArguments,
+    labels: str | None,
+    result: str | None,
+    semantics: Semantics,
+    output: str | None,
+    html: Path | None,
+    json_file: str | None,
+    at_least: float | None,
+    jobs: int | None,
+    allow: frozenset[str],
+) -> int:
+    """Judge episodes by a specification, and compare the verdicts with their success labels.
+
+    LOG is an episode, a folder of them, or a pattern, as for batch. Labels come from labels.json or
+    labels.csv next to the logs, or from the data set. An entry has `log` or `episode`, and `success`.
+
+    The exit code is 0 for every rate. With --at-least it is 1 if the rate is too low, and 4 if undecided
+    episodes leave that open. It is 4 if no episode can be judged.
+
+    \b
+    Examples:
+      spatial-replay judge episodes/push --spec push.spatial
+      spatial-replay judge runs --spec push.spatial --labels labels.csv --html pages
+      spatial-replay judge runs --spec push.spatial --result placed --at-least 0.8
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.batch.run import workers_of
+    from spatial_replay.judging.judgement import prepare_judgement
+
+    suite = suite_of_logs(logs, conditions, semantics).allowing(allow)
+    prepared = prepare_judgement(suite, labels, result, progress)
+    warnings = [warning for file in prepared.case.files for warning in file.warnings]
+    show_diagnostics({str(warning): warning for warning in warnings}.values())
+    inputs = [*inputs_of(suite), *prepared.labels.files]
+    check_outputs({"--json": None if json_file == "-" else json_file}, inputs)
+    folder = output or f"{prepared.name}.results"
+    workers = workers_of(jobs or os.cpu_count() or 1)
+    judgement = prepared.judgement(evaluated_batch([prepared.case], folder, workers), allow)
+    if html is not None:
+        from spatial_replay.batch.outputs import write_pages
+        from spatial_replay.judging.writers import labelled_batch
+
+        write_pages(labelled_batch(judgement), html, judgement.name, workers, progress=progress)
+    if json_file is not None:
+        write_json_lines([judgement.document], json_file, inputs)
+    if json_file != "-":
+        _print(judgement, folder, conditions)
+    warn(*judgement.remarks, *judgement.batch.remarks)
+    warn_of_names(judgement.batch.table)
+    warn_of_damage(judgement.batch.table)
+    return _exit_code(judgement, at_least)
+
+
+def _print(judgement: Judgement, folder: str, conditions: ConditionArguments) -> None:
+    from spatial_replay.judging.sentences import difference_lines, summary_lines
+
+    show(*summary_lines(judgement), *difference_lines(judgement), "")
+    rows = [[row for row in judgement.rows if row.kind == kind] for kind in ("only_theirs", "only_ours")]
+    failed = [row for row in judgement.rows if not row.is_success]
+    example = [*rows[0], *rows[1], *failed, *judgement.rows][0]
+    specs = "".join(f" --spec {spec}" for spec in conditions.specs)
+    mapping = conditions.reading.get("mapping")
+    options = f"{specs} --mapping {mapping}" if mapping else specs
+    show(f"wrote {folder}; spatial-replay explain {example.log}{options}")
+
+
+def _exit_code(judgement: Judgement, at_least: float | None) -> ExitCode:
+    if not judgement.rate.episodes:
+        errors = code_of_errors(judgement.batch.table)
+        return ExitCode.UNKNOWN if errors is ExitCode.SATISFIED else errors
+    if at_least is None:
+        return ExitCode.SATISFIED
+    is_enough = judgement.reaches(at_least)
+    if is_enough is None:
+        pending = judgement.agreement.undecided + judgement.agreement.unstored
+        warn(f"--at-least {at_least:g}: {counted(pending, 'episode')} undecided or unstored leave it open")
+        return ExitCode.UNKNOWN
+    return ExitCode.SATISFIED if is_enough else ExitCode.VIOLATED

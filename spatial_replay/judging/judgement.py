@@ -1,0 +1,375 @@
+"""Episodes judged by a specification: verdicts next to labels, and the rates of both."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+
+from spatial_replay.batch.rows import parsed_specifications
+from spatial_replay.batch.run import BatchResult, PreparedCase, prepare
+from spatial_replay.batch.run_table import Values, worst_rows
+from spatial_replay.batch.suite import Suite
+from spatial_replay.batch.workers import Progress, no_progress
+from spatial_replay.errors import UsageError
+from spatial_replay.judging.labels import Labels, SuccessLabel, read_labels
+from spatial_replay.judging.statistics import Rate
+from spatial_replay.logs.remote import is_address
+from spatial_replay.sources.open_log import LOG_ENDINGS
+from spatial_replay.spec.format import format_formula
+from spatial_replay.text import json_value, listed, nearest_hint, printable, with_unit
+
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow as pa
+
+Kind: TypeAlias = Literal[
+    "both", "only_theirs", "only_ours", "neither", "unstored", "undecided", "unlabelled"
+]
+_AGREEMENTS: Final[Mapping[tuple[bool, bool], Kind]] = {
+    (True, True): "both",
+    (True, False): "only_theirs",
+    (False, True): "only_ours",
+    (False, False): "neither",
+}
+_SMALL_M: Final = 0.1
+"""Shorter lengths are reported in millimetres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """Numbers of episodes by label and verdict.
+
+    Attributes:
+        both, neither: label and verdict agree on a success, or on a failure.
+        only_theirs, only_ours: only the label counts a success, or only the verdict.
+        unstored: the label is about a state that is not stored, and the stored ones miss the success.
+        undecided: the verdict is unknown, untested, doubtful or an error.
+        unlabelled: decided episodes without a label.
+    """
+
+    both: int = 0
+    only_theirs: int = 0
+    only_ours: int = 0
+    neither: int = 0
+    unstored: int = 0
+    undecided: int = 0
+    unlabelled: int = 0
+
+    @property
+    def compared(self) -> int:
+        """Number of episodes with a label and a verdict about the same states."""
+        return self.both + self.only_theirs + self.only_ours + self.neither
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedEpisode:
+    """A row of a judgement.
+
+    Attributes:
+        episode: the log's name without folder and ending, or its address in a data set: `push_v3#17`.
+        label: whether the label counts a success; None without a label.
+        verdict: "satisfied", "violated", "unknown", or None for an error.
+        kind: how label and verdict compare, see `Agreement`.
+        margin: the robustness; None where not determined.
+        success_at: seconds from the begin of the episode to its first success; None without one.
+        tested: see `SpecResult.tested`.
+        reason: a sentence on what decided.
+        task, seed: where the data set has them.
+        log: its path or address.
+    """
+
+    episode: str
+    label: bool | None
+    verdict: str | None
+    kind: Kind
+    margin: float | None
+    success_at: float | None
+    tested: str | None
+    reason: str
+    task: str | None
+    seed: int | None
+    log: str
+
+    @property
+    def is_success(self) -> bool | None:
+        """Whether the verdict counts a success; None if it is undecided."""
+        return None if self.kind == "undecided" else self.verdict == "satisfied"
+
+
+_COLUMNS: Final = ("episode", "label", "verdict", "margin", "success_at", "tested", "reason", "task", "seed")
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Episodes judged by one result of a specification.
+
+    Attributes:
+        name: of their folder or data set.
+        file, result, formula: the specification file, the name of the spec, and its text.
+        rows: one for each episode, in their order.
+        batch: the results of all specs.
+    """
+
+    name: str
+    file: str
+    result: str
+    formula: str
+    rows: tuple[JudgedEpisode, ...]
+    batch: BatchResult
+
+    @cached_property
+    def agreement(self) -> Agreement:
+        """Numbers of episodes by label and verdict."""
+        return Agreement(**Counter[str](row.kind for row in self.rows))
+
+    @property
+    def rate(self) -> Rate:
+        """Successes among decided episodes; unstored successes do not count."""
+        outcomes = [row.is_success for row in self.rows if row.is_success is not None]
+        return Rate(sum(outcomes), len(outcomes))
+
+    @property
+    def rate_with_unstored_reason(self) -> Rate:
+        """The rate if the unstored successes count."""
+        return Rate(self.rate.successes + self.agreement.unstored, self.rate.episodes)
+
+    @property
+    def label_rate(self) -> Rate:
+        """Successes by the labels."""
+        labels = [row.label for row in self.rows if row.label is not None]
+        return Rate(sum(labels), len(labels))
+
+    def reaches(self, least: float) -> bool | None:
+        """Return whether the lower end of the interval is at least a rate.
+
+        None if that depends on undecided episodes or unstored successes.
+        """
+        total, pending = len(self.rows), self.agreement.undecided + self.agreement.unstored
+        intervals = [Rate(self.rate.successes + more, total).interval for more in (0, pending)]
+        low, high = (interval is not None and interval.low >= least for interval in intervals)
+        return low if low == high else None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Messages about the labels."""
+        rate = self.label_rate
+        if 1 < rate.episodes == rate.successes:
+            return (f"all {rate.episodes:,} labels are successes: the data set may hold successes only",)
+        return ()
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The judgement for JSON."""
+        rates = {
+            "": self.rate,
+            "with_unstored_": self.rate_with_unstored,
+            "label_": self.label_rate,
+        }
+        numbers: dict[str, Any] = {}
+        for name, rate in rates.items():
+            numbers[f"{name}rate"] = rate.value
+            numbers[f"{name}interval"] = None if rate.interval is None else list(rate.interval)
+        rows = [
+            {**{name: getattr(row, name) for name in _COLUMNS}, "agreement": row.kind} for row in self.rows
+        ]
+        document = {"name": self.name, "episodes": len(self.rows), "decided": self.rate.episodes}
+        document |= {"file": self.file, "result": self.result, "formula": self.formula}
+        document |= {"agreement": asdict(self.agreement), **numbers, "remarks": self.remarks, "rows": rows}
+        return {name: json_value(value) for name, value in document.items()}
+
+    @property
+    def table(self) -> pa.Table:
+        """The rows with the columns of `document`; null where there is none."""
+        import pyarrow as pa
+
+        types = {"label": pa.bool_(), "seed": pa.int64()}
+        types |= dict.fromkeys(("margin", "success_at"), pa.float64())
+        schema = pa.schema([(name, types.get(name, pa.string())) for name in (*_COLUMNS, "kind")])
+        columns = [[getattr(row, name) for row in self.rows] for name in schema.names]
+        return pa.table(columns, schema=schema).rename_columns([*_COLUMNS, "agreement"])
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the rows as a data frame, see `table`."""
+        return self.table.to_pandas()
+
+
+class _Spec(NamedTuple):
+    """The spec that judges."""
+
+    file: str
+    name: str
+    formula: str
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedJudgement:
+    """Episodes with their labels, and the result that judges them.
+
+    Attributes:
+        case: for `run_batch`.
+    """
+
+    name: str
+    case: PreparedCase
+    spec: _Spec
+    labels: Labels
+
+    def judgement(self, batch: BatchResult, allow: AbstractSet[str] = frozenset()) -> Judgement:
+        """Return the judgement, given the results of a batch with the case.
+
+        Args:
+            allow: "vacuous", "dropped" and "doubtful": verdicts that count although they show nothing.
+        """
+        paths = {log.name: log.path for log in self.case.logs}
+        batch = _part_of_batch(batch, set(paths))
+        rows_by_log: dict[str, Values] = {}
+        for row in worst_rows(_rows_of(batch.table, self.spec), len(batch.table)):
+            # of a template, the worst object
+            rows_by_log.setdefault(row["log"], row)
+        episodes = _episode_names(list(paths))
+        rows = tuple(
+            _judged_episode(
+                episodes[log],
+                path,
+                rows_by_log[log],
+                self.labels.by_path.get(path, SuccessLabel(None)),
+                allow,
+            )
+            for log, path in paths.items()
+        )
+        return Judgement(self.name, *self.spec, rows, batch)
+
+
+def prepare_judgement(
+    suite: Suite, labels: str | None = None, result: str | None = None, progress: Progress = no_progress
+) -> PreparedJudgement:
+    """Find the episodes of a suite of one case, their labels, and the result that judges them.
+
+    Args:
+        labels: see `read_labels`.
+        result: the name of a spec; by default the last one that no other spec uses.
+
+    Raises:
+        UsageError, SpecificationError: see `batch.run.prepare` and `read_labels`.
+    """
+    (case,) = prepare(suite, progress)
+    return PreparedJudgement(
+        _name_of(case), case, _judging_spec(case, result), read_labels(case.logs, labels)
+    )
+
+
+def _judging_spec(case: PreparedCase, result: str | None) -> _Spec:
+    texts = tuple(file.text for file in case.files)
+    files = parsed_specifications(texts, case.case.conditions)
+    specs = [
+        _Spec(named.name, spec.name, printable(format_formula(spec.formula), 200))
+        for named, file in zip(case.files, files, strict=True)
+        for spec in file.results
+    ]
+    if result is None:
+        return specs[-1]
+    matches = [spec for spec in specs if spec.name == result]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        raise UsageError(
+            f"--result {result}: {listed([spec.file for spec in matches])} have it; give one --spec"
+        )
+    names = [spec.name for spec in specs]
+    hint = nearest_hint(result, names) or f"results are {listed(names)}"
+    if any(result == spec.name for file in files for spec in file.specs):
+        hint = f"other specs use it, so it has no result; add `spec judged = {result}`"
+    raise UsageError(f"--result {result}: no result has this name; {hint}")
+
+
+def _name_of(case: PreparedCase) -> str:
+    """Return the name of the folder or data set that the episodes are in, or "episodes"."""
+    patterns = [pattern.text for pattern in case.case.logs]
+    if len(patterns) == 1 and Path(patterns[0]).is_dir():
+        return Path(patterns[0]).resolve().name or "episodes"
+    folders = {log.path.rpartition("#")[0] or log.path.rpartition("/")[0] or "." for log in case.logs}
+    folder = folders.pop() if len(folders) == 1 else ""
+    path = PurePosixPath(folder) if is_address(folder) or not folder else Path(folder).resolve()
+    return path.name or "episodes"
+
+
+def _episode_names(logs: Sequence[str]) -> dict[str, str]:
+    """Return the names of logs without the folder and the ending that all of them share."""
+    folders = {log.rpartition("/")[0] for log in logs}
+    folder = f"{folders.pop()}/" if len(folders) == 1 else ""
+    endings = {max((end for end in LOG_ENDINGS if log.endswith(end)), key=len, default="") for log in logs}
+    ending = endings.pop() if len(endings) == 1 else ""
+    return {log: log.removeprefix(folder).removesuffix(ending) for log in logs}
+
+
+def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
+    """Return the part of a batch that is about some logs."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    wanted = tuple(request for request in batch.wanted if request.log.name in logs)
+    is_about = pc.is_in(batch.table["log"], pa.array(sorted(logs), pa.string()))
+    return replace(batch, table=batch.table.filter(is_about), wanted=wanted)
+
+
+def _rows_of(table: pa.Table, spec: _Spec) -> pa.Table:
+    """Return the rows of a spec; an error of its whole file has rows without a name."""
+    import pyarrow.compute as pc
+
+    is_named = pc.or_(pc.equal(table["spec"], spec.name), pc.equal(table["spec"], ""))
+    return table.filter(pc.and_(pc.equal(table["file"], spec.file), is_named))
+
+
+def _judged_episode(
+    episode: str, path: str, row: Values, label: SuccessLabel, allow: AbstractSet[str]
+) -> JudgedEpisode:
+    reason = _undecided_reason(row, allow)
+    is_satisfied, margin = row["verdict"] == "satisfied", row["robustness"]
+    kind: Kind = "undecided" if reason else "unlabelled"
+    if not reason and label.success is not None:
+        kind = _AGREEMENTS[label.success, is_satisfied]
+    if kind == "only_theirs" and label.is_unstored:
+        kind, reason = "unstored", _unstored_reason(margin, row["unit"] or "")
+    times = [row[name] for name in ("satisfied_at_ns", "first_satisfied_ns") if row[name] is not None]
+    return JudgedEpisode(
+        episode,
+        label.success,
+        row["verdict"],
+        kind,
+        margin,
+        success_at=(times[0] - row["zero_ns"]) / 1e9 if times and is_satisfied else None,
+        tested=row["tested"],
+        reason=reason or row["reason"],
+        task=label.task,
+        seed=label.seed,
+        log=path,
+    )
+
+
+def _undecided_reason(row: Values, allow: AbstractSet[str]) -> str:
+    """Return why a verdict does not count; "" if it does."""
+    if row["verdict"] is None:
+        return row["error"] or "no result"
+    if row["faults"]:
+        return f"the log is damaged: {row['faults'][0]}"
+    if row["verdict"] == "unknown":
+        return row["reason"] or "unknown"
+    if row["tested"] == "nothing" and "vacuous" not in allow:
+        return f"tested by nothing: {row['untested'][0]}"
+    if row["doubtful"] and "doubtful" not in allow:
+        return f"doubtful: {row['doubtful'][0]}"
+    return row["dropped"] if row["dropped"] and "dropped" not in allow else ""
+
+
+def _unstored_reason(margin: float | None, unit: str) -> str:
+    sentence = "the label is about the state after the last frame, which is not in the data"
+    if margin is None or margin == -float("inf"):
+        return sentence
+    is_small = unit == "m" and -margin < _SMALL_M
+    missing = f"{-margin * 1000.0:.2g} mm" if is_small else with_unit(-margin, unit)
+    return f"{sentence}; {missing} were missing"

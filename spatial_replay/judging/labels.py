@@ -1,0 +1,205 @@
+"""Success labels of episodes, from files and from data sets."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, NamedTuple
+
+from spatial_replay.batch.run import FoundLog
+from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
+from spatial_replay.logs.formats.episodes import DataSet, EpisodeReading
+from spatial_replay.logs.remote import is_address
+from spatial_replay.sources.open_log import LOG_ENDINGS
+from spatial_replay.text import counted, first_lines, listed, nearest_hint
+
+LABEL_FILES: Final = ("labels.json", "labels.csv")
+"""Names of label files that are found next to logs."""
+_LARGEST: Final = 256 * 2**20
+"""Bytes of a label file."""
+_MOST_FAULTS: Final = 20
+_FRAME_KEYS: Final = ("frame_index", "frame", "step", "timestamp", "time_ns")
+_TRUTHS: Final[Mapping[str, bool | None]] = {
+    **dict.fromkeys(("true", "1", "1.0", "yes", "success"), True),
+    **dict.fromkeys(("false", "0", "0.0", "no", "failure"), False),
+    **dict.fromkeys(("none", ""), None),
+}
+
+
+class SuccessLabel(NamedTuple):
+    """The success label of an episode.
+
+    Attributes:
+        success: None without a label.
+        is_unstored: whether it is about the state after the last frame, which is not stored.
+        task, seed: where the data set has them.
+    """
+
+    success: bool | None
+    is_unstored: bool = False
+    task: str | None = None
+    seed: int | None = None
+
+
+class Labels(NamedTuple):
+    """Labels by the paths of logs, and the files that they were read from."""
+
+    by_path: Mapping[str, SuccessLabel]
+    files: tuple[Path, ...] = ()
+
+
+def read_labels(logs: Sequence[FoundLog], labels: str | None = None) -> Labels:
+    """Read the labels of episodes.
+
+    Args:
+        labels: a JSON or CSV file, or the name of a field of the data set. Without it, labels are in
+            `labels.json` or `labels.csv` next to the logs, or in the data set.
+
+    Raises:
+        MissingFileError: there is no such file.
+        UsageError: entries for other episodes, for frames, or twice for an episode; all are listed. A field
+            that the data set does not have.
+    """
+    is_file = labels is not None and (labels.lower().endswith((".json", ".csv")) or Path(labels).is_file())
+    by_path: dict[str, SuccessLabel] = {}
+    folders: dict[Path, None] = {}
+    for log in logs:
+        address = data_set_address(log.path)
+        data_set = None if address is None else open_data_set(address[0])
+        if address is not None and data_set is not None:
+            by_path[log.path] = _stored_label(data_set, address[1], None if is_file else labels)
+        elif labels is not None and not is_file:
+            raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
+        elif not is_address(log.path):
+            folders[Path(log.path).parent] = None
+    near = [folder / name for folder in folders for name in LABEL_FILES]
+    files = [Path(labels or "")] if is_file else [file for file in near if file.is_file()]
+    for file in files:
+        for path, success in _labels_of(file, logs).items():
+            by_path[path] = by_path.get(path, SuccessLabel(None))._replace(success=success, is_unstored=False)
+    return Labels(by_path, tuple(files))
+
+
+def _stored_label(data_set: DataSet, number: int, field: str | None) -> SuccessLabel:
+    """Return the label of an episode by its data set; its row reports data that cannot be read."""
+    episode, label = data_set.episode(number), data_set.label
+    about = SuccessLabel(None, task=episode.task, seed=episode.seed)
+    # labels need no times
+    reading = EpisodeReading(fps=data_set.fps or 1.0, label=field)
+    try:
+        columns = data_set.columns(number, reading, ())
+    except LogError:
+        return about
+    if columns.success is None or not columns.success.size:
+        return about
+    # a label in an earlier frame is about a state that is stored
+    is_last = len(columns.success) == len(columns.times_ns) and not columns.success[:-1].any()
+    is_own = field is None or (label is not None and label.field == field)
+    is_about_next = label is not None and label.is_about_next if is_own else str(field).startswith("next.")
+    is_stored = label is not None and label.is_stored
+    return about._replace(success=columns.label, is_unstored=is_last and is_about_next and not is_stored)
+
+
+def _labels_of(file: Path, logs: Sequence[FoundLog]) -> dict[str, bool | None]:
+    """Return the labels of a file; entries about other logs that exist are left out."""
+    paths_by_name = _paths_by_name(logs)
+    labels: dict[str, bool | None] = {}
+    places: dict[str, str] = {}
+    faults = []
+    for place, entry in _entries(file):
+        try:
+            path, success = _entry_path(entry, paths_by_name, file), _success(entry)
+            if path is None:
+                continue
+            if path in labels:
+                raise UsageError(_repetition(entry, places[path]))
+            labels[path], places[path] = success, place
+        except UsageError as error:
+            faults.append(f"{file}, {place}: {error}")
+    if faults:
+        raise UsageError("\n".join(first_lines(faults, _MOST_FAULTS)))
+    return labels
+
+
+def _repetition(entry: Mapping[str, Any], place: str) -> str:
+    frame = next((key for key in _FRAME_KEYS if key in entry), None)
+    if frame is not None:
+        return f"a label for each frame ({frame!r}); give one entry an episode, with its whole success"
+    return f"{place} labels this episode already; keep one of them"
+
+
+def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield each entry of a label file, with its place."""
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(_LARGEST + 1)
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise UsageError(f"{file} is not UTF-8; save it as that") from None
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(file, error) from None
+    if len(data) > _LARGEST:
+        raise UsageError(f"{file} is larger than {_LARGEST // 2**20} MB; labels have one entry an episode")
+    if file.suffix.lower() == ".csv":
+        rows = csv.DictReader(text.splitlines())
+        yield from ((f"line {rows.line_num}", row) for row in rows)
+        return
+    try:
+        entries = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{file} is not JSON: {error}") from None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise UsageError(f'{file} is no list of objects; write [{{"log": "000.mcap", "success": true}}, …]')
+    yield from ((f"entry {number}", entry) for number, entry in enumerate(entries, 1))
+
+
+def _success(entry: Mapping[str, Any]) -> bool | None:
+    if "success" not in entry:
+        raise UsageError(f"it has no 'success'; it has {listed([str(key) for key in entry]) or 'nothing'}")
+    word = str(entry["success"]).strip().lower()
+    if word not in _TRUTHS:
+        raise UsageError(f"success is {word!r:.60}; write true or false")
+    return _TRUTHS[word]
+
+
+def _entry_path(
+    entry: Mapping[str, Any], paths_by_name: Mapping[str, Sequence[str]], file: Path
+) -> str | None:
+    """Return the path of the log that an entry is about; None for one that exists and is not judged."""
+    value = entry.get("log") if entry.get("log") is not None else entry.get("episode")
+    if not isinstance(value, str | int) or isinstance(value, bool):
+        raise UsageError("it names no episode; give 'log', a path, or 'episode', a number or name")
+    name = str(value).strip()
+    # next to the label file first: other folders may have logs of that name
+    paths = paths_by_name.get(_stem(str(file.parent / name))) or paths_by_name.get(_stem(name)) or []
+    if len(paths) > 1:
+        raise UsageError(f"{name!r:.100} names {counted(len(paths), 'log')}; write more of the path")
+    if paths:
+        return paths[0]
+    if "\0" not in name and (file.parent / name).exists():
+        return None
+    hint = nearest_hint(name, paths_by_name) or "remove this entry, or judge that episode, too"
+    raise UsageError(f"no judged episode is named {name!r:.100}; {hint}")
+
+
+def _paths_by_name(logs: Sequence[FoundLog]) -> Mapping[str, list[str]]:
+    """Return the paths of logs by all names that a label may use: ends of their paths, episode numbers."""
+    paths_by_name = defaultdict[str, list[str]](list)
+    for log in logs:
+        parts = PurePosixPath(log.path).parts
+        names = {_stem(log.name), *(_stem("/".join(parts[begin:])) for begin in range(len(parts)))}
+        if data_set_address(log.path) is not None:
+            names.add(log.path.rpartition("#")[2])
+        for name in names | {_stem(log.path)}:
+            paths_by_name[name].append(log.path)
+    return paths_by_name
+
+
+def _stem(name: str) -> str:
+    """Return a path without the ending of a log."""
+    ending = max((end for end in LOG_ENDINGS if name.lower().endswith(end)), key=len, default="")
+    return str(PurePosixPath(name[: len(name) - len(ending)]))

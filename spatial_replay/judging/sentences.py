@@ -1,0 +1,74 @@
+"""Lines on a judgement, for terminals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from spatial_replay.judging.judgement import JudgedEpisode, Judgement, Kind
+from spatial_replay.judging.statistics import Rate
+from spatial_replay.text import counted, first_lines
+
+_TITLES: Final[dict[Kind, str]] = {
+    "only_theirs": "only the label counts",
+    "only_ours": "only the verdict counts",
+    "unstored": "unstored",
+    "undecided": "undecided",
+}
+_MOST: Final = 10
+"""Episodes of a kind that are listed."""
+
+
+def summary_lines(judgement: Judgement) -> Iterator[str]:
+    """Yield what was judged, the rates of verdicts and labels, and how many agree."""
+    count = counted(len(judgement.rows), "episode")
+    yield f"{judgement.name}: {count} judged by `{judgement.result}`, `{judgement.formula}`"
+    agreement = judgement.agreement
+    rates = {"ours": judgement.rate}
+    rates |= {"": judgement.rate_with_unstored} if agreement.unstored else {}
+    rates |= {"label": judgement.label_rate} if judgement.label_rate.episodes else {}
+    counts = {name: f"{rate.successes:,} of {rate.episodes:,}" for name, rate in rates.items()}
+    width = max(map(len, counts.values()))
+    yield f"{'':10}{'success':<{width + 9}}95 %"
+    for name, rate in rates.items():
+        end = f"   if the unstored {agreement.unstored:,} count" if not name else ""
+        yield f"{name:<10}{counts[name]:<{width}}  {_percents(rate)}{end}"
+    numbers = {
+        "both": agreement.both,
+        "only the label": agreement.only_theirs,
+        "only ours": agreement.only_ours,
+        "neither": agreement.neither,
+    }
+    rest = {"unstored": agreement.unstored, "undecided": agreement.undecided}
+    rest["without a label"] = len(judgement.rows) - judgement.label_rate.episodes
+    if not judgement.label_rate.episodes:
+        numbers, rest = {}, {"no labels; undecided": agreement.undecided}
+    numbers |= {name: number for name, number in rest.items() if number}
+    if numbers:
+        agreeing = f"{agreement.both + agreement.neither:,} of {agreement.compared:,}"
+        start = f"agreement {agreeing:<{width + 9}}" if judgement.label_rate.episodes else ""
+        yield f"{start}{', '.join(f'{name} {number:,}' for name, number in numbers.items())}"
+
+
+def _percents(rate: Rate) -> str:
+    if rate.value is None or rate.interval is None:
+        return "no rate"
+    low, high = rate.interval
+    return f"{f'{100.0 * rate.value:.0f} %':<7}{100.0 * low:.0f} to {100.0 * high:.0f}"
+
+
+def difference_lines(judgement: Judgement) -> Iterator[str]:
+    """Yield the episodes in which label and verdict differ, and the undecided ones, with reasons."""
+    for kind, title in _TITLES.items():
+        rows = [row for row in judgement.rows if row.kind == kind]
+        if rows:
+            yield ""
+            yield f"{title} {len(rows):,}:"
+            width = max(len(row.episode) for row in rows[:_MOST])
+            yield from (f"  {line}" for line in first_lines([_line(row, width) for row in rows], _MOST))
+
+
+def _line(row: JudgedEpisode, width: int) -> str:
+    is_early = row.kind == "only_ours" and row.success_at is not None
+    success = f"succeeds at {row.success_at:.3f} s; " if is_early else ""
+    return f"{row.episode:<{width}}  {success}{row.reason.split(chr(10))[0]}"

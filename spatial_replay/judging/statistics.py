@@ -1,0 +1,136 @@
+"""Numbers on rates and pairs of episodes, by SciPy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import importing
+
+if TYPE_CHECKING:
+    from spatial_replay.geometry.arrays import Integers
+
+SIGNIFICANCE: Final = 0.05
+"""The greatest p that decides between two sets of episodes."""
+EVIDENCE: Final = 1.0 / SIGNIFICANCE
+"""The least e-value that decides."""
+_POWER: Final = 0.8
+"""Probability with which the estimated number of pairs decides."""
+_MOST_PAIRS: Final = 100_000
+
+
+class Interval(NamedTuple):
+    """Bounds of a rate."""
+
+    low: float
+    high: float
+
+
+class Rate(NamedTuple):
+    """Successes among episodes."""
+
+    successes: int
+    episodes: int
+
+    @property
+    def value(self) -> float | None:
+        """The rate; None without episodes."""
+        return self.successes / self.episodes if self.episodes else None
+
+    @property
+    def interval(self) -> Interval | None:
+        """Wilson's score interval, 95 %; None without episodes."""
+        if not self.episodes:
+            return None
+        interval = _scipy().binomtest(*self).proportion_ci(0.95, method="wilson")
+        return Interval(float(interval.low), float(interval.high))
+
+
+def mcnemar_p(won: int, lost: int) -> float:
+    """Return the p-value of McNemar's exact test, given the pairs in which only one side succeeds."""
+    return float(_scipy().binomtest(won, won + lost).pvalue) if won + lost else 1.0
+
+
+def e_value(won: int, lost: int) -> float:
+    """Return the evidence that one side wins more often; it may be looked at after every episode.
+
+    It is a ratio of likelihoods: of a uniformly distributed chance of winning to a chance of 1/2.
+    """
+    _scipy()
+    from scipy.special import betaln
+
+    return math.exp((won + lost) * math.log(2.0) + float(betaln(won + 1, lost + 1)))
+
+
+def more_pairs(won: int, lost: int, pairs: int) -> int | None:
+    """Return how many further pairs would decide with 80 % probability, at the same shares.
+
+    None if neither side is ahead, or no number up to 100,000 suffices.
+    """
+    if won == lost:
+        return None
+    high = max(pairs, 1)
+    while _power(high, won, lost, pairs) < _POWER:
+        high *= 2
+        if high > _MOST_PAIRS:
+            return None
+    low = high // 2
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if _power(middle, won, lost, pairs) >= _POWER else (middle, high)
+    # the power is that of whole numbers, and not quite monotone
+    while high > 1 and _power(high - 1, won, lost, pairs) >= _POWER:
+        high -= 1
+    return max(high - pairs, 0)
+
+
+def _power(count: int, won: int, lost: int, pairs: int) -> float:
+    """Return the probability that the exact test of `count` pairs decides."""
+    binom = _scipy().binom
+    differing = np.arange(count + 1)
+    weights = binom.pmf(differing, count, (won + lost) / pairs)
+    # far from the mean, weights are below the last bit of the sum
+    differing, weights = differing[weights > 1e-17], weights[weights > 1e-17]
+    limits = _critical(differing)
+    share = won / (won + lost)
+    decided = binom.cdf(limits, differing, share) + binom.sf(differing - limits - 1, differing, share)
+    return float(np.sum(weights * np.where(limits < 0, 0.0, decided)))
+
+
+def _critical(differing: Integers) -> Integers:
+    """Return the greatest number of wins of the losing side that still decides; -1 for none."""
+    binom = _scipy().binom
+    limits = binom.ppf(SIGNIFICANCE / 2.0, differing, 0.5)
+    is_above = binom.cdf(limits, differing, 0.5) > SIGNIFICANCE / 2.0
+    return np.asarray(np.where(is_above, limits - 1, limits), int)
+
+
+class SignedRank(NamedTuple):
+    """Wilcoxon's test: the statistic and its p-value."""
+
+    statistic: float
+    p: float
+
+
+def wilcoxon(new: Sequence[float], old: Sequence[float]) -> SignedRank | None:
+    """Return Wilcoxon's signed-rank test of paired margins; None if no pair differs."""
+    if list(new) == list(old):
+        return None
+    test: Any = _scipy().wilcoxon(new, old)
+    return SignedRank(float(test.statistic), float(test.pvalue))
+
+
+def pass_hat_k(successes: int, runs: int, k: int) -> float:
+    """Return the estimated probability that `k` runs of one start all succeed."""
+    return math.comb(successes, k) / math.comb(runs, k)
+
+
+@cache
+def _scipy() -> Any:
+    with importing("intervals and tests need SciPy", extra="tune"):
+        from scipy import stats
+    return stats
