@@ -134,7 +134,7 @@ class Judgement:
         return Rate(sum(outcomes), len(outcomes))
 
     @property
-    def rate_with_unstored_reason(self) -> Rate:
+    def rate_with_unstored(self) -> Rate:
         """The rate if the unstored successes count."""
         return Rate(self.rate.successes + self.agreement.unstored, self.rate.episodes)
 
@@ -312,9 +312,9 @@ def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    wanted = tuple(request for request in batch.wanted if request.log.name in logs)
+    requests = tuple(request for request in batch.wanted if request.log.name in logs)
     is_about = pc.is_in(batch.table["log"], pa.array(sorted(logs), pa.string()))
-    return replace(batch, table=batch.table.filter(is_about), wanted=wanted)
+    return replace(batch, table=batch.table.filter(is_about), wanted=requests)
 
 
 def _rows_of(table: pa.Table, spec: _Spec) -> pa.Table:
