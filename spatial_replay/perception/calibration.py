@@ -68,7 +68,7 @@ def calibrate_camera(
             the references have them.
     """
     detector = TagDetector(family)
-    known = {each.id: each.corners for each in references}
+    references_by_id = {tag.id: tag.corners for tag in references}
     points: list[Floats] = []
     pixels: list[Floats] = []
     views: list[dict[int, Floats]] = []
@@ -78,14 +78,18 @@ def calibrate_camera(
         if frame.detections is not None:
             raise UsageError(f"{name} has detections without images; a camera is calibrated from its images")
         size = frame.image.shape[1], frame.image.shape[0]
-        found = {each.id: each.corners for each in detector.detect(frame.image) if each.id in known}
-        seen += len(found) >= _LEAST_TAGS
-        if len(found) < _LEAST_TAGS or not _is_new(found, views, _APART * size[0]):
+        view = {
+            detection.id: detection.corners
+            for detection in detector.detect(frame.image)
+            if detection.id in references_by_id
+        }
+        seen += len(view) >= _LEAST_TAGS
+        if len(view) < _LEAST_TAGS or not _is_new(view, views, _APART * size[0]):
             continue
-        views.append(found)
-        flat = np.concatenate([known[number] for number in found])
+        views.append(view)
+        flat = np.concatenate([references_by_id[number] for number in view])
         points.append(np.concatenate([flat, np.zeros((len(flat), 1))], axis=1))
-        pixels.append(np.concatenate(list(found.values())))
+        pixels.append(np.concatenate(list(view.values())))
         if len(views) == _MOST_VIEWS:
             break
     if size is None:
@@ -146,7 +150,9 @@ def camera_text(camera: Camera) -> str:
         f"  centre: [{cx:.3f}, {cy:.3f}]",
     ]
     if camera.distortion:
-        lines.append(f"  distortion: [{', '.join(f'{each:.6g}' for each in camera.distortion)}]")
+        lines.append(
+            f"  distortion: [{', '.join(f'{coefficient:.6g}' for coefficient in camera.distortion)}]"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -90,8 +90,8 @@ class ImageTopic:
         """
         self._reader = open_messages(path)
         self.name = self._reader.name
-        chosen = _chosen(self.name, self._reader.topics(), topic)
-        self.topic, self._type = chosen.name, short_type(chosen.type)
+        image_topic = _choose_topic(self.name, self._reader.topics(), topic)
+        self.topic, self._type = image_topic.name, short_type(image_topic.type)
         self.channel = next(iter(self._reader.channels({self.topic}).values()), None)
         if self.channel is not None and self.channel.encoding == "json":
             raise UsageError(f"{self.topic} has JSON messages; record it as protobuf or as ROS messages")
@@ -121,7 +121,7 @@ class ImageTopic:
     def _frames(self) -> Iterator[tuple[int, Frame | LogError, bool]]:
         """Yield when each message was logged, its frame or what is wrong with it, and whether it is true."""
         decoder = H264Decoder() if self._is_video else None
-        listed = _DETECTIONS.get(self._type)
+        detections_field = _DETECTIONS.get(self._type)
         for message in self._reader.iter_messages({self.topic}):
             log_ns, payload = message.log_time_ns, message.payload
             try:
@@ -129,9 +129,9 @@ class ImageTopic:
                 time_ns = _stamp_ns(value) or log_ns
                 if decoder is not None:
                     yield from map(_frame, decoder.decode(_h264(value), (log_ns, time_ns, payload)))
-                elif listed is not None:
-                    found = _detections(getattr(value, listed))
-                    yield log_ns, Frame(time_ns, NO_IMAGE, payload, detections=found), True
+                elif detections_field is not None:
+                    detections = _detections(getattr(value, detections_field))
+                    yield log_ns, Frame(time_ns, NO_IMAGE, payload, detections=detections), True
                 else:
                     yield log_ns, Frame(time_ns, _image(value, self._type), payload), True
             except LogError as error:
@@ -147,16 +147,16 @@ class ImageTopic:
         Raises:
             UsageError: a codec that is not installed.
         """
-        shown = self._shown()
-        found = np.searchsorted(shown.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
-        decoder, done = H264Decoder() if self._is_video else None, 0
-        for place in np.unique(found[found >= 0]).tolist():
-            stamp_ns, last_ns = int(shown.stamps_ns[place]), int(shown.log_times_ns[place])
+        frames = self._times_of_frames()
+        places = np.searchsorted(frames.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
+        decoder, read_ns = H264Decoder() if self._is_video else None, 0
+        for place in np.unique(places[places >= 0]).tolist():
+            stamp_ns, last_ns = int(frames.stamps_ns[place]), int(frames.log_times_ns[place])
             # from the key frame on, unless the decoder is already past it
-            first_ns = last_ns if decoder is None else max(int(shown.key_times_ns[place]), done)
-            done = last_ns + 1
+            first_ns = last_ns if decoder is None else max(int(frames.key_times_ns[place]), read_ns)
+            read_ns = last_ns + 1
             shows: list[Shown] = []
-            for message in self._reader.iter_messages({self.topic}, first_ns, done):
+            for message in self._reader.iter_messages({self.topic}, first_ns, read_ns):
                 with suppress(LogError):
                     value: Any = self._decode(message.payload)
                     time_ns = _stamp_ns(value) or message.log_time_ns
@@ -167,12 +167,12 @@ class ImageTopic:
             if decoder is not None and not shows:
                 # held back since something is missing: the next one is decoded from its key frame again
                 shows += _of_stamp(stamp_ns, decoder.rest())
-                decoder, done = H264Decoder(), 0
-            image = next((each.image for each in reversed(shows) if each.is_true), None)
+                decoder, read_ns = H264Decoder(), 0
+            image = next((show.image for show in reversed(shows) if show.is_true), None)
             if image is not None:
                 yield Frame(stamp_ns, image)
 
-    def _shown(self) -> _Shown:
+    def _times_of_frames(self) -> _Shown:
         """Return when there are frames, without decoding them."""
         rows: list[tuple[int, int, int]] = []
         key_ns = last_ns = -1
@@ -198,9 +198,11 @@ class _Shown(NamedTuple):
     key_times_ns: Integers
 
 
-def _chosen(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
-    images = {each.name: each for each in topics if is_image_type(each.type)}
-    detections = {each.name: each for each in topics if short_type(each.type) in _DETECTIONS}
+def _choose_topic(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
+    images = {candidate.name: candidate for candidate in topics if is_image_type(candidate.type)}
+    detections = {
+        candidate.name: candidate for candidate in topics if short_type(candidate.type) in _DETECTIONS
+    }
     if wanted is None and not images and len(detections) == 1:
         return next(iter(detections.values()))
     if wanted is None:
@@ -210,11 +212,11 @@ def _chosen(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
         raise UsageError(f"{name} has {what}; choose one with --topic" if images else f"{name} has {what}")
     if wanted in images or wanted in detections:
         return {**images, **detections}[wanted]
-    every = [each.name for each in topics]
+    every = [candidate.name for candidate in topics]
     if wanted in every:
-        found = next(each for each in topics if each.name == wanted)
+        candidate = next(candidate for candidate in topics if candidate.name == wanted)
         raise UsageError(
-            f"{name}: {wanted} has messages of {found.type}, neither images nor AprilTag detections"
+            f"{name}: {wanted} has messages of {candidate.type}, neither images nor AprilTag detections"
         )
     hint = nearest_hint(wanted, every) or f"image topics are {', '.join(images) or 'none'}"
     raise UsageError(f"{name} has no topic {wanted!r}; {hint}")
@@ -239,7 +241,7 @@ def _frame(shown: Shown) -> tuple[int, Frame, bool]:
 
 def _of_stamp(stamp_ns: int, shown: Iterable[Shown]) -> list[Shown]:
     """Return what is shown with a stamp."""
-    return [each for each in shown if each.of == stamp_ns]
+    return [show for show in shown if show.of == stamp_ns]
 
 
 def _image(value: Any, type_name: str) -> Image:
@@ -276,15 +278,15 @@ def _detections(listed: Any) -> tuple[Detection, ...]:
     Raises:
         LogError: one has not four corners.
     """
-    found = []
-    for each in listed:
-        corners = np.array([(corner.x, corner.y) for corner in each.corners], np.float64)
+    detections = []
+    for tag in listed:
+        corners = np.array([(corner.x, corner.y) for corner in tag.corners], np.float64)
         if corners.shape != (4, 2) or not np.isfinite(corners).all():
-            raise LogError(f"tag {each.id} has not four corners that are numbers")
-        family = str(each.family).removeprefix("tag")
-        known = family if family in FAMILIES else ""
-        found.append(Detection(int(each.id), corners_from_apriltag(corners), known))
-    return tuple(sorted(found, key=lambda tag: (tag.id, *tag.corners[0].tolist())))
+            raise LogError(f"tag {tag.id} has not four corners that are numbers")
+        family = str(tag.family).removeprefix("tag")
+        known_family = family if family in FAMILIES else ""
+        detections.append(Detection(int(tag.id), corners_from_apriltag(corners), known_family))
+    return tuple(sorted(detections, key=lambda tag: (tag.id, *tag.corners[0].tolist())))
 
 
 def _stamp_ns(value: Any) -> int:

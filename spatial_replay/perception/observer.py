@@ -105,15 +105,15 @@ def poses_on_plane(
     lifted = "its object is lifted or has tipped over"
     if isinstance(plane, HomographyPlane):
         bounds = plane.parallax(corners.reshape(-1, 2), np.repeat(z, 4))
-        parallax, larger = (each.reshape(-1, 4).max(axis=1) for each in bounds)
+        parallax, larger = (bounds_of_corner.reshape(-1, 4).max(axis=1) for bounds_of_corner in bounds)
         lifted += ", or the tag is higher above the reference tags than the file says"
     squares = _squares(centre[:, 0], along[:, 0] / 4)
     misfits = _misfits(plane, corners, squares, z)
     poses = []
     for index, tag in enumerate(tags):
         of_pose = np.zeros((4, 4))
-        chosen = [0, 1, 3]
-        of_pose[np.ix_(chosen, chosen)] = spread[index, :3, :3]
+        axes = [0, 1, 3]
+        of_pose[np.ix_(axes, axes)] = spread[index, :3, :3]
         doubt = None
         if not np.isfinite(numbers[index]).all():
             doubt = f"tag {tag.id} is not in front of the camera"
@@ -188,7 +188,7 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
     # the place of the object's centre by the place of the tag and its yaw
     lever = np.eye(4)
     lever[:2, 3] = shift[1], -shift[0]
-    chosen = [0, 1, 2, 5]
+    axes = [0, 1, 2, 5]
     doubt = None
     off = float(np.sqrt(np.square(residual[:8]).sum() / 4))
     if off > sigmas * (2 * plane.corner_error) or np.linalg.norm(state[3:5]) > sigmas * _LEANING:
@@ -197,7 +197,7 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
     return ObjectPose(
         state[:3] - shift,
         float(yaw),
-        lever @ spread[np.ix_(chosen, chosen)] @ lever.T,
+        lever @ spread[np.ix_(axes, axes)] @ lever.T,
         shared,
         doubt=doubt,
         misfit=float(np.linalg.norm(residual[:8])) / math.sqrt(_LEFT_OVER),
@@ -212,26 +212,26 @@ def _level_start(plane: CameraPlane, corners: Floats, tag: MountedTag) -> Floats
     along = along + np.array([left[1], -left[0]])
     eye = -plane.rotation.T @ plane.pose[3:]
     centre = np.append(places.mean(axis=0), tag.z)
-    there = eye + (centre - eye) * (4 * tag.size / np.linalg.norm(along))
-    return np.append(there, math.atan2(along[1], along[0]))
+    place = eye + (centre - eye) * (4 * tag.size / np.linalg.norm(along))
+    return np.append(place, math.atan2(along[1], along[0]))
 
 
-def fused(poses: Sequence[ObjectPose]) -> ObjectPose:
+def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
     """Return one pose from those of several tags on one object, each weighted by its covariance."""
     if len(poses) == 1:
         return poses[0]
     first = poses[0].yaw
     states = np.array(
-        [[*each.place, first + math.remainder(each.yaw - first, 2 * math.pi)] for each in poses]
+        [[*pose.place, first + math.remainder(pose.yaw - first, 2 * math.pi)] for pose in poses]
     )
-    weights = [np.linalg.pinv(each.spread, hermitian=True, rcond=1e-12) for each in poses]
+    weights = [np.linalg.pinv(pose.spread, hermitian=True, rcond=1e-12) for pose in poses]
     spread = np.linalg.pinv(sum(weights, np.zeros((4, 4))), hermitian=True, rcond=1e-12)
     mean = spread @ sum((w @ x for w, x in zip(weights, states, strict=True)), np.zeros(4))
     # tags that contradict each other beyond their noise: what the file says of them is not exact
     off = states - mean
     excess = sum(float(x @ w @ x) for w, x in zip(weights, off, strict=True)) / max(3 * (len(poses) - 1), 1)
-    shared = np.max([each.shared for each in poses], axis=0)
-    parallax = max(each.parallax for each in poses)
+    shared = np.max([pose.shared for pose in poses], axis=0)
+    parallax = max(pose.parallax for pose in poses)
     return ObjectPose(mean[:3], float(mean[3]), spread * max(excess, 1.0), shared, parallax)
 
 
@@ -273,22 +273,23 @@ def simultaneous(
         offsets_ns: what is added to the stamps of each camera; nothing unless given.
     """
     offsets = [*offsets_ns, *[0] * (len(cameras) - len(offsets_ns))]
-    shifted = [_shifted(frames, offset) for frames, offset in zip(cameras, offsets, strict=True)]
+    shifted = [_shift(frames, offset) for frames, offset in zip(cameras, offsets, strict=True)]
     if len(cameras) == 1:
         # nothing to wait for
         yield from ((frame,) for frame in shifted[0])
         return
     coming = [_Coming(frames) for frames in shifted]
-    while present := [each for each in coming if each.now is not None]:
-        gaps = [each.gap_ns for each in present if each.gap_ns]
-        first_ns = min(each.time_ns for each in present)
+    while present := [camera for camera in coming if camera.now is not None]:
+        gaps = [camera.gap_ns for camera in present if camera.gap_ns]
+        first_ns = min(camera.time_ns for camera in present)
         last_ns = first_ns + (min(gaps) // 2 if gaps else 0)
         yield tuple(
-            each.take() if each.now is not None and each.time_ns <= last_ns else None for each in coming
+            camera.take() if camera.now is not None and camera.time_ns <= last_ns else None
+            for camera in coming
         )
 
 
-def _shifted(frames: Iterable[Frame], offset_ns: int) -> Iterator[Frame]:
+def _shift(frames: Iterable[Frame], offset_ns: int) -> Iterator[Frame]:
     return (replace(frame, time_ns=frame.time_ns + offset_ns) if offset_ns else frame for frame in frames)
 
 
@@ -311,9 +312,9 @@ class _Coming:
 
     def take(self) -> Frame | None:
         """Return the frame that comes next, and go on."""
-        taken, self.now = self.now, self._later
+        frame, self.now = self.now, self._later
         self._later = next(self._frames, None)
-        return taken
+        return frame
 
 
 def camera_names(cameras: Sequence[Any]) -> list[str]:
@@ -324,7 +325,7 @@ def camera_names(cameras: Sequence[Any]) -> list[str]:
     """
     if not cameras:
         raise UsageError("there is no camera; give the frames of one or more")
-    return [str(getattr(each, "topic", "") or getattr(each, "name", "")) for each in cameras]
+    return [str(getattr(camera, "topic", "") or getattr(camera, "name", "")) for camera in cameras]
 
 
 # ------------------------------------------------------------------------------------------------- one camera
@@ -406,7 +407,9 @@ class CameraView:
             detections = self._detector.detect(frame.image)
             height, width = frame.image.shape[:2]
         else:
-            detections = [each for each in frame.detections if each.family in ("", self.tags.family)]
+            detections = [
+                detection for detection in frame.detections if detection.family in ("", self.tags.family)
+            ]
             width, height = self._size_without_image()
         usable = self._single(detections)
         if self._size != (width, height):
@@ -427,27 +430,31 @@ class CameraView:
 
     def _single(self, detections: Iterable[Detection]) -> dict[int, Floats]:
         """Return the corners of the tags that are in the image once: of two, no one knows which it is."""
-        times = Counter(each.id for each in detections)
+        times = Counter(detection.id for detection in detections)
         self.seen.update(times.keys())
         self.twice.update(number for number, count in times.items() if count > 1)
-        return {each.id: each.corners for each in detections if times[each.id] == 1}
+        return {detection.id: detection.corners for detection in detections if times[detection.id] == 1}
 
     def _refer(self, corners: Mapping[int, Floats]) -> None:
         """Take in the reference tags, and fit the plane again while their averages still change."""
         if not self.tags.references or self.tags.pose is not None:
             return
-        present = {each.id: corners[each.id] for each in self.tags.references if each.id in corners}
+        present = {
+            reference.id: corners[reference.id]
+            for reference in self.tags.references
+            if reference.id in corners
+        }
         before = {number: self._averages[number] for number in present if number in self._averages}
         off = [float(np.linalg.norm(present[n] - mean, axis=1).mean()) for n, (mean, _) in before.items()]
         if off and float(np.median(off)) > _MOVED:
             self.moved += 1
             self._averages.clear()
         is_new = False
-        for number, each in present.items():
-            mean, count = self._averages.get(number, (each, 0))
+        for number, reference_corners in present.items():
+            mean, count = self._averages.get(number, (reference_corners, 0))
             if count < _MOST_AVERAGED:
                 is_new = True
-                self._averages[number] = (mean + (each - mean) / (count + 1), count + 1)
+                self._averages[number] = (mean + (reference_corners - mean) / (count + 1), count + 1)
         if not is_new:
             return
         if len(self._averages) < LEAST_REFERENCES:
@@ -475,8 +482,8 @@ class CameraView:
             poses |= zip(flat, poses_on_plane(plane, of_flat, mounted, sigmas), strict=True)
         if isinstance(plane, CameraPlane):
             for number in present:
-                found, tag = self.tags.by_id[number]
-                pose = pose_in_space(plane, corners[number], tag, sigmas) if found.is_lifted else None
+                tagged, tag = self.tags.by_id[number]
+                pose = pose_in_space(plane, corners[number], tag, sigmas) if tagged.is_lifted else None
                 if pose is not None:
                     poses[number] = pose
         poses = {number: self._with_misfits(plane, number, pose) for number, pose in poses.items()}
@@ -507,7 +514,7 @@ class CameraView:
                 f" {LEAST_REFERENCES} of them once in a frame while the camera stood still"
             )
         were = "was" if len(absent) == 1 else "were"
-        return f"fewer than {LEAST_REFERENCES} reference tags were seen; {tags_listed(absent)} {were} not"
+        return f"fewer than {LEAST_REFERENCES} reference tags were seen; {tags_text(absent)} {were} not"
 
     def remarks(self) -> list[str]:
         """Return what is worth knowing: that the camera saw nothing, not the plane, or has moved."""
@@ -547,7 +554,7 @@ class CameraView:
         return lines
 
 
-def tags_listed(numbers: list[str]) -> str:
+def tags_text(numbers: list[str]) -> str:
     """Return tags as a sentence lists them, the first of many."""
     return f"tag{'s' if len(numbers) > 1 else ''} {listed(numbers, _MOST_NAMED)}"
 
@@ -606,7 +613,7 @@ class TagObserver:
         ]
         self._last: dict[str, tuple[int, TrackedObject]] = {}
         self._hidden: dict[str, str | None] = {}
-        self._outlines = {each.name: _outline(each.footprint) for each in tags.objects}
+        self._outlines = {tagged.name: _outline(tagged.footprint) for tagged in tags.objects}
         self._doubts: dict[str, tuple[str, int]] = {}
         self._apart: dict[str, tuple[float, int]] = {}
         self.frames = self._last_ns = 0
@@ -647,20 +654,20 @@ class TagObserver:
             view = None
             if frame is not None:
                 try:
-                    view, found = camera.look(frame)
+                    view, poses_by_tag = camera.look(frame)
                 except UsageError as error:
                     raise UsageError(f"{camera.name}: {error}" if camera.name else str(error)) from None
-                poses.append((abs(frame.time_ns - time_ns), found))
+                poses.append((abs(frame.time_ns - time_ns), poses_by_tag))
             views.append(view)
-        objects = dict(self._located(poses))
-        held = self._held(time_ns, objects)
+        objects = dict(self._locate(poses))
+        held = self._hold(time_ns, objects)
         reported_ns = {name: self._last[name][0] for name in held}
         sample = Sample(time_ns, {**objects, **held}, unknown=self._hidden, reported_ns=reported_ns)
         return Observation(sample, tuple(views))
 
     # ------------------------------------------------------------------------------------- the objects
 
-    def _located(
+    def _locate(
         self, poses: Sequence[tuple[int, Mapping[int, ObjectPose]]]
     ) -> Iterator[tuple[str, TrackedObject]]:
         """Yield the objects whose tags are in an image, where nothing speaks against their places.
@@ -668,65 +675,72 @@ class TagObserver:
         Args:
             poses: of each camera that has a frame: by how much it is off in time, and the poses by tag.
         """
-        for each in self.tags.objects:
-            own = [(off, found[tag.id]) for off, found in poses for tag in each.tags if tag.id in found]
-            for _, pose in own:
+        for tagged in self.tags.objects:
+            poses_of_object = [
+                (off, poses_by_tag[tag.id])
+                for off, poses_by_tag in poses
+                for tag in tagged.tags
+                if tag.id in poses_by_tag
+            ]
+            for _, pose in poses_of_object:
                 if pose.doubt is not None:
-                    text, count = self._doubts.get(each.name, (pose.doubt, 0))
-                    self._doubts[each.name] = text, count + 1
-            sound = [(off, pose) for off, pose in own if pose.doubt is None]
+                    text, count = self._doubts.get(tagged.name, (pose.doubt, 0))
+                    self._doubts[tagged.name] = text, count + 1
+            sound = [(off, pose) for off, pose in poses_of_object if pose.doubt is None]
             # frames that are off in time are taken where they make the object more certain
             found_at = [
-                self._tracked(each, fused([pose for off, pose in sound if off <= latest]), latest)
+                self._track(tagged, fuse([pose for off, pose in sound if off <= latest]), latest)
                 for latest in sorted({off for off, _ in sound})
             ]
-            self._compare(each, [pose for _, pose in sound])
+            self._compare(tagged, [pose for _, pose in sound])
             if found_at:
-                yield each.name, min(found_at, key=lambda tracked: tracked.uncertainty)
+                yield tagged.name, min(found_at, key=lambda tracked: tracked.uncertainty)
 
-    def _compare(self, each: TaggedObject, poses: Sequence[ObjectPose]) -> None:
+    def _compare(self, tagged: TaggedObject, poses: Sequence[ObjectPose]) -> None:
         """Take note of tags that place an object further apart than it is large, beyond what is uncertain."""
         if len(poses) < 2:
             return
-        outline = self._outlines[each.name]
+        outline = self._outlines[tagged.name]
         size = 2 * max(
-            float(np.linalg.norm(outline, axis=1).max()), *(part.radius for part in each.footprint.parts)
+            float(np.linalg.norm(outline, axis=1).max()), *(part.radius for part in tagged.footprint.parts)
         )
         unsure = 2 * max(radius(pose, outline, self.tags.sigmas) for pose in poses)
         apart = max(float(np.linalg.norm((poses[0].place - pose.place)[:2])) for pose in poses)
         if apart > size + unsure:
-            most, count = self._apart.get(each.name, (0.0, 0))
-            self._apart[each.name] = max(most, apart), count + 1
+            most, count = self._apart.get(tagged.name, (0.0, 0))
+            self._apart[tagged.name] = max(most, apart), count + 1
 
-    def _tracked(self, each: TaggedObject, pose: ObjectPose, off_ns: int) -> TrackedObject:
-        height = each.height
-        if height is not None and each.is_lifted:
+    def _track(self, tagged: TaggedObject, pose: ObjectPose, off_ns: int) -> TrackedObject:
+        height = tagged.height
+        if height is not None and tagged.is_lifted:
             height = height[0] + float(pose.place[2]), height[1] + float(pose.place[2])
         return TrackedObject(
-            _moved(each.footprint, float(pose.place[0]), float(pose.place[1]), pose.yaw),
-            class_name=each.class_name,
+            _move(tagged.footprint, float(pose.place[0]), float(pose.place[1]), pose.yaw),
+            class_name=tagged.class_name,
             yaw=math.remainder(pose.yaw, 2 * math.pi),
             height=height,
-            uncertainty=radius(pose, self._outlines[each.name], self.tags.sigmas)
-            + each.fastest * off_ns / 1e9,
+            uncertainty=radius(pose, self._outlines[tagged.name], self.tags.sigmas)
+            + tagged.fastest * off_ns / 1e9,
         )
 
-    def _held(self, time_ns: int, objects: Mapping[str, TrackedObject]) -> dict[str, TrackedObject]:
+    def _hold(self, time_ns: int, objects: Mapping[str, TrackedObject]) -> dict[str, TrackedObject]:
         """Return the hidden objects that are held; remember where the others are, and which are unknown."""
         held: dict[str, TrackedObject] = {}
-        for each in self.tags.objects:
-            if each.name in objects:
-                self._last[each.name] = time_ns, objects[each.name]
-                self._hidden.pop(each.name, None)
-            elif each.name in self._last:
-                since_ns, last = self._last[each.name]
+        for tagged in self.tags.objects:
+            if tagged.name in objects:
+                self._last[tagged.name] = time_ns, objects[tagged.name]
+                self._hidden.pop(tagged.name, None)
+            elif tagged.name in self._last:
+                since_ns, last = self._last[tagged.name]
                 if time_ns - since_ns <= self.hold_ns:
-                    grown = last.uncertainty + each.fastest * (time_ns - since_ns) / 1e9
+                    grown = last.uncertainty + tagged.fastest * (time_ns - since_ns) / 1e9
                     # a yaw has no uncertainty: of what may have turned, it is unknown
-                    yaw = None if each.fastest else last.yaw
-                    held[each.name] = TrackedObject(last.footprint, last.class_name, yaw, last.height, grown)
+                    yaw = None if tagged.fastest else last.yaw
+                    held[tagged.name] = TrackedObject(
+                        last.footprint, last.class_name, yaw, last.height, grown
+                    )
                 else:
-                    self._hidden[each.name] = each.class_name
+                    self._hidden[tagged.name] = tagged.class_name
         return held
 
     # ------------------------------------------------------------------------------------- remarks
@@ -740,21 +754,21 @@ class TagObserver:
         lines: list[str] = []
         unmapped = [number for number in sorted(seen) if number not in self.tags.ids]
         if unmapped:
-            listed = [f"{number} (in {counted(seen[number], 'frame')})" for number in unmapped]
-            lines.append(f"{self.tags.name} has no {tags_listed(listed)}")
-        missing = [each for each in self.tags.objects if not any(tag.id in seen for tag in each.tags)]
+            tag_texts = [f"{number} (in {counted(seen[number], 'frame')})" for number in unmapped]
+            lines.append(f"{self.tags.name} has no {tags_text(tag_texts)}")
+        missing = [tagged for tagged in self.tags.objects if not any(tag.id in seen for tag in tagged.tags)]
         frames = counted(sum(camera.frames for camera in self._cameras), "frame")
         lines += [
-            f"{each.name} was never seen: no {tags_listed([str(tag.id) for tag in each.tags])} in {frames}"
-            for each in missing[:_MOST_NAMED]
+            f"{tagged.name} was never seen: no {tags_text([str(tag.id) for tag in tagged.tags])} in {frames}"
+            for tagged in missing[:_MOST_NAMED]
         ]
         lines += of_cameras
-        for each_name, (text, count) in sorted(self._doubts.items()):
-            lines.append(f"{each_name} is unknown in {counted(count, 'frame')}: {text}")
-        for each_name, (most, count) in sorted(self._apart.items()):
+        for object_name, (text, count) in sorted(self._doubts.items()):
+            lines.append(f"{object_name} is unknown in {counted(count, 'frame')}: {text}")
+        for object_name, (most, count) in sorted(self._apart.items()):
             where = f"in {counted(count, 'frame')}, by up to {most:.3g} {self.tags.unit}"
             lines.append(
-                f"{each_name}: its tags contradict each other {where}; check their places on it, and of"
+                f"{object_name}: its tags contradict each other {where}; check their places on it, and of"
                 " cameras the pose and the --offset"
             )
         return tuple(lines)
@@ -785,7 +799,7 @@ def _outline(footprint: Footprint) -> Floats:
     return np.concatenate([part.vertices for part in footprint.parts])
 
 
-def _moved(footprint: Footprint, x: float, y: float, yaw: float) -> Footprint:
+def _move(footprint: Footprint, x: float, y: float, yaw: float) -> Footprint:
     cosine, sine = math.cos(yaw), math.sin(yaw)
     turn = np.array([[cosine, sine], [-sine, cosine]])
     return Footprint(

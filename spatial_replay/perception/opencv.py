@@ -194,11 +194,11 @@ def refined_corners(grey: Image, corners: Floats, cells: int) -> Floats:
     if not len(corners):
         return corners
     for share in (1.0, _SECOND):
-        corners = _refined(grey, corners, cells, share)
+        corners = _refine(grey, corners, cells, share)
     return corners
 
 
-def _refined(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
+def _refine(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
     ahead = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(ahead, axis=2)
     along = ahead / length[..., None]
@@ -220,10 +220,10 @@ def _refined(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
         at = (weight * steps).sum(axis=-1) / total
     total = np.where(np.isfinite(at), total, 0.0)
     # the line through the steps of each edge: offset = a + b * share, with little weight on faint ones
-    found = np.minimum(total, np.median(total, axis=-1, keepdims=True))
-    sums = [(found * shares**power).sum(axis=-1) for power in range(3)]
+    weights = np.minimum(total, np.median(total, axis=-1, keepdims=True))
+    sums = [(weights * shares**power).sum(axis=-1) for power in range(3)]
     at = np.nan_to_num(at)
-    moments = [(found * at * shares**power).sum(axis=-1) for power in range(2)]
+    moments = [(weights * at * shares**power).sum(axis=-1) for power in range(2)]
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (sums[0] * moments[1] - sums[1] * moments[0]) / (sums[0] * sums[2] - sums[1] ** 2)
         begin = (moments[0] - slope * sums[1]) / sums[0]
@@ -349,8 +349,11 @@ class TagDetector:
             return []
         ours = np.array(corners, np.float64).reshape(-1, 4, 2)[:, _OURS_FROM_OPENCV]
         refined = refined_corners(grey, ours, self._cells)
-        found = [Detection(int(number), each) for number, each in zip(np.ravel(ids), refined, strict=True)]
-        return sorted(found, key=lambda each: (each.id, *each.corners[0].tolist()))
+        detections = [
+            Detection(int(number), tag_corners)
+            for number, tag_corners in zip(np.ravel(ids), refined, strict=True)
+        ]
+        return sorted(detections, key=lambda tag: (tag.id, *tag.corners[0].tolist()))
 
 
 def corners_from_apriltag(corners: Floats) -> Floats:
@@ -385,10 +388,10 @@ def fit_pose(points: Floats, pixels: Floats, camera: Camera) -> Floats | None:
     appear at pixels (N, 2); None if there is none."""
     cv2 = _load()
     matrix, distortion = camera.matrix, np.array(camera.distortion)
-    found, turn, shift = cv2.solvePnP(
+    is_solved, turn, shift = cv2.solvePnP(
         np.ascontiguousarray(points), np.ascontiguousarray(pixels), matrix, distortion
     )
-    if not found:
+    if not is_solved:
         return None
     turn, shift = cv2.solvePnPRefineLM(points, np.ascontiguousarray(pixels), matrix, distortion, turn, shift)
     pose = np.concatenate([turn.ravel(), shift.ravel()]).astype(np.float64)
@@ -426,14 +429,14 @@ def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int])
     cv2 = _load()
     # k3 is left out: from tags on a sheet it is seldom determined
     rms, matrix, distortion, _, _, spread, *_ = cv2.calibrateCameraExtended(
-        [np.asarray(each, np.float32) for each in points],
-        [np.asarray(each, np.float32).reshape(-1, 1, 2) for each in pixels],
+        [np.asarray(view, np.float32) for view in points],
+        [np.asarray(view, np.float32).reshape(-1, 1, 2) for view in pixels],
         size,
         None,
         None,
         flags=cv2.CALIB_FIX_K3,
     )
-    numbers = tuple(round(float(each), 8) for each in np.ravel(distortion)[:4])
+    numbers = tuple(round(float(coefficient), 8) for coefficient in np.ravel(distortion)[:4])
     camera = Camera(
         (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2])), size, numbers
     )

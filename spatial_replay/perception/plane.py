@@ -117,8 +117,8 @@ class HomographyPlane:
         moved[np.arange(8, 16), np.arange(8)] -= steps
         inverse = np.linalg.inv(moved.reshape(16, 3, 3))
         homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-        there = np.einsum("kij,nj->kni", inverse, homogeneous)
-        places = there[..., :2] / there[..., 2:]
+        homogeneous_places = np.einsum("kij,nj->kni", inverse, homogeneous)
+        places = homogeneous_places[..., :2] / homogeneous_places[..., 2:]
         derivative = (places[:8] - places[8:]) / (2 * steps)[:, None, None]
         return np.asarray(np.einsum("kni,kl,lnj->nij", derivative, self.spread, derivative), np.float64)
 
@@ -203,32 +203,32 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     Raises:
         UsageError: they do not fit, or the plane is seen edge-on.
     """
-    references = [each for each in tags.references if each.id in corners]
-    known = np.concatenate([each.corners for each in references])
-    seen = np.concatenate([corners[each.id] for each in references])
-    solved = _solved(known, seen, tags.camera)
+    references = [tag for tag in tags.references if tag.id in corners]
+    known_corners = np.concatenate([tag.corners for tag in references])
+    seen = np.concatenate([corners[tag.id] for tag in references])
+    solved = _solve(known_corners, seen, tags.camera)
     if solved is None:
         raise UsageError(f"{tags.name}: {_edge_on()}")
-    found, (fitted, derivative) = solved, _appearing(known, solved, tags.camera)
+    solution, (fitted, derivative) = solved, _appearing(known_corners, solved, tags.camera)
     off = np.linalg.norm(fitted - seen, axis=1)
     unknowns = derivative.shape[-1]
     rms = float(np.sqrt(np.square(off).sum() / max(2 * len(off) - unknowns, 1)))
     by_tag = off.reshape(-1, 4).mean(axis=1)
     place = int(by_tag.argmax())
     worst = references[place].id, float(by_tag[place])
-    _refuse_misfit(tags, references, by_tag, seen, known)
+    _refuse_misfit(tags, references, by_tag, seen, known_corners)
     error = tags.corner_error or max(rms, LEAST_CORNER_ERROR)
     flat_derivative = derivative.reshape(-1, unknowns)
     # a place that is wrong by some length moves the tag's corners by that many pixels
-    per_pixel = _pixels_per_unit(seen, known)
+    per_pixel = _pixels_per_unit(seen, known_corners)
     variance = error**2 + (tags.reference_error * per_pixel) ** 2
     spread = np.asarray(variance * np.linalg.pinv(flat_derivative.T @ flat_derivative), np.float64)
     plane: Plane
     if tags.camera is None:
-        plane = HomographyPlane(found, spread, error, size)
+        plane = HomographyPlane(solution, spread, error, size)
     else:
-        plane = CameraPlane(tags.camera, found, spread, error)
-    _refuse_edge_on(tags, seen, known)
+        plane = CameraPlane(tags.camera, solution, spread, error)
+    _refuse_edge_on(tags, seen, known_corners)
     return Fit(plane, rms, worst)
 
 
@@ -257,9 +257,9 @@ def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
 
 def _through(matrix: Floats, points: Floats) -> Floats:
     """Return points (…, 2) moved by a homography."""
-    there = points @ matrix[:, :2].T + matrix[:, 2]
+    homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        moved: Floats = there[..., :2] / there[..., 2:]
+        moved: Floats = homogeneous[..., :2] / homogeneous[..., 2:]
     return moved
 
 
@@ -275,19 +275,19 @@ def _cast(directions: Floats, rotation: Floats, shift: Floats, z: Floats) -> Flo
 
 def _homography_jacobian(matrix: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Return where points (N, 2) go, and the derivative (N, 2, 8) by the matrix without its last entry."""
-    there = points @ matrix[:, :2].T + matrix[:, 2]
-    u, v, w = there.T
+    homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
+    u, v, w = homogeneous.T
     x, y = points.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    first = np.stack([x, y, one, zero, zero, zero, -u / w * x, -u / w * y], axis=1) / w[:, None]
-    second = np.stack([zero, zero, zero, x, y, one, -v / w * x, -v / w * y], axis=1) / w[:, None]
-    return there[:, :2] / w[:, None], np.stack([first, second], axis=1)
+    zero, ones = np.zeros_like(x), np.ones_like(x)
+    first = np.stack([x, y, ones, zero, zero, zero, -u / w * x, -u / w * y], axis=1) / w[:, None]
+    second = np.stack([zero, zero, zero, x, y, ones, -v / w * x, -v / w * y], axis=1) / w[:, None]
+    return homogeneous[:, :2] / w[:, None], np.stack([first, second], axis=1)
 
 
 def _pixels_per_unit(seen: Floats, known: Floats) -> float:
     """Return how many pixels a unit of the plane takes at most, from the edges of tags."""
-    edges = [np.diff(each.reshape(-1, 4, 2), axis=1).reshape(-1, 2) for each in (seen, known)]
-    lengths = [np.linalg.norm(each, axis=1) for each in edges]
+    edges = [np.diff(corners.reshape(-1, 4, 2), axis=1).reshape(-1, 2) for corners in (seen, known)]
+    lengths = [np.linalg.norm(edge, axis=1) for edge in edges]
     return float((lengths[0] / lengths[1]).max())
 
 
@@ -302,7 +302,7 @@ def _refuse_misfit(
     for turns in (2, 1, 3):
         # the corners of all tags, each counted from another one
         turned = np.roll(known.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)
-        solved = _solved(turned, seen, tags.camera)
+        solved = _solve(turned, seen, tags.camera)
         if solved is not None and _off_by_tag(turned, seen, solved, tags.camera).max() <= limit:
             raise UsageError(
                 f"{tags.name}: the reference tags fit each other only if all are turned by {90 * turns}"
@@ -327,25 +327,29 @@ def _refuse_misfit(
 def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float, float] | None:
     """Return the place of the tag without which the others fit best, its offset from where they place it, and
     their greatest offset, in pixels."""
-    found: list[tuple[float, int, float]] = []
+    candidates: list[tuple[float, int, float]] = []
     for place in range(len(known) // 4):
         others = np.arange(len(known)) // 4 != place
-        solved = _solved(known[others], seen[others], tags.camera)
+        solved = _solve(known[others], seen[others], tags.camera)
         if solved is not None:
             by_tag = _off_by_tag(known, seen, solved, tags.camera)
-            found.append((float(np.delete(by_tag, place).max()), place, float(by_tag[place])))
-    if not found:
+            candidates.append((float(np.delete(by_tag, place).max()), place, float(by_tag[place])))
+    if not candidates:
         return None
-    most, place, away = min(found)
+    most, place, away = min(candidates)
     return place, away, most
 
 
-def _solved(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
+def _solve(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
     """Return the homography (3, 3), or with a camera its pose (6,), with which places appear at pixels."""
     if camera is not None:
         return fit_pose(_flat(known), seen, camera)
-    found = fit_homography(known, seen)
-    return None if found is None or abs(found[2, 2]) < 1e-12 else np.asarray(found / found[2, 2])
+    homography = fit_homography(known, seen)
+    return (
+        None
+        if homography is None or abs(homography[2, 2]) < 1e-12
+        else np.asarray(homography / homography[2, 2])
+    )
 
 
 def _appearing(known: Floats, found: Floats, camera: Camera | None) -> tuple[Floats, Floats]:
@@ -365,7 +369,7 @@ def _flat(places: Floats) -> Floats:
 
 def _refuse_edge_on(tags: TagsFile, seen: Floats, known: Floats) -> None:
     """Check that the tags are not seen as lines."""
-    areas = [np.abs(_areas(each.reshape(-1, 4, 2))) for each in (seen, known)]
+    areas = [np.abs(_areas(corners.reshape(-1, 4, 2))) for corners in (seen, known)]
     longest = np.linalg.norm(np.diff(seen.reshape(-1, 4, 2), axis=1), axis=2).max(axis=1)
     if float(np.median(areas[0] / longest**2)) < _LEAST_SLANT:
         raise UsageError(f"{tags.name}: {_edge_on()}")

@@ -122,7 +122,7 @@ class TagsFile:
     @property
     def ids(self) -> frozenset[int]:
         """All tags that it names."""
-        return frozenset([*self.by_id, *(each.id for each in self.references)])
+        return frozenset([*self.by_id, *(reference.id for reference in self.references)])
 
     def of_camera(self, name: str, number: int = 1, *, count: int = 1) -> TagsFile:
         """Return what the file says for one of several cameras.
@@ -136,14 +136,14 @@ class TagsFile:
             UsageError: the file does not say what this one does, or says that all have one pose or one image.
         """
         if self.cameras:
-            found = self.cameras.get(name, self.cameras.get(str(number)))
-            if found is None:
-                listed = ", ".join(self.cameras)
+            camera = self.cameras.get(name, self.cameras.get(str(number)))
+            if camera is None:
+                camera_names = ", ".join(self.cameras)
                 raise UsageError(
-                    f"{self.name} has no camera {name or number}; its cameras are {listed}; name this one"
-                    f" by its video or topic, or by its number, {number}"
+                    f"{self.name} has no camera {name or number}; its cameras are {camera_names}; name this"
+                    f" one by its video or topic, or by its number, {number}"
                 )
-            return replace(self, camera=found[0], pose=found[1])
+            return replace(self, camera=camera[0], pose=camera[1])
         if count > 1 and self.is_image:
             raise UsageError(
                 f"{self.name}: plane: image is that of one camera; for several, give reference tags"
@@ -190,7 +190,7 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
         )
         references = () if is_image else tuple(_references(plane, size))
         pose = _pose(camera_value)
-        cameras = {each: (_camera(entry), _pose(entry)) for each, entry in several.items()}
+        cameras = {camera_name: (_camera(entry), _pose(entry)) for camera_name, entry in several.items()}
     except (UsageError, GeometryError) as error:
         raise UsageError(f"{name}: {error}") from None
     return TagsFile(
@@ -206,7 +206,7 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
         reference_error=0.0 if is_image else _length(plane.get("error", 0.0)),
         sigmas=float(value.get("sigmas", 4.0)),
         hold_ns=duration_ns_from_text(value["hold"]) if "hold" in value else 0,
-        by_id=MappingProxyType({tag.id: (each, tag) for each in objects for tag in each.tags}),
+        by_id=MappingProxyType({tag.id: (tagged, tag) for tagged in objects for tag in tagged.tags}),
         text=text,
     )
 
@@ -221,8 +221,8 @@ def _object(
     top = level if interval is None or _is_image(defaults) else interval[1]
     mounted = entry["tags"] if "tags" in entry else [entry["tag"]]
     tags = []
-    for each in mounted:
-        tag = each if isinstance(each, dict) else {"id": each}
+    for mounting in mounted:
+        tag = mounting if isinstance(mounting, dict) else {"id": mounting}
         z = _length(tag.get("z", top)) - level
         tags.append(_tag(tag["id"], tag, 0.0 if size is None else size, z))
     return TaggedObject(
@@ -238,11 +238,11 @@ def _object(
 
 def _footprint(entry: Mapping[str, Any]) -> Footprint:
     if "box" in entry:
-        length, width = (_length(each) / 2 for each in entry["box"])
+        length, width = (_length(side) / 2 for side in entry["box"])
         return Footprint.box(-length, -width, length, width)
     if "disc" in entry:
         return Footprint.disc(0.0, 0.0, _length(entry["disc"]))
-    return Footprint.polygon([[_length(each) for each in corner] for corner in entry["polygon"]])
+    return Footprint.polygon([[_length(coordinate) for coordinate in corner] for corner in entry["polygon"]])
 
 
 def _references(plane: Mapping[str, Any], size: Any) -> Iterator[MountedTag]:
@@ -252,7 +252,7 @@ def _references(plane: Mapping[str, Any], size: Any) -> Iterator[MountedTag]:
 
 
 def _tag(number: int, entry: Mapping[str, Any], size: Any, z: float = 0.0) -> MountedTag:
-    x, y = (_length(each) for each in entry.get("at", (0.0, 0.0)))
+    x, y = (_length(coordinate) for coordinate in entry.get("at", (0.0, 0.0)))
     return MountedTag(number, _length(entry.get("size", size)), x, y, _angle(entry.get("yaw", 0.0)), z)
 
 
@@ -272,7 +272,9 @@ def _pose(camera: Mapping[str, Any]) -> Floats | None:
     value = camera.get("pose")
     if value is None:
         return None
-    eye, target = (np.array([_length(each) for each in value[key]]) for key in ("position", "look_at"))
+    eye, target = (
+        np.array([_length(coordinate) for coordinate in value[key]]) for key in ("position", "look_at")
+    )
     return pose_looking_at(eye, target, np.array(value.get("up", (0.0, 0.0, 1.0)), np.float64))
 
 
@@ -349,36 +351,38 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             faults.append((place, "give either tag, a number, or tags, a list"))
         tags = entry["tags"] if isinstance(entry.get("tags"), list) else [entry.get("tag")]
         for index, tag in enumerate(tags):
-            own = (*place, "tags", index) if "tags" in entry else (*place, "tag")
-            use(tag.get("id") if isinstance(tag, dict) else tag, own, f"on {name}")
+            tag_place = (*place, "tags", index) if "tags" in entry else (*place, "tag")
+            use(tag.get("id") if isinstance(tag, dict) else tag, tag_place, f"on {name}")
             if isinstance(tag, dict) and tag.get("z") and _is_image(value):
-                faults.append((own, "an image has no heights; leave z out, or give reference tags"))
+                faults.append((tag_place, "an image has no heights; leave z out, or give reference tags"))
             has_size = "size" in value or (isinstance(tag, dict) and "size" in tag)
             if entry.get("lifted") and not has_size:
-                faults.append((own, "a lifted object is found by the size of its tags; give size"))
+                faults.append((tag_place, "a lifted object is found by the size of its tags; give size"))
         if entry.get("lifted") and not camera:
             faults.append(
                 (place, "lifted needs a calibrated camera; add camera (tags calibrate measures one)")
             )
     if isinstance(plane, dict) and isinstance(references, dict):
         for key, entry in references.items():
-            own = ("plane", "tags", key)
+            tag_place = ("plane", "tags", key)
             if not key.isdecimal():
-                faults.append((own, f"expected the number of a tag; got {key[:40]!r}"))
+                faults.append((tag_place, f"expected the number of a tag; got {key[:40]!r}"))
                 continue
-            use(int(key), own, "a reference tag")
+            use(int(key), tag_place, "a reference tag")
             own_size = isinstance(entry, dict) and "size" in entry
             if not own_size and "size" not in value and "size" not in plane:
-                faults.append((own, "the size of the tag is missing; give size for all, or for this one"))
+                faults.append(
+                    (tag_place, "the size of the tag is missing; give size for all, or for this one")
+                )
     each_camera = camera if "cameras" in value and isinstance(camera, dict) else {"camera": camera}
     lacking = [str(name) for name, of in each_camera.items() if not (isinstance(of, dict) and "pose" in of)]
     are_enough = isinstance(references, dict) and len(references) >= LEAST_REFERENCES
     if plane != "image" and lacking and not are_enough:
         least = f"{LEAST_REFERENCES} or more tags with known places"
-        other = "the camera with its pose, or write plane: image for pixels"
+        alternative = "the camera with its pose, or write plane: image for pixels"
         if "cameras" in value:
-            other = f"the pose of each camera; {lacking[0]} has none"
-        faults.append((("plane",), f"the plane is not determined: give {least}, or {other}"))
+            alternative = f"the pose of each camera; {lacking[0]} has none"
+        faults.append((("plane",), f"the plane is not determined: give {least}, or {alternative}"))
     return faults
 
 
@@ -386,8 +390,8 @@ def _reach(known: Any) -> float:
     """Return the diagonal of the box around reference tags, or a camera and the point that it looks at, in
     metres; inf where it is not known."""
     try:
-        entries = [each for key, each in known.items() if key != "up"]
-        places = [[*map(_length, each["at"] if isinstance(each, dict) else each)] for each in entries]
+        entries = [entry for key, entry in known.items() if key != "up"]
+        places = [[*map(_length, entry["at"] if isinstance(entry, dict) else entry)] for entry in entries]
         return float(np.linalg.norm(np.ptp(places, axis=0))) or math.inf
     except (AttributeError, KeyError, TypeError, ValueError, UsageError):
         return math.inf
@@ -407,8 +411,8 @@ def _beyond(value: Any, reach: float) -> str:
 def _plain_numbers(value: Any) -> Iterator[float]:
     """Yield the sizes of the numbers without a unit in a list, at any depth."""
     if isinstance(value, list):
-        for each in value:
-            yield from _plain_numbers(each)
+        for number in value:
+            yield from _plain_numbers(number)
     elif isinstance(value, int | float):
         yield abs(float(value))
 
@@ -416,7 +420,7 @@ def _plain_numbers(value: Any) -> Iterator[float]:
 def _outline_fault(corners: Any) -> str | None:
     """Return why the corners of a polygon enclose no footprint; None if they do, or are no corners."""
     try:
-        Footprint.polygon([[_length(each) for each in corner] for corner in corners])
+        Footprint.polygon([[_length(coordinate) for coordinate in corner] for corner in corners])
     except GeometryError as error:
         # what functions take, a tags file does not have
         return str(error).removesuffix(", or take its hull (concave='hull')")

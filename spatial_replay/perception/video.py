@@ -136,34 +136,34 @@ class Decoder:
             self._await(sent)
         decoded: list[Decoded] = []
         for frame in frames:
-            own = frame.opaque or sent
-            self._waiting = [each for each in self._waiting if each is not own]
-            decoded += self._never_shown(frame.pts)
-            decoded.append(self._judged(frame, own))
+            packet_of_frame = frame.opaque or sent
+            self._waiting = [waiting for waiting in self._waiting if waiting is not packet_of_frame]
+            decoded += self._skipped_frames(frame.pts)
+            decoded.append(self._judge(frame, packet_of_frame))
         if is_end or len(self._waiting) > _MOST_WAITING:
-            decoded += self._never_shown(None)
+            decoded += self._skipped_frames(None)
         return decoded
 
     def _await(self, sent: _Sent) -> None:
         if sent.after and sent.pts is not None:
             self._waiting.append(sent)
 
-    def _never_shown(self, pts: int | None) -> Iterator[Decoded]:
+    def _skipped_frames(self, pts: int | None) -> Iterator[Decoded]:
         """Yield empty frames for those due before a stamp: some decoders skip what they cannot draw."""
-        late = [each for each in self._waiting if pts is None or cast("int", each.pts) < pts]
-        self._waiting = [each for each in self._waiting if each not in late]
+        late = [waiting for waiting in self._waiting if pts is None or cast("int", waiting.pts) < pts]
+        self._waiting = [waiting for waiting in self._waiting if waiting not in late]
         width, height = self._context.width, self._context.height
-        for each in sorted(late, key=lambda sent: cast("int", sent.pts)):
-            if each.after > self._mended and width and height:
+        for late_packet in sorted(late, key=lambda sent: cast("int", sent.pts)):
+            if late_packet.after > self._mended and width and height:
                 frame = load_av().VideoFrame(width, height, "gray")
-                frame.pts, frame.time_base = each.pts, each.time_base
-                yield Decoded(each.of, frame, False)
+                frame.pts, frame.time_base = late_packet.pts, late_packet.time_base
+                yield Decoded(late_packet.of, frame, False)
 
-    def _judged(self, frame: Any, sent: _Sent) -> Decoded:
+    def _judge(self, frame: Any, sent: _Sent) -> Decoded:
         if frame.is_corrupt:
             self._mended = -1
         # a picture that is renewed strip by strip is called a key frame where that begins, but is predicted
-        elif frame.key_frame and frame.pict_type not in _predicted() and sent.before == sent.after:
+        elif frame.key_frame and frame.pict_type not in _predicted_kinds() and sent.before == sent.after:
             self._mended = max(self._mended, sent.after)
         return Decoded(sent.of, frame, sent.after <= self._mended)
 
@@ -191,18 +191,18 @@ class H264Decoder:
             packet.pts, packet.time_base = self._count, Fraction(1)
             self._count += 1
             try:
-                found = self._decoder.decode(packet, of)
+                decoded = self._decoder.decode(packet, of)
             except av.FFmpegError as error:
                 raise LogError(f"a frame cannot be decoded ({reason(error)})") from None
-            for each in found:
-                yield Shown(each.of, picture(each), each.is_true)
+            for frame in decoded:
+                yield Shown(frame.of, picture(frame), frame.is_true)
 
     def rest(self) -> Iterator[Shown]:
         """Yield what is held back; the decoder is then at its end."""
         if self._is_ready:
             with suppress(load_av().FFmpegError):
-                for each in self._decoder.decode(None):
-                    yield Shown(each.of, picture(each), each.is_true)
+                for frame in self._decoder.decode(None):
+                    yield Shown(frame.of, picture(frame), frame.is_true)
 
 
 class Untrue:
@@ -273,7 +273,7 @@ def reason(error: BaseException) -> str:
 
 
 @cache
-def _predicted() -> frozenset[Any]:
+def _predicted_kinds() -> frozenset[Any]:
     kinds = load_av().video.frame.PictureType
     return frozenset({kinds.P, kinds.B})
 
@@ -590,13 +590,13 @@ class VideoWriter:
         """Add a frame; an odd edge of the picture loses a row or column of pixels."""
         height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
         if self._stream is None:
-            self._stream = self._opened(width, height)
+            self._stream = self._open(width, height)
         picture = _to_encode(frame, (width, height))
         picture.time_base = _TICK
         picture.pts = round(frame.time_ns * _NS / _TICK)
         self._container.mux(self._stream.encode(picture))
 
-    def _opened(self, width: int, height: int) -> Any:
+    def _open(self, width: int, height: int) -> Any:
         stream = self._container.add_stream("libx264", rate=self._rate)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         context = stream.codec_context
