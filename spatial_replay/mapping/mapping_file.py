@@ -14,13 +14,16 @@ from collections.abc import Mapping as Table
 from dataclasses import dataclass
 from dataclasses import field as value_of
 from decimal import Decimal
+from functools import lru_cache
 from itertools import combinations
 from math import pi
 from os import PathLike
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.formats.episodes import AS_STORED, EpisodeReading
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text, schema_of
@@ -36,6 +39,8 @@ FOREVER_NS = 2**63 - 1
 
 NO_TOPIC = "no topic was chosen: name one with objects or signals"
 """Error of a mapping without topics."""
+NO_FEATURE = "no feature was chosen: name one with objects or signals"
+"""Error of a mapping without features."""
 NO_FRAME = "no frame was chosen: name the one that coordinates are brought into"
 """Error of a mapping with an open fixed frame."""
 
@@ -51,6 +56,7 @@ class ShapeMapping:
         kind: "box" (sizes: length along x, width along y, optionally height along z), "disc" (sizes: radius)
             or "polygon" (its corners as points, or as outline the path of them).
         offset: its centre (x, y) in the object's own frame, in footprint units.
+        height: its bottom and top above the object's own origin.
     """
 
     kind: Literal["box", "disc", "polygon"]
@@ -58,6 +64,7 @@ class ShapeMapping:
     points: tuple[tuple[float, float], ...] = ()
     outline: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
+    height: tuple[Measure, Measure] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +219,9 @@ class LogMapping:
         axes: those of the fixed frame, or of the messages without one.
         origin: latitude and longitude in degrees where the fixes of satellite receivers have (0, 0).
         accept: names of assumptions that may be contradicted.
+        features: entries of a data set's features, in the file's order; their `topic` is the feature.
+        episodes: how a data set is read.
+        shapes: by their names, for bodies that a data set names itself.
     """
 
     name: str
@@ -226,6 +236,9 @@ class LogMapping:
     axes: Axes = OUR_AXES
     origin: tuple[float, float] | None = None
     accept: tuple[str, ...] = ()
+    features: tuple[TopicMapping, ...] = ()
+    episodes: EpisodeReading = AS_STORED
+    shapes: Table[str, ShapeMapping] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
 
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
@@ -266,38 +279,47 @@ def load_mapping(path: str | PathLike[str]) -> LogMapping:
         MissingFileError: there is no such file.
         UsageError: the file is not a valid mapping; all errors are listed.
     """
-    name = log_file(path).name
-    if name.endswith(".spatial"):
-        raise UsageError(f"{name} is a specification, not a mapping; give it by --spec")
-    return parse_mapping(read_yaml_text(path), name)
+    file = log_file(path)
+    if file.name.endswith(".spatial"):
+        raise UsageError(f"{file.name} is a specification, not a mapping; give it by --spec")
+    return parse_mapping(read_yaml_text(path), file.name, file.parent if isinstance(file, Path) else None)
 
 
-def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
-    """Parse the text of a mapping file.
+@lru_cache(maxsize=8)
+def parse_mapping(text: str, name: str = "mapping", folder: Path | None = None) -> LogMapping:
+    """Parse the text of a mapping file; the last ones are parsed once.
 
     Args:
         name: of the file, for errors.
+        folder: where it lies: paths in it are relative to that.
 
     Raises:
         UsageError: the text is not a valid mapping; all errors are listed.
     """
     document = checked_document(text, name, schema_of("mapping", "mapping"), _contradictions, "a mapping")
     try:
-        return _mapping(document, name)
+        return _mapping(document, name, folder or Path())
     except UsageError as error:
         raise UsageError(f"{name}: {error}") from None
 
 
-def _mapping(document: Document, name: str) -> LogMapping:
+def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
     value: Any = document.value
     shapes = value.get("shapes") or {}
     sample = value.get("sample", {})
     # the hash ignores layout and comments: the same mapping has the same hash
     canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
-    entries = _entries(value["topics"])
-    topics = tuple(_topic_mapping(topic, entry or {}, shapes) for topic, _, entry in entries)
-    units = {signal.name: signal.unit for topic in topics for signal in topic.signals if signal.unit}
+    topics = tuple(
+        _topic_mapping(topic, entry or {}, shapes) for topic, _, entry in _entries(value, "topics")
+    )
+    features = tuple(
+        _topic_mapping(feature, _without_indices(entry), shapes)
+        for feature, _, entry in _entries(value, "features")
+    )
+    units = {
+        signal.name: signal.unit for entry in (*topics, *features) for signal in entry.signals if signal.unit
+    }
     return LogMapping(
         name=name,
         sha256=hashlib.sha256(canonical.encode("utf-8", "surrogatepass")).hexdigest(),
@@ -316,32 +338,79 @@ def _mapping(document: Document, name: str) -> LogMapping:
             value.get("unit", ""),
             units,
         ),
+        features=features,
+        episodes=EpisodeReading(
+            fps=float(value["fps"]) if "fps" in value else None,
+            label=value.get("label"),
+            model=folder / value["model"] if "model" in value else None,
+            order=value.get("order"),
+            assets=folder / value["assets"] if "assets" in value else None,
+        ),
+        shapes=MappingProxyType({name: shape for name in shapes if (shape := _shape(name, shapes))}),
     )
 
 
-def _entries(topics: Table[str, Any]) -> Iterator[tuple[str, Place, Any]]:
-    """Yield each topic with the place of an entry and the entry; a topic may have a list of them."""
-    for topic, entry in topics.items():
+def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any]]:
+    """Yield each topic or feature with the place of an entry and the entry; it may have a list of them."""
+    for name, entry in value.get(key, {}).items():
         if isinstance(entry, list):
-            yield from ((topic, ("topics", topic, index), part) for index, part in enumerate(entry))
+            yield from ((name, (key, name, index), part) for index, part in enumerate(entry))
         else:
-            yield topic, ("topics", topic), entry
+            yield name, (key, name), entry
+
+
+def _without_indices(entry: Any) -> Any:
+    """Return the entry of a feature, with `[3]` for the place 3."""
+
+    def as_text(place: Any) -> Any:
+        if isinstance(place, list):
+            return list(map(as_text, place))
+        if isinstance(place, dict):
+            return {**place, "field": as_text(place["field"])}
+        return f"[{place}]" if isinstance(place, int) else place
+
+    places = {key: as_text(entry[key]) for key in ("position", "orientation", "yaw") if key in entry}
+    if "signals" in entry:
+        places["signals"] = {name: as_text(place) for name, place in entry["signals"].items()}
+    return {**entry, **places}
+
+
+_OF_TOPICS = ("topics", "fixed_frame", "origin", "clock", "sample", "max_age", "ends")
+_OF_EPISODES = ("features", "label", "fps", "model", "assets", "order")
+"""Keys of logs of messages alone, and of data sets of episodes alone."""
+
+
+def _contradictions_of_kinds(value: Table[str, Any]) -> Iterator[tuple[Place, str]]:
+    """Yield keys for logs of messages among those for data sets, and a file without either."""
+    of_episodes = [key for key in _OF_EPISODES if key in value]
+    if not of_episodes and "topics" not in value:
+        yield (), "the key 'topics' is missing, or 'features' for a data set of episodes"
+    for key in _OF_TOPICS if of_episodes else ():
+        if key in value:
+            yield (key,), f"it is for logs of messages, and {of_episodes[0]!r} for data sets of episodes"
+    if "features" in value and not value["features"]:
+        yield ("features",), NO_FEATURE
 
 
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
     """Find what a schema cannot express: unknown shapes, keys that exclude each other, durations of 0."""
-    value = document.value
+    value: Any = document.value
     if isinstance(value, dict) and "topics" in value and not value["topics"]:
         return [(("topics",), NO_TOPIC)]
-    if not isinstance(value, dict) or not isinstance(value.get("topics"), dict):
+    if not isinstance(value, dict):
         return []
+    faults = list(_contradictions_of_kinds(value))
+    if not all(isinstance(value.get(key, {}), dict) for key in ("topics", "features")):
+        return faults
     shapes_by_name = value.get("shapes")
     shapes = list(shapes_by_name) if isinstance(shapes_by_name, dict) else []
-    faults: list[tuple[Place, str]] = []
     if value.get("fixed_frame", "") is None:
         faults.append((("fixed_frame",), NO_FRAME))
-    topics: Any = value["topics"]
-    entries = list(_entries(topics))
+    features = list(_entries(value, "features"))
+    entries = [*_entries(value, "topics"), *features]
+    for _, place, entry in features:
+        if isinstance(entry, dict) and "position" not in entry and not entry.keys() <= _SIGNAL_KEYS:
+            faults.append((place, "the key 'position' is missing"))
     for _, place, entry in entries:
         if not isinstance(entry, dict):
             continue
@@ -353,7 +422,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         for key, rival in (*outlines, ("orientation", "yaw")):
             if key in entry and rival in entry:
                 faults.append(((*place, rival), f"there is {key!r} already; give one of the two"))
-        faults += [((*place, *within), text) for within, text in _contradictions_of_turns(entry)]
+        is_feature = place[0] == "features"
+        faults += [((*place, *within), text) for within, text in _contradictions_of_turns(entry, is_feature)]
     tables: list[tuple[Place, Any, str]] = [
         ((), value, "max_age"),
         ((), value, "max_gap"),
@@ -367,9 +437,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     return faults
 
 
-def _contradictions_of_turns(entry: Table[str, Any]) -> Iterator[tuple[Place, str]]:
+def _contradictions_of_turns(entry: Table[str, Any], is_feature: bool) -> Iterator[tuple[Place, str]]:
     orientation, yaw = entry.get("orientation"), entry.get("yaw")
-    if "order" in entry and isinstance(orientation, list):
+    if "order" in entry and isinstance(orientation, list) and not is_feature:
         yield ("order",), "the four paths of `orientation` give the order, x, y, z and w; leave `order` out"
     if "order" in entry and yaw is not None:
         yield ("order",), "it is the order of a quaternion, and there is `yaw`; give one of the two"
@@ -390,6 +460,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         NameTemplate.of(entry["name"])
     frame = entry.get("frame")
     position, orientation, height = entry.get("position"), entry.get("orientation"), entry.get("height")
+    shape = _shape(entry.get("shape"), shapes)
     bounds, form = entry.get("bounds"), "xyxy"
     if isinstance(bounds, dict):
         bounds, form = bounds["field"], bounds["form"]
@@ -408,8 +479,8 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         polygon=entry.get("polygon"),
         bounds=tuple(bounds) if isinstance(bounds, list) else bounds,
         bounds_have_size=form == "xywh",
-        shape=_shape(entry.get("shape"), shapes),
-        height=(_measure(height[0]), _measure(height[1])) if height else None,
+        shape=shape,
+        height=_height(height) if height or shape is None else shape.height,
         uncertainty=_uncertainty(entry.get("uncertainty")),
         frame=frame.removeprefix("/") if isinstance(frame, str) else None,
         frame_field=frame["field"] if isinstance(frame, dict) else None,
@@ -457,15 +528,21 @@ def _shape(value: Any, shapes: Table[str, Any]) -> ShapeMapping | None:
     if isinstance(value, str):
         value = shapes[value]
     x, y = value.get("offset", (0.0, 0.0))
-    offset = (float(x), float(y))
+    offset, height = (float(x), float(y)), _height(value.get("height"))
     if "box" in value:
-        return ShapeMapping("box", tuple(_measure(size) for size in value["box"]), offset=offset)
+        return ShapeMapping(
+            "box", tuple(_measure(size) for size in value["box"]), offset=offset, height=height
+        )
     if "disc" in value:
-        return ShapeMapping("disc", (_measure(value["disc"]),), offset=offset)
+        return ShapeMapping("disc", (_measure(value["disc"]),), offset=offset, height=height)
     if isinstance(value["polygon"], str):
-        return ShapeMapping("polygon", outline=value["polygon"], offset=offset)
+        return ShapeMapping("polygon", outline=value["polygon"], offset=offset, height=height)
     corners = tuple((float(x), float(y)) for x, y in value["polygon"])
-    return ShapeMapping("polygon", points=corners, offset=offset)
+    return ShapeMapping("polygon", points=corners, offset=offset, height=height)
+
+
+def _height(value: Any) -> tuple[Measure, Measure] | None:
+    return (_measure(value[0]), _measure(value[1])) if value else None
 
 
 def _uncertainty(value: Any) -> Uncertainty | None:

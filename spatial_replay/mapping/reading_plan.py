@@ -207,6 +207,8 @@ class ReadingPlan:
 
 
 def _faults_of(mapping: LogMapping, by_name: dict[str, Topic]) -> list[str]:
+    if not mapping.topics:
+        return ["its keys are for data sets of episodes, and this log has messages; name its `topics`"]
     faults: list[str] = []
     named = [entry.topic for entry in mapping.topics]
     sampled = mapping.sampling.topic

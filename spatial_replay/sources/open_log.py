@@ -21,6 +21,7 @@ from typing import NamedTuple, Unpack
 from urllib.parse import quote
 
 from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
+from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
 from spatial_replay.logs.formats.tracks import (
     CSV_COLUMNS,
     FRAMES_A_SECOND,
@@ -41,7 +42,7 @@ from spatial_replay.logs.remote import (
     is_web,
     log_file,
 )
-from spatial_replay.text import counted_from, printable
+from spatial_replay.text import counted, counted_from, listed, printable
 from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
@@ -60,7 +61,8 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
     Only the needed parts of an MCAP log at an address are read; a log of another format is downloaded once.
 
     Args:
-        path: on this machine, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://….
+        path: on this machine, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://…. An
+            episode of a data set is the set's path with a number: push_v3#17.
         reading: how to read it; see `ReadOptions`.
 
     Raises:
@@ -75,6 +77,8 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
         raise UsageError(f"path is {shortened(given)}; {remedy}")
     options = ReadOptions(**reading)
+    if (address := data_set_address(path)) is not None:
+        return _open_episode(*address, options)
     path = readable_file(path)
     if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
@@ -91,6 +95,8 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         )
     if path.name.endswith(".spatial"):
         raise UsageError(f"{path.name} is a specification, not a log; give it by --spec, behind the log")
+    if isinstance(path, Path):
+        _refuse_data_set(path)
     message = (
         f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}; "
         "a video becomes a log by `record video`"
@@ -149,6 +155,7 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             # the bag, by one of its files
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
+            _refuse_data_set(file)
             names = sorted(entry.name for entry in file.iterdir())
             if {"format.json", "rows"}.issubset(names):
                 remedy = "`results` shows them, and compares two such folders"
@@ -168,6 +175,56 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
         if not has_summary(stream):
             return downloaded(file, "it has no index, so all of it is read")
     return file
+
+
+def _refuse_data_set(path: Path) -> None:
+    """Refuse a data set of episodes, each of which is a log.
+
+    Raises:
+        UsageError: it is one.
+    """
+    data_set = open_data_set(path)
+    if data_set is not None and data_set.episodes:
+        first = printable(f"{path}#{data_set.episodes[0].number}")
+        raise UsageError(
+            f"{path} is a {data_set.kind} data set of {counted(len(data_set.episodes), 'episode')}; give one,"
+            f" such as {first}, or all of them to `batch`"
+        )
+
+
+def _open_episode(path: str, number: int, options: ReadOptions) -> Source:
+    """Open an episode of a data set.
+
+    Raises:
+        UsageError: there is no such episode, or no mapping although the data set needs one.
+    """
+    data_set = open_data_set(path)
+    if data_set is None:
+        raise UsageError(f"{path} is no data set of episodes; leave out #{number}")
+    data_set.episode(number)
+    options.refuse_except(frozenset({"mapping", "max_gap"}), data_set.kind, data_set.name)
+    if options.mapping is None and not data_set.names_bodies:
+        if not any(feature.width for feature in data_set.features):
+            names = listed([feature.name for feature in data_set.features])
+            raise UsageError(
+                "no poses in this data set; what would be needed: a feature with the positions of objects in"
+                f" each frame, and {data_set.name} has {names}"
+            )
+        raise UsageError(
+            f"{data_set.name} is a {data_set.kind} data set, which does not say what its objects are; give a"
+            " mapping file that does, with --mapping FILE or mapping=FILE; for a first one, see:"
+            f" spatial-replay info {shlex.quote(path)} --suggest-mapping"
+        )
+    from spatial_replay.mapping.episode_source import EpisodeSource
+    from spatial_replay.mapping.mapping_file import load_mapping
+
+    mapping = None if options.mapping is None else load_mapping(options.mapping)
+    if mapping is not None and mapping.topics:
+        raise UsageError(
+            f"{mapping.name}: topics: {data_set.name} is a data set of episodes, which has none; name its"
+            " `features`"
+        )
+    return EpisodeSource(data_set, number, mapping, options)
 
 
 def _refuse_endless(path: Path) -> None:

@@ -20,7 +20,8 @@ EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 
 @pytest.mark.parametrize("text", EXAMPLES)
 def test_every_example_is_a_valid_mapping(text: str) -> None:
-    assert parse_mapping(text).topics
+    mapping = parse_mapping(text)
+    assert mapping.topics or mapping.features
 
 
 def test_every_key_is_documented() -> None:
@@ -28,6 +29,7 @@ def test_every_key_is_documented() -> None:
     keys = [
         *schema["properties"],
         *schema["$defs"]["topic"]["properties"],
+        *schema["$defs"]["feature"]["properties"],
         *schema["$defs"]["shape"]["properties"],
     ]
     assert [key for key in keys if not re.search(rf"`{{?{key}[`:]", PAGE)] == []

@@ -1,0 +1,199 @@
+"""Episodes of data sets as sources: the columns of an episode and a mapping in; a block of samples out.
+
+All frames of an episode become samples at once, by arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Booleans, Floats, concatenated
+from spatial_replay.geometry.footprint import FootprintBatch
+from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
+from spatial_replay.logs.messages import Block, Source, noting_pauses
+from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
+from spatial_replay.mapping.detections import Detections
+from spatial_replay.mapping.feature_reader import FeatureReading, bind_features, detections_of_body
+from spatial_replay.mapping.mapping_file import LogMapping
+from spatial_replay.mapping.tracker import ObservationRows, rows_from_detections
+from spatial_replay.mapping.transforms import matrices_from_quaternions
+from spatial_replay.text import Instant, Sentence, encodable
+from spatial_replay.trace.trace import Trace, class_order, within
+from spatial_replay.trace.units import OUR_AXES, Axes
+
+
+@dataclass(frozen=True)
+class EpisodeSource(Source):
+    """An episode of a data set, with a mapping from its features to objects.
+
+    Attributes:
+        number: of the episode.
+        mapped_by: None for a data set that names its bodies.
+    """
+
+    data_set: DataSet
+    number: int
+    mapped_by: LogMapping | None = None
+    reading: ReadOptions = DEFAULTS
+
+    @property
+    def name(self) -> str:
+        """Its address without the folder: `push_v3#17`."""
+        return encodable(f"{self.data_set.name}#{self.number}")
+
+    @property
+    def kind(self) -> str:
+        """See `Source.kind`."""
+        return f"{self.data_set.kind} episode"
+
+    @property
+    def axes(self) -> Axes:
+        """Axes of the features; samples are always y-up."""
+        return OUR_AXES if self.mapped_by is None else self.mapped_by.axes
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """See `Source.options`."""
+        mapping, concave = self.mapped_by, self.reading.concave
+        options = {**self.reading.given(), **({} if concave == "decompose" else {"concave": concave})}
+        if mapping is not None:
+            options |= {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
+        return options
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        """See `Source.max_gap_ns`."""
+        mapped_ns = None if self.mapped_by is None else self.mapped_by.max_gap_ns
+        return gap_ns(self.reading.max_gap) or mapped_ns
+
+    def columns(self) -> EpisodeColumns:
+        """Return the episode as arrays: the features of the mapping, the bodies, the label.
+
+        Raises:
+            UsageError: the mapping does not fit the data set.
+            LogError: the data cannot be read.
+        """
+        if self.mapped_by is None:
+            return self.data_set.columns(self.number, features=())
+        features = _bind(self.mapped_by, self.data_set).features
+        return self.data_set.columns(self.number, self.mapped_by.episodes, features)
+
+    @noting_pauses
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`; also raises LogError for an episode that is not judged."""
+        columns, faults = self.columns(), FaultList()
+        if columns.unjudged:
+            raise LogError(f"{self.name}: {columns.unjudged}")
+        for fault in columns.faults:
+            faults.add(f"{self.name}: {fault}")
+        # features contain NaN and infinity; they make objects unknown, without warnings
+        with np.errstate(all="ignore"):
+            trace = self._trace(columns, faults)
+        if not len(trace):
+            raise LogError(f"{self.name} has no frame")
+        remarks = [f"{self.name}: {remark}" for remark in columns.remarks]
+        if self.mapped_by is not None:
+            remarks += [
+                f"{self.name}: it has no feature {feature!r}, which {self.mapped_by.name} marks as optional"
+                for feature in _bind(self.mapped_by, self.data_set).absent
+            ]
+        yield Block(
+            replace(within(trace, start_ns, end_ns), faults=faults.take(last=True)), remarks=tuple(remarks)
+        )
+
+    def _trace(self, columns: EpisodeColumns, faults: FaultList) -> Trace:
+        """Return the samples of an episode: each frame is one.
+
+        Raises:
+            UsageError: the mapping does not fit the numbers, or names a body again.
+            LogError: the files of the data set lack a feature.
+        """
+        mapping, times_ns = self.mapped_by, columns.times_ns
+        features = FeatureReading() if mapping is None else _bind(mapping, self.data_set)
+        shapes = {} if mapping is None else mapping.shapes
+        rows_by_name: dict[str, ObservationRows] = {}
+        classes: dict[str, str | None] = {}
+        for thing in features.objects:
+            detections = thing.detections(
+                columns.features, len(times_ns), mapping.name if mapping else "", self.name
+            )
+            rows_by_name[thing.name] = self._rows(thing.name, detections, columns, faults)
+            classes[thing.name] = thing.class_name
+        for body in columns.bodies:
+            if body.name in rows_by_name:
+                raise UsageError(
+                    f"{self.data_set.name} has a body {body.name!r}; give the object of the mapping another"
+                    " `name`"
+                )
+            shape = shapes.get(body.name)
+            if shape is None:
+                rows_by_name[body.name] = _rows_of_body(body, self.axes)
+            else:
+                detections = detections_of_body(body, shape)
+                rows_by_name[body.name] = self._rows(body.name, detections, columns, faults)
+            classes[body.name] = None
+        names = sorted(rows_by_name)
+        rows = concatenated([rows_by_name[name] for name in names] or [_NO_ROWS])
+        number = np.arange(len(rows), dtype=np.int64)
+        ordered = class_order(classes.values())
+        codes = np.array([ordered.index(classes[name]) for name in names], np.int64)
+        numbered = np.where(rows.is_valid, number, -2 - number).reshape(len(names), -1).T
+        return Trace(
+            times_ns=times_ns,
+            names=tuple(names),
+            rows=np.ascontiguousarray(numbered).reshape(len(times_ns), len(names)),
+            footprints=rows.shapes,
+            yaw=rows.yaw,
+            uncertainty=rows.uncertainty,
+            class_code=np.repeat(codes, len(times_ns)),
+            classes=ordered,
+            signals={signal.name: signal.values(columns.features, self.name) for signal in features.signals},
+        )
+
+    def _rows(
+        self, name: str, detections: Detections, columns: EpisodeColumns, faults: FaultList
+    ) -> ObservationRows:
+        """Return the footprints of an object in each frame; frames without a valid one are faults."""
+
+        def report(frame: int, what: str) -> None:
+            moment = Instant(int(columns.times_ns[frame]), 0)
+            faults.add(Sentence(f"{self.name} at ", moment, f": object {name!r}{what}"))
+
+        return rows_from_detections(detections, None, self.axes, self.reading.concave, report)
+
+
+_NO_ROWS = ObservationRows.blank(np.empty(0, np.int64))
+
+
+@lru_cache(maxsize=16)
+def _bind(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
+    return bind_features(mapping, data_set)
+
+
+def _rows_of_body(body: Body, axes: Axes) -> ObservationRows:
+    """Return the footprints of a body that a data set names, as they are."""
+    count = len(body.positions)
+    is_valid: Booleans = np.asarray(np.isfinite(body.positions).all(axis=1))
+    yaw: Floats = np.full(count, np.nan)
+    if body.quaternions is not None:
+        is_valid &= np.isfinite(body.quaternions).all(axis=1)
+        _, yaw = matrices_from_quaternions(body.quaternions)
+    shapes = body.shapes
+    if shapes is None:
+        shapes = FootprintBatch.trusted(
+            part_start=np.arange(count + 1, dtype=np.int64),
+            vertex_start=np.arange(count + 1, dtype=np.int64),
+            vertices=np.ascontiguousarray(body.positions[:, :2]),
+            radius=np.zeros(count),
+            bottom=np.full(count, np.nan),
+            top=np.full(count, np.nan),
+        )
+    no_class = np.zeros(count, np.int64)
+    return ObservationRows(
+        axes.convert_shapes(shapes), axes.convert_yaw(yaw), np.zeros(count), no_class, is_valid
+    )

@@ -1,0 +1,383 @@
+"""Read features of a data set: entries of a mapping and columns of an episode in; detections and signals out.
+
+An entry is bound to the features of a data set once. All frames of an episode are read together.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import nan
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.logs.formats.episodes import Body, DataSet, Feature
+from spatial_replay.mapping.binding import Binding
+from spatial_replay.mapping.detections import DetectionChunk, Detections, detections_from_chunks
+from spatial_replay.mapping.mapping_file import LogMapping, Measure, ShapeMapping, SignalMapping, TopicMapping
+from spatial_replay.mapping.message_types import MessageLayout, layout_of_topic
+from spatial_replay.mapping.topic_reader import with_single_precision
+from spatial_replay.text import listed, nearest_hint, number_text
+
+_SLICE: Final = re.compile(r"(.*)\[(?:(-?\d{1,9})|(-?\d{1,9})?:(-?\d{1,9})?)\]", re.DOTALL)
+_NAME_ENDS: Final = re.compile(r"[./]")
+_LENGTH_ERROR: Final = 0.01
+"""By how much the length of a quaternion may differ from 1."""
+
+Columns: TypeAlias = Mapping[str, Floats]
+
+
+class NumberPlace(NamedTuple):
+    """One number of a feature: of the row of each frame."""
+
+    feature: str
+    number: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class BoundObject:
+    """An object of a mapping's entry, with the places of its numbers.
+
+    Attributes:
+        key: of the entry, for errors.
+        places: of each column of `binding`.
+        quaternion: the places of its orientation, x, y, z and w; () without one.
+    """
+
+    name: str
+    class_name: str | None
+    key: str
+    layout: MessageLayout
+    binding: Binding
+    places: tuple[NumberPlace, ...]
+    quaternion: tuple[NumberPlace, ...] = ()
+
+    def detections(self, columns: Columns, times: int, mapping_name: str, episode: str) -> Detections:
+        """Return the object in each of T frames; its name and class are codes of 0.
+
+        Raises:
+            UsageError: the four numbers of its orientation are no quaternion.
+            LogError: the files of the data set lack a feature.
+        """
+        numbers = np.empty((times, self.binding.width))
+        for column, place in enumerate(self.places):
+            numbers[:, column] = column_of(columns, place, episode)
+        if self.layout.invalid:
+            numbers[np.isin(numbers, with_single_precision(self.layout.invalid))] = nan
+        if self.quaternion:
+            self._check_quaternions(numbers[:, list(self.binding.orientation)], mapping_name, episode)
+        return detections_of(self.layout, self.binding, numbers)
+
+    def _check_quaternions(self, quaternions: Floats, mapping_name: str, episode: str) -> None:
+        length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
+        # one of zeros was never set, and a number that is not finite makes the object unknown
+        is_off = np.isfinite(length) & (length > 0) & (np.abs(length - 1) > _LENGTH_ERROR)
+        if not is_off.any():
+            return
+        frame = int(is_off.argmax())
+        widest = int(np.fmax.reduce(np.abs(quaternions[is_off]), axis=0).argmax())
+        least, greatest = np.fmin.reduce(quaternions[:, widest]), np.fmax.reduce(quaternions[:, widest])
+        names = listed([place.name for place in self.quaternion])
+        raise UsageError(
+            f"{mapping_name}: {self.key}.orientation: {names} have the length"
+            f" {number_text(float(length[frame]))} in frame {frame} of {episode}, so they are no quaternion"
+            f" ({self.quaternion[widest].name} goes from {number_text(float(least))} to"
+            f" {number_text(float(greatest))}); give its four numbers, or leave `orientation` out"
+        )
+
+
+class BoundSignal(NamedTuple):
+    """A signal of a mapping's entry, with the place of its number."""
+
+    name: str
+    place: NumberPlace
+    invalid: tuple[float, ...]
+
+    def values(self, columns: Columns, episode: str) -> Floats:
+        """Return its value in each frame (T,)."""
+        values = column_of(columns, self.place, episode)
+        if self.invalid:
+            return np.where(np.isin(values, with_single_precision(self.invalid)), nan, values)
+        return values
+
+
+@dataclass(frozen=True)
+class FeatureReading:
+    """The entries of a mapping, bound to a data set.
+
+    Attributes:
+        objects: in the order of the mapping.
+        absent: optional features that the data set lacks.
+    """
+
+    objects: tuple[BoundObject, ...] = ()
+    signals: tuple[BoundSignal, ...] = ()
+    absent: tuple[str, ...] = ()
+
+    @cached_property
+    def features(self) -> tuple[str, ...]:
+        """The features that it reads."""
+        places = [place for thing in self.objects for place in thing.places]
+        places += [signal.place for signal in self.signals]
+        return tuple(dict.fromkeys(place.feature for place in places))
+
+
+def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
+    """Bind the entries of a mapping to the features of a data set.
+
+    Raises:
+        UsageError: the mapping does not fit the data set; all errors are listed.
+    """
+    objects: dict[str, BoundObject] = {}
+    signals: dict[str, BoundSignal] = {}
+    absent, faults = [], []
+    count_of: dict[str, int] = {}
+    for entry in mapping.features:
+        number = count_of[entry.topic] = count_of.get(entry.topic, -1) + 1
+        key = f"features.{entry.topic}" + (f"[{number}]" if number else "")
+        feature = data_set.feature(entry.topic)
+        if feature is None and entry.optional:
+            absent.append(entry.topic)
+            continue
+        try:
+            if feature is None:
+                names = [feature.name for feature in data_set.features]
+                hint = nearest_hint(entry.topic, names) or f"its features are {listed(names)}"
+                raise UsageError(f"{key}: {data_set.name} has no such feature; {hint}")
+            places = _Places(data_set, feature, key)
+            for signal in entry.signals:
+                _claim(signals, signal.name, key, "signal")
+                signals[signal.name] = _bind_signal(signal, entry, places)
+            if entry.position is not None:
+                thing = _bind_object(entry, places, mapping.episodes.order)
+                _claim(objects, thing.name, key, "object")
+                objects[thing.name] = thing
+        except UsageError as error:
+            faults.append(f"{mapping.name}: {error}")
+    if faults:
+        raise UsageError("\n".join(faults))
+    return FeatureReading(tuple(objects.values()), tuple(signals.values()), tuple(absent))
+
+
+def _claim(claimed: Mapping[str, object], name: str, key: str, what: str) -> None:
+    if name in claimed:
+        raise UsageError(f"{key}: there is another {what} {name!r}; give one of them another name")
+
+
+def _bind_signal(signal: SignalMapping, entry: TopicMapping, places: _Places) -> BoundSignal:
+    return BoundSignal(signal.name, places.single(f"signals.{signal.name}", signal.field), entry.invalid)
+
+
+def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> BoundObject:
+    """Bind an entry with a position.
+
+    Raises:
+        UsageError: its places do not fit the feature.
+    """
+    columns: dict[NumberPlace, int] = {}
+
+    def column(place: NumberPlace) -> int:
+        return columns.setdefault(place, len(columns))
+
+    def measure(key: str, value: Measure) -> float | int:
+        return column(places.single(key, value)) if isinstance(value, str) else value
+
+    position = places.several("position", entry.position or (), (2, 3))
+    quaternion: tuple[NumberPlace, ...] = ()
+    if entry.orientation is not None:
+        quaternion = places.several("orientation", entry.orientation, (4,))
+        order = entry.order or order or ("xyzw" if isinstance(entry.orientation, tuple) else None)
+        if order is None:
+            raise UsageError(
+                f"{places.key}.orientation: the four numbers have no names; `order: wxyz` says that w comes"
+                " first, `order: xyzw` that it comes last"
+            )
+        quaternion = tuple(quaternion[order.index(name)] for name in "xyzw")
+    shape = entry.shape
+    if shape is not None and shape.outline:
+        raise UsageError(f"{places.key}.shape: a feature has no list of corners; give [[x, y], …]")
+    uncertainty = entry.uncertainty
+    binding = _binding(
+        position=tuple(map(column, position)),
+        orientation=tuple(map(column, quaternion)),
+        yaw=None if entry.yaw is None else column(places.single("yaw", entry.yaw.field)),
+        shape_sizes=tuple(measure("shape", size) for size in shape.sizes) if shape is not None else (),
+        height=tuple(measure("height", bound) for bound in entry.height or ()),
+        uncertainty=None if uncertainty is None else measure("uncertainty", uncertainty.measure),
+    )
+    name = entry.name or _NAME_ENDS.split(entry.topic)[-1] or "object"
+    class_name = entry.class_name if isinstance(entry.class_name, str) else None
+    return BoundObject(
+        name,
+        class_name,
+        places.key,
+        layout_of_topic("", entry),
+        replace(binding, width=len(columns)),
+        tuple(columns),
+        quaternion,
+    )
+
+
+def _binding(
+    position: tuple[int, ...],
+    orientation: tuple[int, ...],
+    yaw: int | None,
+    shape_sizes: tuple[float | int, ...],
+    height: tuple[float | int, ...],
+    uncertainty: float | int | None,
+) -> Binding:
+    return Binding(
+        style="keys",
+        numbers=_column_numbers,
+        width=0,
+        position=position,
+        orientation=orientation,
+        yaw=yaw,
+        sizes=(),
+        shape_sizes=shape_sizes,
+        height=height,
+        uncertainty=uncertainty,
+        polygon=None,
+        has_rings=False,
+        covariance=None,
+        class_gets=(),
+        class_names={},
+        frame=None,
+        lifetime=None,
+    )
+
+
+def _column_numbers(row: object) -> object:
+    """Return a row as it is: the numbers of features are columns already."""
+    return row
+
+
+def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> Detections:
+    """Return one object in T frames, from its numbers (T, W)."""
+    count = len(numbers)
+    frames = np.arange(count, dtype=np.int64)
+    chunk = DetectionChunk(frames, [], frames.tolist(), [0] * count, [0] * count, numbers=numbers)
+    detections = detections_from_chunks(layout, binding, [chunk], np.ones(count, np.bool_))
+    return detections if layout.scale == 1.0 else detections.scale(layout.scale)
+
+
+def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
+    """Return a body that a data set names, in T frames, with the footprint of a mapping.
+
+    Raises:
+        UsageError: the shape has sizes that only a feature could give.
+    """
+    measures = (*shape.sizes, *(shape.height or ()))
+    if shape.outline or any(isinstance(measure, str) for measure in measures):
+        raise UsageError(f"shapes.{body.name}: a body has no fields; give numbers")
+    has_turn = body.quaternions is not None
+    numbers = body.positions if body.quaternions is None else np.hstack([body.positions, body.quaternions])
+    binding = _binding(
+        position=(0, 1, 2),
+        orientation=(3, 4, 5, 6) if has_turn else (),
+        yaw=None,
+        shape_sizes=tuple(float(size) for size in shape.sizes),
+        height=tuple(float(bound) for bound in shape.height or ()),
+        uncertainty=None,
+    )
+    return detections_of(MessageLayout(shape=shape), replace(binding, width=numbers.shape[1]), numbers)
+
+
+def column_of(columns: Columns, place: NumberPlace, episode: str) -> Floats:
+    """Return the numbers at a place in each frame (T,).
+
+    Raises:
+        LogError: the files of the data set lack the feature, or have fewer numbers of it.
+    """
+    values = columns.get(place.feature)
+    if values is None:
+        raise LogError(f"{episode}: its files have no numbers of {place.feature}; download them again")
+    rows = values.reshape(len(values), -1)
+    if place.number >= rows.shape[1]:
+        raise LogError(f"{episode}: {place.feature} has {rows.shape[1]} numbers a frame in its files")
+    column: Floats = rows[:, place.number]
+    return column
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Finds the places of an entry: in its feature, or in another one that they name."""
+
+    data_set: DataSet
+    feature: Feature
+    key: str
+
+    def several(
+        self, key: str, texts: str | tuple[str, ...], counts: tuple[int, ...]
+    ) -> tuple[NumberPlace, ...]:
+        """Return the places that texts name.
+
+        Raises:
+            UsageError: there are none, or another number of them than one of `counts`.
+        """
+        parts = (texts,) if isinstance(texts, str) else texts
+        places = tuple(place for text in parts for place in self._places(key, text))
+        if len(places) not in counts:
+            needed = " or ".join(map(str, counts))
+            raise UsageError(
+                f"{self.key}.{key}: {listed(list(parts))} has {len(places)} numbers, and {needed} are needed;"
+                f" write {self._example(counts[-1])}"
+            )
+        return places
+
+    def single(self, key: str, text: str) -> NumberPlace:
+        """Return the only place that a text names.
+
+        Raises:
+            UsageError: there is none, or several.
+        """
+        (place,) = self.several(key, text, (1,))
+        return place
+
+    def _example(self, count: int) -> str:
+        return "[0]" if count == 1 else f'"[0:{count}]"'
+
+    def _places(self, key: str, text: str) -> Iterator[NumberPlace]:
+        feature = self.feature
+        if text in feature.places:
+            yield NumberPlace(feature.name, feature.places.index(text), text)
+            return
+        whole = self.data_set.feature(text)
+        if whole is not None:
+            yield from (_place(whole, index) for index in range(whole.width))
+            return
+        numbered = _SLICE.fullmatch(text)
+        source = feature if numbered is None or not numbered[1] else self.data_set.feature(numbered[1])
+        if numbered is None or source is None:
+            raise UsageError(f"{self.key}.{key}: {feature.name} has no place {text!r}; {self._hint(text)}")
+        if numbered[2] is None:
+            begin, end = (None if part is None else int(part) for part in numbered.groups()[2:])
+            yield from (_place(source, index) for index in range(*slice(begin, end).indices(source.width)))
+            return
+        index = int(numbered[2])
+        if not -source.width <= index < source.width:
+            raise UsageError(
+                f"{self.key}.{key}: {source.name} has {source.width} numbers, so there is no {text}; write"
+                f" [0] to [{source.width - 1}]"
+            )
+        yield _place(source, index % source.width)
+
+    def _hint(self, text: str) -> str:
+        places, width = self.feature.places, self.feature.width
+        names = [*places, *(feature.name for feature in self.data_set.features)]
+        if hint := nearest_hint(text, names):
+            return hint
+        if places:
+            return f"its places are {listed(list(places))}"
+        return f"its {width} numbers have no names; write [0] to [{width - 1}]"
+
+
+def _place(feature: Feature, index: int) -> NumberPlace:
+    name = feature.places[index] if feature.places else f"{feature.name}[{index}]"
+    return NumberPlace(feature.name, index, name)
