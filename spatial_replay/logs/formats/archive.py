@@ -46,7 +46,8 @@ def open_archive(path: Path) -> Iterator[Any]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        # damaged names, types and encodings are all of these in h5py
         raise LogError(
             f"{path.name} cannot be read: {first_line(error)}; close its writer or copy it again"
         ) from None
@@ -93,7 +94,8 @@ _COPY: Final = "copy its data into the file"
 
 def names_in(group: Any) -> list[str]:
     """Return the names in a group, without looking at the objects."""
-    return [] if group is None or not hasattr(group, "keys") else list(group)
+    # h5py gives names that are not UTF-8 as bytes
+    return [name for name in group if isinstance(name, str)] if hasattr(group, "keys") else []
 
 
 def arrays_in(top: Any) -> Iterator[tuple[str, Any]]:
@@ -139,7 +141,8 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
     if width_of(array) == 0:
         raise LogError(f"{array.name} holds no numbers of frames: {array.dtype}, {array.shape}")
     try:
-        values = np.asarray(array[rows], np.float64)
+        with np.errstate(invalid="ignore"):
+            values = np.asarray(array[rows], np.float64)
     except (OSError, RuntimeError, ValueError) as error:
         raise LogError(f"{array.name} cannot be read: {first_line(error)}; copy the file again") from None
     return values.reshape(len(values), -1) if values.ndim > 1 else values

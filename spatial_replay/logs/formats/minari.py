@@ -181,12 +181,12 @@ class _Hdf5(_Minari):
     def widths(self, episode: Episode) -> dict[str, int]:
         with open_archive(self._file) as file:
             group = episode_group(file, episode.key, f"{self.name}#{episode.number}")
-            return {_plain(name): width_of(array) for name, array in arrays_in(group)}
+            return {_arrow_path(name): width_of(array) for name, array in arrays_in(group)}
 
     def arrays(self, episode: Episode, names: set[str]) -> dict[str, Floats]:
         with open_archive(self._file) as file:
             group = episode_group(file, episode.key, f"{self.name}#{episode.number}")
-            arrays = {name: member(group, _stored(group, name)) for name in names}
+            arrays = {name: member(group, _hdf5_path(name)) for name in names}
             return {
                 name: numbers(array)
                 for name, array in arrays.items()
@@ -194,12 +194,12 @@ class _Hdf5(_Minari):
             }
 
 
-def _plain(name: str) -> str:
+def _arrow_path(name: str) -> str:
     """Return the name of an array as Arrow has it: parts of tuples are numbers."""
     return "/".join(part.removeprefix("_index_") for part in name.split("/"))
 
 
-def _stored(group: Any, name: str) -> str:
+def _hdf5_path(name: str) -> str:
     return "/".join(f"_index_{part}" if part.isdecimal() else part for part in name.split("/"))
 
 
@@ -248,11 +248,12 @@ class _Tables(_Minari):
         try:
             table = library.concat_tables([_table(file, library) for file in files])
             table.validate(full=True)
-        except (OSError, library.ArrowException) as error:
+            names = table.column_names
+        except (OSError, ValueError, library.ArrowException) as error:
             raise LogError(
                 f"{self.name}#{episode.number} cannot be read: {first_line(error)}; download it again"
             ) from None
-        pending = [(name, table.column(name)) for name in reversed(table.column_names)]
+        pending = [(name, table.column(name)) for name in reversed(names)]
         while pending:
             name, column = pending.pop()
             if not library.types.is_struct(column.type):
