@@ -287,7 +287,7 @@ class _Robosuite(GroupedEpisodes):
 
     folder = "data"
     names_bodies = True
-    left_out = frozenset({"next_obs", "states"})
+    left_out = frozenset({"next_obs"})
 
     def __init__(self, path: Path, file: Any) -> None:
         home = member(file, "data")

@@ -224,14 +224,14 @@ class _Tables(_Minari):
 
     def widths(self, episode: Episode) -> dict[str, int]:
         widths = {}
-        for name, column in self._columns(episode):
+        for name, column in self._columns(episode).items():
             values = numbers_from_column(column)
             widths[name] = 0 if values is None else int(np.prod(values.shape[1:]))
         return widths
 
     def arrays(self, episode: Episode, names: set[str]) -> dict[str, Floats]:
         arrays = dict[str, Floats]()
-        for name, column in self._columns(episode):
+        for name, column in self._columns(episode).items():
             values = numbers_from_column(column) if name in names else None
             if values is not None:
                 # the last row of steps is padding: nothing follows the last state
@@ -239,8 +239,8 @@ class _Tables(_Minari):
                 arrays[name] = values[: (episode.frames or len(values)) - 1] if is_of_steps else values
         return arrays
 
-    def _columns(self, episode: Episode) -> Iterator[tuple[str, Any]]:
-        """Yield the columns of an episode; the fields of structures apart."""
+    def _columns(self, episode: Episode) -> dict[str, Any]:
+        """Return the columns of an episode; the fields of structures apart."""
         library, folder = arrow(), self.folder / episode.key
         files = sorted([*folder.glob("*.arrow"), *folder.glob("*.parquet")])
         if not files:
@@ -248,22 +248,25 @@ class _Tables(_Minari):
         try:
             table = library.concat_tables([_table(file, library) for file in files])
             table.validate(full=True)
-            names = table.column_names
+            return dict(_leaves(table, library))
         except (OSError, ValueError, library.ArrowException) as error:
             raise LogError(
                 f"{self.name}#{episode.number} cannot be read: {first_line(error)}; download it again"
             ) from None
-        pending = [(name, table.column(name)) for name in reversed(names)]
-        while pending:
-            name, column = pending.pop()
-            if not library.types.is_struct(column.type):
-                yield name, column
-                continue
-            fields = [column.type.field(index).name for index in range(column.type.num_fields)]
-            pending += [
-                (f"{name}/{field}", library.compute.struct_field(column, [index]))
-                for index, field in reversed(list(enumerate(fields)))
-            ]
+
+
+def _leaves(table: Any, library: Any) -> Iterator[tuple[str, Any]]:
+    pending = [(name, table.column(name)) for name in reversed(table.column_names)]
+    while pending:
+        name, column = pending.pop()
+        if not library.types.is_struct(column.type):
+            yield name, column
+            continue
+        fields = [column.type.field(index).name for index in range(column.type.num_fields)]
+        pending += [
+            (f"{name}/{field}", library.compute.struct_field(column, [index]))
+            for index, field in reversed(list(enumerate(fields)))
+        ]
 
 
 def _table(file: Path, library: Any) -> Any:
