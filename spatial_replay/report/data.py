@@ -155,12 +155,12 @@ class RunReport:
     @property
     def decided_ns(self) -> list[int]:
         """The samples that decided the drawn results."""
-        return [each.decided.time_ns for each in self.drawn if each.decided is not None]
+        return [reported.decided.time_ns for reported in self.drawn if reported.decided is not None]
 
     @property
     def marked_ns(self) -> list[int]:
         """The samples that sentences are about: that decided a result or are its least, or begin an event."""
-        least_ns = (shown.result.least_at_ns for shown in self.drawn)
+        least_ns = (reported.result.least_at_ns for reported in self.drawn)
         events_ns = sorted(set(map(start_of, self.events)))[:_MOST_MARKED]
         return sorted(
             {*self.decided_ns, *(time_ns for time_ns in least_ns if time_ns is not None), *events_ns}
@@ -198,16 +198,16 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
     count = len(times_ns)
     if count <= most:
         return np.arange(count)
-    starts = [int(np.searchsorted(times_ns, each.times_ns[0])) for each in curves]
-    chosen = np.zeros(count, np.bool_)
-    chosen[np.linspace(0, count - 1, most // 4).astype(np.int64)] = True
-    for start, each in zip(starts, curves, strict=True):
-        chosen[[start, start + len(each.times_ns) - 1]] = True
+    starts = [int(np.searchsorted(times_ns, curve.times_ns[0])) for curve in curves]
+    is_chosen = np.zeros(count, np.bool_)
+    is_chosen[np.linspace(0, count - 1, most // 4).astype(np.int64)] = True
+    for start, curve in zip(starts, curves, strict=True):
+        is_chosen[[start, start + len(curve.times_ns) - 1]] = True
     stretches = max(1, most // 16)
     for limit, found_in in ((most * 5 // 8, _turns), (most, lambda series: _extremes(series, stretches))):
-        for start, each in zip(starts, curves, strict=True):
-            _choose(chosen, start + found_in(each.series), limit)
-    return np.flatnonzero(chosen)
+        for start, curve in zip(starts, curves, strict=True):
+            _choose(is_chosen, start + found_in(curve.series), limit)
+    return np.flatnonzero(is_chosen)
 
 
 def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
@@ -221,28 +221,28 @@ def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
 
 def _turns(series: Floats) -> Integers:
     """Return the samples on both sides of a change of sign: of a number, or of an end of its interval."""
-    found = [np.empty(0, np.int64)]
+    turns = [np.empty(0, np.int64)]
     for numbers in series.reshape(-1, series.shape[-1]):
         sign = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))
         after = np.flatnonzero(np.diff(sign)) + 1
-        found += [after - 1, after]
-    return np.unique(np.concatenate(found))
+        turns += [after - 1, after]
+    return np.unique(np.concatenate(turns))
 
 
 def _extremes(series: Floats, stretches: int) -> Integers:
     """Return where value and now are least and greatest within each of so many stretches."""
     count = series.shape[-1]
     starts = np.unique(np.linspace(0, count, stretches, endpoint=False).astype(np.int64))
-    found = [np.empty(0, np.int64)]
+    extremes = [np.empty(0, np.int64)]
     for numbers in series[:, :2].reshape(-1, count):
         for infinite, extreme in ((np.inf, np.minimum), (-np.inf, np.maximum)):
-            known = np.where(np.isnan(numbers), infinite, numbers)
-            best = np.repeat(extreme.reduceat(known, starts), np.diff([*starts, count]))
-            hits = np.flatnonzero(known == best)
+            comparable = np.where(np.isnan(numbers), infinite, numbers)
+            best = np.repeat(extreme.reduceat(comparable, starts), np.diff([*starts, count]))
+            hits = np.flatnonzero(comparable == best)
             # the first in each stretch
             _, first = np.unique(np.searchsorted(starts, hits, side="right"), return_index=True)
-            found.append(hits[first])
-    return np.unique(np.concatenate(found))
+            extremes.append(hits[first])
+    return np.unique(np.concatenate(extremes))
 
 
 MOST_VALUES: Final = 4_000_000
@@ -267,39 +267,45 @@ class PageData:
 def page_data(report: RunReport) -> PageData:
     """Return everything that the page draws; equal reports give equal data."""
     packing = Packing()
-    drawn, first_ns = report.drawn, report.replayed.first_ns
+    reported_results, first_ns = report.drawn, report.replayed.first_ns
     times_ns = np.unique(
-        np.concatenate([report.scene.times_ns, *(each.result.times_ns for each in drawn)]).astype(np.int64)
+        np.concatenate(
+            [report.scene.times_ns, *(reported.result.times_ns for reported in reported_results)]
+        ).astype(np.int64)
     )
-    results = [each.result for each in drawn if len(each.result.times_ns)]
-    curves = [NodeSeries(each.times_ns, each.series[list(named_nodes(each.formula))]) for each in results]
-    room = _room(drawn, len(times_ns))
+    results = [reported.result for reported in reported_results if len(reported.result.times_ns)]
+    curves = [
+        NodeSeries(result.times_ns, result.series[list(named_nodes(result.formula))]) for result in results
+    ]
+    room = _room(reported_results, len(times_ns))
     shown_ns = _shown_times(report, times_ns, room // 2)
-    kept = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
+    kept_ns = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
     decisions = decisions_value(report.decisions, report.redone, first_ns, packing)
     facts = {
         "settles": report.replayed.semantics == "ltlf",
         "lengths": report.axes.unit,
-        "is_thinned": len(kept) < len(times_ns),
-        "times": packing.add((kept - first_ns) / 1e9, "f8"),
+        "is_thinned": len(kept_ns) < len(times_ns),
+        "times": packing.add((kept_ns - first_ns) / 1e9, "f8"),
         "palette": {
             **SIGNS,
             # without those of the signs
             "curves": CURVES[2:],
         },
-        "results": [_result_value(each, kept, report, packing) for each in drawn],
-        "scene": scene_value(report.scene, kept, first_ns, _places(report), packing),
+        "results": [_result_value(reported, kept_ns, report, packing) for reported in reported_results],
+        "scene": scene_value(report.scene, kept_ns, first_ns, _places(report), packing),
         "events": event_values(report.events, first_ns),
         "decisions": decisions["decisions"],
         "camera": dict(report.pictures),
     }
-    omissions = tuple(_omissions(report, len(times_ns), len(kept), decisions["maps_left_out"]))
+    omissions = tuple(_omissions(report, len(times_ns), len(kept_ns), decisions["maps_left_out"]))
     return PageData(facts, packing.text(), omissions)
 
 
 def _room(results: Sequence[ReportedResult], samples: int) -> int:
     """Return how many samples fit."""
-    values = sum(4 * len(shown_nodes(each.result.formula)) * len(each.result.times_ns) for each in results)
+    values = sum(
+        4 * len(shown_nodes(reported.result.formula)) * len(reported.result.times_ns) for reported in results
+    )
     return max(_FEWEST_SAMPLES, MOST_VALUES * max(samples, 1) // max(values, 1))
 
 
@@ -326,61 +332,65 @@ def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
 
 
 def _result_value(
-    each: ReportedResult, kept: Integers, report: RunReport, packing: Packing
+    reported: ReportedResult, kept: Integers, report: RunReport, packing: Packing
 ) -> Mapping[str, Any]:
     first_ns = report.replayed.first_ns
-    relations = RELATION_NAMES | each.file.relations
-    samples = np.flatnonzero(np.isin(each.result.times_ns, kept))
-    here = each.result.times_ns[samples]
+    relations = RELATION_NAMES | reported.file.relations
+    samples = np.flatnonzero(np.isin(reported.result.times_ns, kept))
+    times_ns = reported.result.times_ns[samples]
     # (nodes, 4, samples), of the shown nodes
-    series = each.result.series[list(shown_nodes(each.result.formula))][:, :, samples]
+    series = reported.result.series[list(shown_nodes(reported.result.formula))][:, :, samples]
     value: dict[str, Any] = {
-        **json_fields(each.result, "title", "name", "object", "verdict"),
-        "pointer": _pointer_value(each, first_ns, report.axes.unit),
-        "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
-        "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
-        "samples": len(here),
-        "decided": _place_of(each),
-        "decided_text": _decided_text(each),
-        "left_open": "" if each.witness is None else open_text(each.witness),
-        "nodes": tree_value(each.result, relations, report.axes.units, each.tree.calls(each.file.source)),
-        "requirements": requirement_values(each.result, samples, packing),
+        **json_fields(reported.result, "title", "name", "object", "verdict"),
+        "pointer": _pointer_value(reported, first_ns, report.axes.unit),
+        "fault": None if reported.fault_ns is None else (reported.fault_ns - first_ns) / 1e9,
+        "first": int(np.searchsorted(kept, times_ns[0])) if len(times_ns) else 0,
+        "samples": len(times_ns),
+        "decided": _place_of(reported),
+        "decided_text": _decided_text(reported),
+        "left_open": "" if reported.witness is None else open_text(reported.witness),
+        "nodes": tree_value(
+            reported.result, relations, report.axes.units, reported.tree.calls(reported.file.source)
+        ),
+        "requirements": requirement_values(reported.result, samples, packing),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
-        "no_automaton": sentence_parts(each.compiled.reason),
+        "no_automaton": sentence_parts(reported.compiled.reason),
     }
-    if each.compiled.automaton is not None:
-        inside = np.searchsorted(each.path.times_ns, here)
+    if reported.compiled.automaton is not None:
+        inside = np.searchsorted(reported.path.times_ns, times_ns)
         value["automaton"] = {
-            **automaton_value(each.compiled.automaton, each.path, each.tree.named),
-            "sets": list(each.path.sets),
-            "path": packing.add(np.array(each.path.codes)[inside], "i4"),
+            **automaton_value(reported.compiled.automaton, reported.path, reported.tree.named),
+            "sets": list(reported.path.sets),
+            "path": packing.add(np.array(reported.path.codes)[inside], "i4"),
         }
     return value
 
 
-def _place_of(each: ReportedResult) -> int | None:
+def _place_of(reported: ReportedResult) -> int | None:
     """Return the place on the page of the node that decided a result."""
-    shown = shown_nodes(each.result.formula)
-    return shown.index(each.decided.node) if each.decided and each.decided.node in shown else None
+    nodes = shown_nodes(reported.result.formula)
+    return nodes.index(reported.decided.node) if reported.decided and reported.decided.node in nodes else None
 
 
-def _decided_text(each: ReportedResult) -> str:
+def _decided_text(reported: ReportedResult) -> str:
     """Return the atom of the objects that decided a quantifier, or "" if what decided is none."""
-    if each.decided is None or each.deciding is None:
+    if reported.decided is None or reported.deciding is None:
         return ""
-    nodes = {identifier: node for identifier, _, node in iter_nodes(each.result.formula)}
-    return each.deciding.text if isinstance(nodes[each.decided.node], Quantified) else ""
+    nodes = {identifier: node for identifier, _, node in iter_nodes(reported.result.formula)}
+    return reported.deciding.text if isinstance(nodes[reported.decided.node], Quantified) else ""
 
 
-def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
+def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
     """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
-    witness, deciding = each.witness, each.deciding
-    if each.fault_ns is None or witness is None or deciding is None or deciding.unknown:
+    witness, deciding = reported.witness, reported.deciding
+    if reported.fault_ns is None or witness is None or deciding is None or deciding.unknown:
         return None
-    if each.decided != (witness.closest_path or witness.path)[-1]:
+    if reported.decided != (witness.closest_path or witness.path)[-1]:
         return None  # things stood elsewhere when the atom had its number
-    contact = next((each.contact for each in deciding.measured if each.contact is not None), None)
+    contact = next(
+        (measurement.contact for measurement in deciding.measured if measurement.contact is not None), None
+    )
     if contact is None:
         return None
     number = deciding.value * divisor_of(deciding.atom)
@@ -388,7 +398,7 @@ def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping
     # as the arrow of the log's scene says it
     holds = "must not hold, holds by " if number >= 0 else ""
     return {
-        "time": (each.fault_ns - first_ns) / 1e9,
+        "time": (reported.fault_ns - first_ns) / 1e9,
         "ends": [*map(float, (*contact.first, *contact.second))],
         "text": deciding.text,
         "label": open_text(witness) or f"{holds}{number:.3g} {lengths}".rstrip(),
@@ -410,8 +420,8 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
             f"The scene has one of {report.scene.stride} messages of /spatial/scene, and every sample that "
             "decides, is least or begins an event."
         )
-    drawn = [each for _, frame in report.scene.frames[:1] for each in frame.entities.values()]
-    if len(report.results) > 1 and not all(each.shades for each in drawn):
+    entities = [entity for _, frame in report.scene.frames[:1] for entity in frame.entities.values()]
+    if len(report.results) > 1 and not all(entity.shades for entity in entities):
         yield "The scene has the colours of all results together: there are too many for colours of each."
     if len(report.results) > MOST_DRAWN:
         yield (

@@ -52,13 +52,13 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
 
 def _chip_of(report: RunReport) -> Html:
     verdict = report.replayed.verdict
-    deciding = [each.result for each in report.results if each.result.verdict is verdict]
+    deciding = [reported.result for reported in report.results if reported.result.verdict is verdict]
     return chip(verdict, is_sound=all(map(_is_sound, deciding)))
 
 
 def panels(report: RunReport) -> Html:
     """Return the verdicts, and a place for each panel that is drawn."""
-    has_automaton = any(each.compiled.automaton is not None for each in report.drawn)
+    has_automaton = any(reported.compiled.automaton is not None for reported in report.drawn)
     sections = [
         panel("verdicts", "Verdicts", *_verdicts(report)),
         *([panel("camera", "Camera", kind="panel wide")] if report.pictures["topic"] else []),
@@ -69,8 +69,8 @@ def panels(report: RunReport) -> Html:
         panel("events", "Events"),
     ]
     if report.decisions.decisions:
-        other = f"They were made for another specification: {report.planned_for}, as it was recorded."
-        note = [element("p", text(other), **{"class": "axes"})] if report.planned_for else []
+        sentence = f"They were made for another specification: {report.planned_for}, as it was recorded."
+        note = [element("p", text(sentence), **{"class": "axes"})] if report.planned_for else []
         sections.append(panel("decisions", "Decisions", *note))
     return element("main", *sections, id="main", tabindex="-1")
 
@@ -129,8 +129,8 @@ def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
 
 
 def _notice(role: str, what: str, details: Sequence[str]) -> Html:
-    listed = element("ul", *(element("li", text(each)) for each in details)) if details else Html("")
-    return element("div", element("strong", what), listed, role=role, **{"class": f"notice {role}"})
+    detail_list = element("ul", *(element("li", text(detail)) for detail in details)) if details else Html("")
+    return element("div", element("strong", what), detail_list, role=role, **{"class": f"notice {role}"})
 
 
 def panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
@@ -150,27 +150,32 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     if are_many:
         yield element("p", text(_counts(report)), id="counts", **{"class": "counts"})
     worst = worst_first(report.replayed.results)
-    for number, each in enumerate(report.results[place] for place in worst):
+    for number, reported in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
-        drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
-        is_reported = each.result.verdict == report.replayed.verdict or bool(each.result.remarks)
+        result_attribute = {"data-result": str(places[id(reported)])} if id(reported) in places else {}
+        is_reported = reported.result.verdict == report.replayed.verdict or bool(reported.result.remarks)
         is_unfolded = is_reported and not (are_many and number)
-        unfolded = {"open": ""} if each.sentences and is_unfolded else {}
-        attributes = {"class": "verdict", "data-verdict": str(each.result.verdict), **drawn, **unfolded}
-        content = [element("p", *sentence_html(sentence, first_ns)) for sentence in each.sentences]
-        content += [_specs(each, first_ns)] if each.sentences else []
-        yield element("details" if content else "div", _summary(each, first_ns), *content, **attributes)
+        unfolded = {"open": ""} if reported.sentences and is_unfolded else {}
+        attributes = {
+            "class": "verdict",
+            "data-verdict": str(reported.result.verdict),
+            **result_attribute,
+            **unfolded,
+        }
+        content = [element("p", *sentence_html(sentence, first_ns)) for sentence in reported.sentences]
+        content += [_specs(reported, first_ns)] if reported.sentences else []
+        yield element("details" if content else "div", _summary(reported, first_ns), *content, **attributes)
 
 
 def _counts(report: RunReport) -> str:
     """Return how many results have each verdict."""
-    return counts_text(each.result.verdict for each in report.results)
+    return counts_text(reported.result.verdict for reported in report.results)
 
 
-def _summary(each: ReportedResult, first_ns: int) -> Html:
+def _summary(reported: ReportedResult, first_ns: int) -> Html:
     """Return the line of a result: its verdict, requirement and number, and since when it is certain."""
-    result = each.result
-    numbers = [f"robustness {each.robustness_text or 'not determined'}"]
+    result = reported.result
+    numbers = [f"robustness {reported.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
         if result.least is None and result.least_at_ns is not None:
             numbers.append(f"least at {Instant(result.least_at_ns, first_ns)}")
@@ -182,7 +187,7 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
     mark = _mark(result)
     marks = [element("span", mark, **{"class": "chip is-vacuous"})] if mark else []
     return element(
-        "summary" if each.sentences else "div",
+        "summary" if reported.sentences else "div",
         chip(result.verdict, is_sound=_is_sound(result)),
         *marks,
         *_requirement(result.spec.id, result.title, result.spec.title),
@@ -216,15 +221,15 @@ def _requirement(identifier: str | None, name: str, title: str | None) -> Iterat
         yield element("span", text(title), **{"class": "title-words"})
 
 
-def _specs(each: ReportedResult, first_ns: int) -> Html:
+def _specs(reported: ReportedResult, first_ns: int) -> Html:
     """Return one row for each named spec within a result, and the units that its number is the least of."""
-    named = {spec.name: spec for spec in each.file.specs}
-    rows, formulas = [], {identifier: node for identifier, _, node in iter_nodes(each.result.formula)}
-    for node in each.specs:
-        settled_ns = settled_time(each.result.settled_ns, node.id)
+    named = {spec.name: spec for spec in reported.file.specs}
+    rows, formulas = [], {identifier: node for identifier, _, node in iter_nodes(reported.result.formula)}
+    for node in reported.specs:
+        settled_ns = settled_time(reported.result.settled_ns, node.id)
         spec = named.get(node.name or "")
         about = (None, None) if spec is None else (spec.id, spec.title)
-        unit = declared_unit(formulas[node.id], each.result.evidence.units)
+        unit = declared_unit(formulas[node.id], reported.result.evidence.units)
         numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
         if settled_ns is not None:
             numbers += f", violated since {Instant(settled_ns, first_ns)}"
@@ -233,7 +238,7 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
             element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
         )
     parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
-    if words := units_text(units_of(each.result.formula)):
+    if words := units_text(units_of(reported.result.formula)):
         parts.append(element("p", text(words), **{"class": "units"}))
     return element("div", *parts)
 
@@ -350,8 +355,8 @@ def document(
     body = [
         *parts,
         '<div id="transport" class="transport" role="region" aria-label="Time"></div>',
-        *(f'<script type="{json_kind}" id="{name}">{each}</script>' for name, each in facts.items()),
-        *(f'<script type="{packed_kind}" id="{name}">{each}</script>' for name, each in numbers.items()),
+        *(f'<script type="{json_kind}" id="{name}">{fact}</script>' for name, fact in facts.items()),
+        *(f'<script type="{packed_kind}" id="{name}">{number}</script>' for name, number in numbers.items()),
     ]
     scripts = [asset(_LIBRARY), _script(script_name)]
     return html_page(title, body, scripts, _STYLES, has_pictures=has_pictures)
@@ -381,7 +386,7 @@ def html_page(
         element("title", text(title)),
         f"<style>{style}</style></head><body>",
         *body,
-        *(f"<script>{each}</script>" for each in scripts),
+        *(f"<script>{script}</script>" for script in scripts),
         "</body></html>\n",
     ]
     return "".join(whole).encode("utf-8")
@@ -395,7 +400,7 @@ def asset(name: str) -> str:
 
 def _script(name: str) -> str:
     """Return our scripts as one, in a scope of its own."""
-    scripts = "\n".join(asset(f"browser/{each}.js") for each in (*_SCRIPTS, name))
+    scripts = "\n".join(asset(f"browser/{script}.js") for script in (*_SCRIPTS, name))
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 

@@ -174,8 +174,8 @@ def tree_value(
     """
     # with the object that it is about in place of a template's parameter
     formula = result.evidence.bound(result.formula)
-    shown, initial = shown_nodes(formula), initial_nodes(formula)
-    place = {identifier: index for index, identifier in enumerate(shown)}
+    nodes, initial = shown_nodes(formula), initial_nodes(formula)
+    place = {identifier: index for index, identifier in enumerate(nodes)}
     return [
         {
             "id": identifier,
@@ -227,11 +227,11 @@ def final_text(robustness: float, lower: float, upper: float, unit: str = "") ->
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:
     """Return the nodes that have curves: the root and the named nodes among those shown."""
-    shown = set(shown_nodes(formula))
+    nodes = set(shown_nodes(formula))
     return tuple(
         identifier
         for identifier, parent, node in iter_nodes(formula)
-        if identifier in shown and (parent is None or node.name)
+        if identifier in nodes and (parent is None or node.name)
     )
 
 
@@ -240,10 +240,10 @@ def _head(node: Formula, relations: frozenset[str]) -> str:
     if isinstance(node, Boolean):
         return operator_of(node)
     text = format_formula(node, relations=relations)
-    for operand in (format_formula(each, relations=relations) for each in operands_of(node)):
-        for written in (f"({operand})", operand):
-            if written in text:
-                text = text.replace(written, _PLACE, 1)
+    for operand in (format_formula(operand_node, relations=relations) for operand_node in operands_of(node)):
+        for operand_text in (f"({operand})", operand):
+            if operand_text in text:
+                text = text.replace(operand_text, _PLACE, 1)
                 break
     return text
 
@@ -300,7 +300,7 @@ MOST_EVENTS: Final = 2_000
 def event_values(events: Sequence[Event], first_ns: int) -> list[Mapping[str, Any]]:
     """Return the list as the page reads it, by start time."""
     ordered = sorted(events, key=start_of)
-    return [_event_value(each, first_ns) for each in ordered[:MOST_EVENTS]]
+    return [_event_value(event, first_ns) for event in ordered[:MOST_EVENTS]]
 
 
 def start_of(event: Event) -> int:
@@ -310,7 +310,7 @@ def start_of(event: Event) -> int:
 
 
 def _event_value(event: Event, first_ns: int) -> Mapping[str, Any]:
-    facts = {each.key: each.value for each in event.metadata}
+    facts = {entry.key: entry.value for entry in event.metadata}
     return {
         "time": (start_of(event) - first_ns) / 1e9,
         "status": _status(facts),
@@ -360,14 +360,16 @@ def pictures_of(
     others = np.linspace(*span_ns, MOST_PICTURES - len(decided)).astype(np.int64).tolist()
     try:
         frames = ImageTopic(path, topic).frames_at(sorted({*decided, *others}))
-        made = [(frame.time_ns, _small(frame.image)) for frame in frames]
+        pictures = [(frame.time_ns, _small(frame.image)) for frame in frames]
     except (LogError, UsageError) as error:
         return {**NO_PICTURES, "topic": topic, "reason": f"The pictures of {topic} are not shown: {error}."}
     return {
         "topic": topic,
-        "reason": "" if made else f"No picture of {topic} can be decoded.",
-        "times": [(time_ns - first_ns) / 1e9 for time_ns, _ in made],
-        "pictures": [f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}" for _, data in made],
+        "reason": "" if pictures else f"No picture of {topic} can be decoded.",
+        "times": [(time_ns - first_ns) / 1e9 for time_ns, _ in pictures],
+        "pictures": [
+            f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}" for _, data in pictures
+        ],
     }
 
 
@@ -376,7 +378,11 @@ def _image_topic(path: LogFile) -> str | None:
     if not is_log(path):
         return None
     try:
-        topics = [each.name for each in open_messages(path).topics() if is_image_type(each.type)]
+        topics = [
+            image_topic.name
+            for image_topic in open_messages(path).topics()
+            if is_image_type(image_topic.type)
+        ]
     except LogError:
         # the replay has said how damaged it is
         return None
@@ -421,9 +427,9 @@ class ReportedScene:
     def add(self, frames: SceneFrames) -> None:
         """Add what the next messages show."""
         # no others have a place
-        chosen = np.arange(-self._count % self.stride, len(frames.times_ns), self.stride)
+        frame_numbers = np.arange(-self._count % self.stride, len(frames.times_ns), self.stride)
         is_again = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
-        frames = replace(frames, chosen=np.union1d(chosen, [0]) if is_again else chosen)
+        frames = replace(frames, chosen=np.union1d(frame_numbers, [0]) if is_again else frame_numbers)
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             self.add_frame(time_ns, partial(frames.frame, index))
 
@@ -486,20 +492,24 @@ def scene_value(
     """
     times_ns = scene.times_ns
     is_kept = np.isin(times_ns, kept_ns)
-    frames = [frame for (_, frame), kept in zip(scene.frames, is_kept.tolist(), strict=True) if kept]
+    frames = [
+        frame
+        for (_, frame), is_kept_frame in zip(scene.frames, is_kept.tolist(), strict=True)
+        if is_kept_frame
+    ]
     entities = _entities(frames)
     # of one result there is one arrow in a frame
     results = dict(sorted((result, place) for (result, _), (place, _) in places.items()))
-    listed = sorted(results, key=results.__getitem__)
+    result_numbers = sorted(results, key=results.__getitem__)
     most = max(1, MOST_ARROWS // max(len(frames), 1))
-    shown = [
+    numbered_arrows = [
         (number, arrow)
         for number, frame in enumerate(frames)
         for result, place in results.items()
         if place < most and (arrow := frame.violation(result)) is not None
     ]
-    arrows = [arrow for _, arrow in shown]
-    outlines = list(dict.fromkeys(each.dashes for each in arrows))
+    arrows = [arrow for _, arrow in numbered_arrows]
+    outlines = list(dict.fromkeys(arrow.dashes for arrow in arrows))
     box = _box(entities, arrows)
     return {
         "times": packing.add((times_ns[is_kept] - first_ns) / 1e9, "f8"),
@@ -508,26 +518,26 @@ def scene_value(
         "low": box.low.tolist(),
         "high": (box.low + box.size).tolist(),
         "entities": [
-            _entity_value(identifier, shown, len(frames), listed, box, packing)
-            for identifier, shown in sorted(entities.items(), key=_drawing_order)
+            _entity_value(identifier, by_frame, len(frames), result_numbers, box, packing)
+            for identifier, by_frame in sorted(entities.items(), key=_drawing_order)
         ],
         "violations": {
-            "frames": packing.add(np.array([number for number, _ in shown]), "i4"),
-            "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),
-            "labels": [each.label for each in arrows],
-            "atoms": [each.atom for each in arrows],
-            "robustness": packing.add(np.array([each.robustness for each in arrows]), "f8"),
-            "holds": packing.add(np.array([each.holds for each in arrows]), "u1"),
+            "frames": packing.add(np.array([number for number, _ in numbered_arrows]), "i4"),
+            "points": packing.add(box.steps(_join_points([arrow.ends for arrow in arrows])), "u2"),
+            "labels": [arrow.label for arrow in arrows],
+            "atoms": [arrow.atom for arrow in arrows],
+            "robustness": packing.add(np.array([arrow.robustness for arrow in arrows]), "f8"),
+            "holds": packing.add(np.array([arrow.holds for arrow in arrows]), "u1"),
             "outlines": outlines,
-            "outline": packing.add(np.array([outlines.index(each.dashes) for each in arrows]), "i4"),
+            "outline": packing.add(np.array([outlines.index(arrow.dashes) for arrow in arrows]), "i4"),
             # of those about an earlier sample
             "moments": [
-                None if each.moment_ns is None else (each.moment_ns - first_ns) / 1e9 for each in arrows
+                None if arrow.moment_ns is None else (arrow.moment_ns - first_ns) / 1e9 for arrow in arrows
             ],
             # the result and the node of the page, -1 where the page leaves the node out
             "places": packing.add(
                 np.array(
-                    [places.get((each.result, each.node), (results[each.result], -1)) for each in arrows]
+                    [places.get((arrow.result, arrow.node), (results[arrow.result], -1)) for arrow in arrows]
                 ),
                 "i4",
             ),
@@ -542,23 +552,23 @@ def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
 
 def _entities(frames: Sequence[SceneFrame]) -> Mapping[str, dict[int, DrawnEntity]]:
     """Return what is drawn, by entity and frame."""
-    found: dict[str, dict[int, DrawnEntity]] = {}
+    frames_by_entity: dict[str, dict[int, DrawnEntity]] = {}
     for number, frame in enumerate(frames):
-        for identifier, drawn in frame.entities.items():
-            found.setdefault(identifier, {})[number] = drawn
-    return found
+        for identifier, entity in frame.entities.items():
+            frames_by_entity.setdefault(identifier, {})[number] = entity
+    return frames_by_entity
 
 
 def _box(entities: Mapping[str, Mapping[int, DrawnEntity]], arrows: Sequence[DrawnViolation]) -> _Box:
-    rings = [ring for shown in entities.values() for each in shown.values() for ring in each.rings]
-    everything = _joined([*rings, *(each.ends for each in arrows)])
+    rings = [ring for by_frame in entities.values() for entity in by_frame.values() for ring in entity.rings]
+    everything = _join_points([*rings, *(arrow.ends for arrow in arrows)])
     if not len(everything):
         return _Box(np.zeros(2), np.ones(2))
     low, size = everything.min(axis=0), np.ptp(everything, axis=0)
     return _Box(low, np.where(size > 0.0, size, 1.0))
 
 
-def _joined(points: Sequence[Floats]) -> Floats:
+def _join_points(points: Sequence[Floats]) -> Floats:
     """Return all points, (n, 2)."""
     return np.concatenate([np.empty((0, 2)), *points])
 
@@ -578,13 +588,15 @@ def _entity_value(
     """
     forms: dict[tuple[tuple[int, ...], bool], int] = {}
     of_frame = np.full(frames, _ABSENT, np.int64)
-    for number, each in shown.items():
-        form = tuple(len(ring) for ring in each.rings), each.is_last
+    for number, entity in shown.items():
+        form = tuple(len(ring) for ring in entity.rings), entity.is_last
         of_frame[number] = forms.setdefault(form, len(forms))
     kind, _, name = identifier.partition("/")
-    rings = [ring for each in shown.values() for ring in each.rings]
-    has_shades = all(each.shades for each in shown.values())
-    shades = [np.frombuffer(each.shades, np.uint8)[list(results)] for each in shown.values() if has_shades]
+    rings = [ring for entity in shown.values() for ring in entity.rings]
+    has_shades = all(entity.shades for entity in shown.values())
+    shades = [
+        np.frombuffer(entity.shades, np.uint8)[list(results)] for entity in shown.values() if has_shades
+    ]
     return {
         "kind": kind,
         "name": name,
@@ -592,8 +604,8 @@ def _entity_value(
         # a missing object leaves its last outline
         "last": [number for (_, is_last), number in forms.items() if is_last],
         "form": packing.add(of_frame, "u2"),
-        "points": packing.add(box.steps(_joined(rings)), "u2"),
-        "colours": packing.add(np.array([each.colour for each in shown.values()]), "u1"),
+        "points": packing.add(box.steps(_join_points(rings)), "u2"),
+        "colours": packing.add(np.array([entity.colour for entity in shown.values()]), "u1"),
         "shades": packing.add(np.array(shades), "u1") if has_shades else None,
     }
 
@@ -652,7 +664,7 @@ class _Owner(NamedTuple):
         if not candidate.HasField("target"):
             return None
         nearest = min(
-            (each.turn for each in candidate.maps), key=lambda turn: abs(turn - candidate.target.turn)
+            (map_turn.turn for map_turn in candidate.maps), key=lambda turn: abs(turn - candidate.target.turn)
         )
         return candidate.target if nearest == self.turn else None
 
@@ -688,34 +700,38 @@ def decisions_value(
     Args:
         redone: what would have been decided otherwise, if the log has that.
     """
-    drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
-    kept = _kept([each for maps in drawn for each in maps], most_cells)
-    others = {each.number: each for each in redone.decisions}
+    maps_by_decision = [list(_maps_of(plan, decision)) for decision in plan.decisions]
+    kept_maps = _maps_that_fit([drawn_map for maps in maps_by_decision for drawn_map in maps], most_cells)
+    others = {redone_decision.number: redone_decision for redone_decision in redone.decisions}
     decisions = []
-    for decision, maps in zip(plan.decisions, drawn, strict=True):
-        values = [_map_value(each, packing) for each in maps if id(each) in kept]
+    for decision, maps in zip(plan.decisions, maps_by_decision, strict=True):
+        values = [_map_value(drawn_map, packing) for drawn_map in maps if id(drawn_map) in kept_maps]
         value = _decision_value(decision, values, first_ns, packing)
-        other = others.get(decision.number)
-        if other is not None and _done(other) != _done(decision):
-            own = [_map_value(each, packing) for each in _maps_of(redone, other) if each.is_chosen]
-            value["redone"] = _decision_value(other, own, first_ns, packing)
+        redone_decision = others.get(decision.number)
+        if redone_decision is not None and _outcome(redone_decision) != _outcome(decision):
+            redone_values = [
+                _map_value(drawn_map, packing)
+                for drawn_map in _maps_of(redone, redone_decision)
+                if drawn_map.is_chosen
+            ]
+            value["redone"] = _decision_value(redone_decision, redone_values, first_ns, packing)
         decisions.append(value)
-    return {"decisions": decisions, "maps_left_out": sum(map(len, drawn)) - len(kept)}
+    return {"decisions": decisions, "maps_left_out": sum(map(len, maps_by_decision)) - len(kept_maps)}
 
 
-def _done(decision: PlanDecision) -> tuple[object, ...]:
+def _outcome(decision: PlanDecision) -> tuple[object, ...]:
     return decision.kind, decision.reason, decision.time_ns
 
 
-def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
+def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
     """Return the maps that fit, by identity: those of chosen targets, then the others, in order."""
-    kept: set[int] = set()
+    kept_maps: set[int] = set()
     cells = 0
-    for each in sorted(maps, key=lambda each: not each.is_chosen):
-        if cells + each.values.size <= most_cells:
-            cells += each.values.size
-            kept.add(id(each))
-    return kept
+    for drawn_map in sorted(maps, key=lambda drawn_map: not drawn_map.is_chosen):
+        if cells + drawn_map.values.size <= most_cells:
+            cells += drawn_map.values.size
+            kept_maps.add(id(drawn_map))
+    return kept_maps
 
 
 def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
@@ -726,19 +742,19 @@ def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn
         for place, candidate in enumerate(considered.candidates)
         for named in candidate.maps
     }
-    found: list[tuple[_Owner | None, Grid]] = [
+    owned_grids: list[tuple[_Owner | None, Grid]] = [
         (owner, plan.maps[number]) for number, owner in sorted(owners.items()) if number in plan.maps
     ]
     if not owners:
-        found = [
+        owned_grids = [
             (None, grid)
             for _, grid in sorted(plan.maps.items())
             if grid.timestamp.ToNanoseconds() == decision.time_ns
         ]
-    for owner, grid in found:
-        drawn = _drawn(grid, owner, _is_chosen(owner, decision, len(found)))
-        if drawn is not None:
-            yield drawn
+    for owner, grid in owned_grids:
+        drawn_map = _draw_map(grid, owner, _is_chosen(owner, decision, len(owned_grids)))
+        if drawn_map is not None:
+            yield drawn_map
 
 
 def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
@@ -751,7 +767,7 @@ def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
     return is_last and owner.candidate.chosen and owner.target is not None
 
 
-def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
+def _draw_map(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
     """Return a map's robustness; None if the sizes in the message are inconsistent or empty."""
     fields = map_fields(grid)
     numbers = fields.get("robustness")
@@ -766,12 +782,12 @@ def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
 
 
 def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
-    known = drawn.values[np.isfinite(drawn.values)]
+    finite = drawn.values[np.isfinite(drawn.values)]
     value: dict[str, Any] = {
         "columns": drawn.values.shape[1],
         "low": drawn.low,
         "high": drawn.high,
-        "scale": float(np.abs(known).max(initial=0.0)),
+        "scale": float(np.abs(finite).max(initial=0.0)),
         "values": packing.add(singles(drawn.values), "f4"),
         "chosen": drawn.is_chosen,
         "edge": None,
@@ -797,14 +813,14 @@ def _layer_values(drawn: _Drawn, candidate: PlanCandidate, packing: Packing) -> 
     """Return what limits and what blocks each cell and, of the chosen map, the layer of each conjunct."""
     if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
         return {}
-    named = {number: f"{number}: {each.text}" for number, each in enumerate(candidate.conjuncts, 1)}
-    shown = [name for name in named.values() if name in drawn.fields] if drawn.is_chosen else []
+    named = {number: f"{number}: {conjunct.text}" for number, conjunct in enumerate(candidate.conjuncts, 1)}
+    layer_names = [name for name in named.values() if name in drawn.fields] if drawn.is_chosen else []
     return {
         "limited": packing.add(drawn.fields["limited_by"], "u2"),
         "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
-        "limits": [each.text for each in candidate.conjuncts],
-        "blocks": [cause_text(each) for each in candidate.causes],
-        "layers": [{"title": name, "values": packing.add(drawn.fields[name], "f4")} for name in shown],
+        "limits": [conjunct.text for conjunct in candidate.conjuncts],
+        "blocks": [cause_text(cause) for cause in candidate.causes],
+        "layers": [{"title": name, "values": packing.add(drawn.fields[name], "f4")} for name in layer_names],
     }
 
 
@@ -842,7 +858,7 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
         "progress": _guard_texts(edge.progress),
         "constraints": _guard_texts(edge.constraints),
         "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
-        "later": [f"{each.object} to {_target_value(each)['words']}" for each in edge.motions[1:]],
+        "later": [f"{motion.object} to {_target_value(motion)['words']}" for motion in edge.motions[1:]],
         "once": joint_suffix(edge),
         "pruned": Reason.from_text(edge.pruned).kind,
     }

@@ -65,8 +65,8 @@ class Collector:
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
-        chosen = messages.of_topics(_COLLECTED)
-        for topic, (_, sequence, time_ns, _, payload) in zip(chosen.topics, chosen.rows(), strict=True):
+        collected = messages.of_topics(_COLLECTED)
+        for topic, (_, sequence, time_ns, _, payload) in zip(collected.topics, collected.rows(), strict=True):
             match topic:
                 case log_topics.AUTOMATON:
                     state = AutomatonState.FromString(payload)
@@ -176,8 +176,8 @@ def _results(
 
 def _gaps(replayed: Replayed) -> tuple[str, ...]:
     """Return sentences on what unknown results lack at the ends of a log, with a window without that."""
-    unknown = [each for each in replayed.results if each.verdict is Verdict.UNKNOWN]
-    gaps = (gap for each in unknown for gap in each.gaps() if gap.window is not None)
+    unknown = [result for result in replayed.results if result.verdict is Verdict.UNKNOWN]
+    gaps = (gap for result in unknown for gap in result.gaps() if gap.window is not None)
     return tuple(dict.fromkeys(gap_sentence(gap, replayed.first_ns) for gap in gaps))
 
 
@@ -217,7 +217,7 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
     Args:
         a, b: both sides, as they are reported.
     """
-    one, other = page_data(a), page_data(b)
+    data_a, data_b = page_data(a), page_data(b)
     labels = _labels(diff)
     decision = None if isinstance(diff, SpecificationDiff) else diff.decision
     is_same = "nothing differs" if diff.is_empty else "different"
@@ -242,11 +242,11 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
         " → ".join(labels),
         parts,
         {
-            "facts-a": json_text(one.facts),
-            "facts-b": json_text(other.facts),
+            "facts-a": json_text(data_a.facts),
+            "facts-b": json_text(data_b.facts),
             "pairs": json_text({"labels": labels, **_pairs(diff, a, b)}),
         },
-        {"numbers-a": one.numbers, "numbers-b": other.numbers},
+        {"numbers-a": data_a.numbers, "numbers-b": data_b.numbers},
         "comparison",
     )
 
@@ -269,9 +269,11 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
     if diff.is_empty:
         yield element("p", "Nothing differs.")
     if isinstance(diff, SpecificationDiff):
-        for each in diff.specs:
-            if each.edits or each.is_different:
-                yield _change(each.title, each.new.verdict, list(each.sentences(diff.first_ns)), first_ns)
+        for spec_diff in diff.specs:
+            if spec_diff.edits or spec_diff.is_different:
+                yield _change(
+                    spec_diff.title, spec_diff.new.verdict, list(spec_diff.sentences(diff.first_ns)), first_ns
+                )
         for names, where in ((diff.removed, diff.old), (diff.added, diff.new)):
             yield from (element("p", text(f"{name}: only in {where.filename}")) for name in names)
         return
@@ -342,14 +344,17 @@ def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dic
             [(knot.a_ns - a.replayed.first_ns) / 1e9, (knot.b_ns - b.replayed.first_ns) / 1e9]
             for knot in diff.alignment.knots
         ]
-        found = (
-            [each.apart_ns for each in diff.objects],
+        candidates_ns = (
+            [object_diff.apart_ns for object_diff in diff.objects],
             [] if decision is None else [decision.a_ns],
             [spec.first_ns for spec in diff.specs],
-            [*(each.first_ns for each in diff.objects), *(each.first_ns for each in diff.signals)],
+            [
+                *(object_diff.first_ns for object_diff in diff.objects),
+                *(object_diff.first_ns for object_diff in diff.signals),
+            ],
         )
-        known = ([at for at in times_ns if at is not None] for times_ns in found)
-        first_ns = next((min(times_ns) for times_ns in known if times_ns), None)
+        known_ns = ([at for at in times_ns if at is not None] for times_ns in candidates_ns)
+        first_ns = next((min(times_ns) for times_ns in known_ns if times_ns), None)
         for run_spec in diff.specs:
             titles = run_spec.a.title, run_spec.b.title
             nodes += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), places)
@@ -367,11 +372,11 @@ _Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]
 
 def _places(report: RunReport) -> _Places:
     return {
-        each.result.title: (
+        reported.result.title: (
             index,
-            {node: place for place, node in enumerate(shown_nodes(each.result.formula))},
+            {node: place for place, node in enumerate(shown_nodes(reported.result.formula))},
         )
-        for index, each in enumerate(report.drawn)
+        for index, reported in enumerate(report.drawn)
     }
 
 
@@ -392,10 +397,10 @@ def _node_pair(
     label: str, titles: tuple[str, str], ids: tuple[int, int], places: Sequence[_Places]
 ) -> Iterator[dict[str, Any]]:
     """Yield two nodes as the page finds them, if it shows both."""
-    found = [
-        [own[title][0], own[title][1][identifier]]
-        for own, title, identifier in zip(places, titles, ids, strict=True)
-        if title in own and identifier in own[title][1]
+    shown_nodes_of_pair = [
+        [places_of_report[title][0], places_of_report[title][1][identifier]]
+        for places_of_report, title, identifier in zip(places, titles, ids, strict=True)
+        if title in places_of_report and identifier in places_of_report[title][1]
     ]
-    if len(found) == 2:
-        yield {"label": label, "a": found[0], "b": found[1]}
+    if len(shown_nodes_of_pair) == 2:
+        yield {"label": label, "a": shown_nodes_of_pair[0], "b": shown_nodes_of_pair[1]}
