@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -15,7 +15,7 @@ import click
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.evidence import evidence_lines
 from spatial_replay.cli.options import JsonCommand, LogPath, input_files, output_option, reading_options
-from spatial_replay.cli.output import MANY, WORST_FIRST
+from spatial_replay.cli.output import MANY, WORST_FIRST, align_rows
 from spatial_replay.cli.terminal import (
     printing_to,
     progress,
@@ -27,7 +27,7 @@ from spatial_replay.cli.terminal import (
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.verdict import counts_text
-from spatial_replay.text import counted, counted_from, escaped, json_fields, json_value, requirement_text
+from spatial_replay.text import counted, counted_from, json_fields, json_value, requirement_text
 from spatial_replay.trace.doubts import json_doubt
 
 if TYPE_CHECKING:
@@ -89,7 +89,8 @@ def info(
 ) -> int:
     """Show what a log contains: samples, objects, signals, topics, attachments.
 
-    For an external log, lists the topics that could map to objects; with a mapping, the mapped objects.
+    For an external log, lists the topics that could map to objects; with a mapping, the mapped objects. For a
+    data set of episodes, lists its tasks, labels and features; push_v3#2 is one episode.
 
     Reads the whole log. Exits with 0, or with 3 if the log is damaged; the damage is reported on standard
     error.
@@ -100,6 +101,8 @@ def info(
       spatial-replay info blocks.jsonl.gz --json
       spatial-replay info drive.bag --suggest-mapping -o drive.yaml
       spatial-replay info drive.bag --mapping drive.yaml --fit
+      spatial-replay info push_v3 --suggest-mapping -o push.yaml
+      spatial-replay info push_v3#2
       spatial-replay info push.mcap --decisions
       spatial-replay info annotated.mcap --specification -o used.spatial
       spatial-replay info annotated.mcap --layout -o layout.json
@@ -134,6 +137,9 @@ def info(
         show(f"wrote {output}")
         return ExitCode.SATISFIED
     with printing_to(output, input_files(log, reading=reading)):
+        code = _print_data_set(log, as_json, suggest_mapping, names, reading)
+        if code is not None:
+            return code
         if layout:
             return _print_layout(log, panels=panels)
         if specification is not None:
@@ -145,6 +151,39 @@ def info(
         if fit:
             return _print_fitness(log, reading)
         return _print_overview(log, as_json, reading)
+
+
+def _print_data_set(
+    log: LogFile, as_json: bool, suggest_mapping: bool, contents: Sequence[str], reading: Reading
+) -> int | None:
+    """Print what a data set contains, or an episode without a mapping; None for anything else.
+
+    Raises:
+        UsageError: a data set as a whole has no such content.
+    """
+    from spatial_replay.cli.data_sets import show_data_set, show_episode
+    from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
+
+    if not isinstance(log, Path):
+        return None
+    path, number = data_set_address(log) or (log, None)
+    data_set = open_data_set(path)
+    if data_set is None:
+        return None
+    if suggest_mapping:
+        from spatial_replay.mapping.suggest_features import suggest_feature_mapping
+
+        show_file(suggest_feature_mapping(data_set))
+        return ExitCode.SATISFIED
+    if number is None:
+        if contents or reading.get("mapping") is not None:
+            first = data_set.episodes[0].number if data_set.episodes else 0
+            option = contents[0] if contents else "--mapping"
+            raise UsageError(f"{option} is about one episode; give its address: {path}#{first}")
+        return show_data_set(data_set, as_json)
+    if contents or reading.get("mapping") is not None or data_set.names_bodies:
+        return None
+    return show_episode(data_set, number, as_json)
 
 
 def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
@@ -400,7 +439,7 @@ def _lines(
         yield f"axes     {overview.axes}"
     if overview.objects:
         yield "objects"
-        yield from _table(
+        yield from align_rows(
             (
                 tracked.name,
                 ", ".join(tracked.classes),
@@ -423,14 +462,14 @@ def _lines(
 def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
     if survey.topics:
         yield "topics"
-        yield from _table(
+        yield from align_rows(
             (topic.topic.name, topic.topic.type, topic.topic.encoding, counted(topic.messages, "message"))
             for topic in survey.topics
         )
     objects = [(f"{topic.topic.name}:", topic.entry) for topic in survey.topics if topic.entry]
     if objects and not mapped:
         yield "could map to objects"
-        yield from _table(objects)
+        yield from align_rows(objects)
         yield f"to write a first mapping: spatial-replay info {shlex.quote(survey.name)} --suggest-mapping"
 
 
@@ -445,7 +484,7 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
             range(len(kinds)), key=lambda place: WORST_FIRST.index(kinds[place]) if is_known else 0
         )
         yield f"verdicts: {counts_text(kinds)}" if is_known and len(kinds) > MANY else "verdicts"
-        yield from _table(
+        yield from align_rows(
             (
                 verdict["name"] or "",
                 verdict["verdict"] or "",
@@ -455,7 +494,7 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
         )
     if topics:
         yield "topics"
-        yield from _table(
+        yield from align_rows(
             (
                 *names,
                 counted(sum(counts), "message"),
@@ -467,12 +506,12 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
         if name != VERDICTS:
             yield f"metadata {name}"
             pairs = [(key, _shortened(value)) for key, value in list(data.items())[:_MOST_ENTRIES]]
-            yield from _table(pairs)
+            yield from align_rows(pairs)
             if len(data) > _MOST_ENTRIES:
                 yield f"  … and {len(data) - _MOST_ENTRIES:,} more; --json prints all"
     if container.attachments:
         yield "attachments"
-        yield from _table(
+        yield from align_rows(
             (attachment.name, attachment.media_type, counted(attachment.size, "byte"))
             for attachment in container.attachments
         )
@@ -495,12 +534,3 @@ def _clock(time_ns: int) -> str:
         return f"{time_ns / 1e9:.3f} s"
     seconds, fraction_ns = divmod(time_ns, 10**9)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{fraction_ns // 10**6:03d}Z"
-
-
-def _table(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
-    """Yield rows as lines with aligned columns."""
-    # escaped here, so that what is printed is as wide as what is measured
-    cells = [tuple(map(escaped, row)) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        yield "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -199,3 +199,12 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
 
 def _number_text(number: float, unit: str = "") -> str:
     return "not determined" if math.isnan(number) else with_unit(number, unit)
+
+
+def align_rows(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
+    """Yield rows as lines with aligned columns."""
+    # escaped here, so that what is printed is as wide as what is measured
+    cells = [tuple(map(escaped, row)) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        yield "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -133,6 +133,7 @@ class DataSet:
         path: of the folder or file.
         kind: its format with the version, such as `LeRobot v3.0`.
         fps: frames a second; None where the data set does not say.
+        has_times: whether its frames have times of their own, so that no frames a second are needed.
         robot: its type; "" where the data set does not say.
         features: columns that a mapping can use, in the data set's order.
         episodes: in the order of their numbers.
@@ -144,6 +145,7 @@ class DataSet:
     path: Path
     kind: str
     fps: float | None = None
+    has_times: bool = False
     robot: str = ""
     features: tuple[Feature, ...] = ()
     episodes: tuple[Episode, ...] = ()
@@ -170,6 +172,10 @@ class DataSet:
             LogError: the data cannot be read.
         """
         raise NotImplementedError
+
+    def label_of(self, number: int) -> bool | None:
+        """Read whether an episode is labelled a success; None without a label."""
+        return self.columns(number, AS_STORED._replace(fps=self.fps or 1.0), ()).label
 
     def episode(self, number: int) -> Episode:
         """Return the episode of a number.

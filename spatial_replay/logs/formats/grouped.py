@@ -105,6 +105,14 @@ class GroupedEpisodes(DataSet):
                 read.unjudged,
             )
 
+    def label_of(self, number: int) -> bool | None:
+        """See `DataSet.label_of`; no pose is read."""
+        episode, place = self.episode(number), f"{self.name}#{number}"
+        with open_archive(self.path) as file:
+            group = episode_group(file, f"{self.folder}/{episode.key}", place)
+            success = self.success(group, self.count_frames(group, place), episode, AS_STORED)
+            return None if success is None else bool(success.any())
+
     def _features_of(
         self, group: Any, count: int, names: Sequence[str]
     ) -> tuple[dict[str, Floats], list[str]]:

@@ -286,6 +286,7 @@ class _Robosuite(GroupedEpisodes):
     """
 
     folder = "data"
+    has_times = True
     names_bodies = True
     left_out = frozenset({"next_obs"})
 

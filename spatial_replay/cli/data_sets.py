@@ -1,0 +1,247 @@
+"""`spatial-replay info` of data sets of episodes, and of an episode without a mapping."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from spatial_replay.cli.application import ExitCode
+from spatial_replay.cli.output import align_rows
+from spatial_replay.cli.terminal import progress, show, show_json, warn
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.text import counted, json_fields, json_number, printable
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, EpisodeReading, Feature
+
+_MOST_LABELS: Final = 1_000
+"""Episodes whose labels are counted."""
+_MOST_TASKS: Final = 5
+_MOST_PLACES: Final = 60
+"""Places of a feature that the text of an episode lists."""
+
+
+def show_data_set(data_set: DataSet, as_json: bool) -> int:
+    """Print what a data set contains.
+
+    Raises:
+        UsageError: it has no poses.
+    """
+    from spatial_replay.mapping.suggest_features import why_poseless
+
+    labels = _read_labels(data_set)
+    bodies, remarks = _bodies(data_set)
+    warn(*(f"{data_set.name}: {remark}" for remark in (*data_set.remarks, *remarks)))
+    if as_json:
+        show_json(_document(data_set, labels, bodies, remarks))
+    else:
+        show(*_lines(data_set, labels, bodies))
+    if reason := why_poseless(data_set):
+        raise UsageError(reason)
+    return ExitCode.SATISFIED
+
+
+def show_episode(data_set: DataSet, number: int, as_json: bool) -> int:
+    """Print what an episode contains, without a mapping: its task, label, and the range of each number."""
+    from spatial_replay.mapping.suggest_features import mappable_features
+
+    episode, features = data_set.episode(number), mappable_features(data_set)
+    columns = data_set.columns(number, _any_rate(data_set), [feature.name for feature in features])
+    name = f"{data_set.name}#{number}"
+    unjudged = [columns.unjudged] if columns.unjudged else []
+    warn(*(f"{name}: {text}" for text in (*columns.faults, *columns.remarks, *unjudged)))
+    seconds = int(columns.times_ns[-1] - columns.times_ns[0]) / 1e9 if len(columns.times_ns) else 0.0
+    if as_json:
+        document = {
+            "name": name,
+            "kind": f"{data_set.kind} episode",
+            **json_fields(episode, "number", "key", "task", "seed"),
+            "frames": len(columns.times_ns),
+            "seconds": seconds if data_set.fps else None,
+            "success": columns.label,
+            "faults": columns.faults,
+            "remarks": columns.remarks,
+            "unjudged": columns.unjudged or None,
+            "features": [
+                {"name": feature.name, "places": list(_ranges(feature, columns))} for feature in features
+            ],
+        }
+        show_json(document)
+        return ExitCode.DAMAGED if columns.faults else ExitCode.SATISFIED
+    length = f" in {seconds:.3f} s" if data_set.fps else ""
+    show(f"{name}: {data_set.kind} episode, {counted(len(columns.times_ns), 'frame')}{length}")
+    if episode.task:
+        show(f"task     {printable(episode.task)}")
+    if columns.label is not None:
+        show(f"label    {_label_text(data_set, columns)}")
+    for feature in features:
+        show(printable(feature.name))
+        ranges = list(_ranges(feature, columns))
+        show(
+            *align_rows(
+                (
+                    row["place"],
+                    f"first {row['first']:.4g}",
+                    f"from {row['least']:.4g} to {row['greatest']:.4g}",
+                )
+                for row in ranges[:_MOST_PLACES]
+            )
+        )
+        if len(ranges) > _MOST_PLACES:
+            show(f"  … and {len(ranges) - _MOST_PLACES:,} more; --json prints all")
+    return ExitCode.DAMAGED if columns.faults else ExitCode.SATISFIED
+
+
+def _any_rate(data_set: DataSet) -> EpisodeReading:
+    """Return a reading for what does not depend on times."""
+    from spatial_replay.logs.formats.episodes import AS_STORED
+
+    return AS_STORED._replace(fps=data_set.fps or 1.0)
+
+
+def _read_labels(data_set: DataSet) -> list[bool | None]:
+    """Return the labels of the first episodes; None for an episode without one, or that cannot be read."""
+    if data_set.label is None:
+        return []
+    episodes = data_set.episodes[:_MOST_LABELS]
+    labels: list[bool | None] = []
+    with progress("episodes", len(episodes)) as advance:
+        for episode in episodes:
+            try:
+                labels.append(data_set.label_of(episode.number))
+            except LogError as error:
+                warn(str(error))
+                labels.append(None)
+            advance(1)
+    return labels
+
+
+def _bodies(data_set: DataSet) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the bodies of the first episode, and why they cannot be read."""
+    if not data_set.names_bodies or not data_set.episodes:
+        return [], []
+    try:
+        columns = data_set.columns(data_set.episodes[0].number, _any_rate(data_set), ())
+    except (UsageError, LogError) as error:
+        return [], [str(error)]
+    bodies = [
+        {
+            "name": body.name,
+            "has_orientation": body.quaternions is not None,
+            "has_shape": body.shapes is not None,
+        }
+        for body in columns.bodies
+    ]
+    return bodies, list(columns.remarks)
+
+
+def _document(
+    data_set: DataSet, labels: Sequence[bool | None], bodies: Sequence[dict[str, Any]], remarks: Sequence[str]
+) -> dict[str, Any]:
+    from spatial_replay.mapping.suggest_features import mappable_features
+
+    mappable = {feature.name for feature in mappable_features(data_set)}
+    label = data_set.label
+    successes = [*labels, *[None] * (len(data_set.episodes) - len(labels))]
+    return {
+        **json_fields(data_set, "name", "kind", "fps"),
+        "robot": data_set.robot or None,
+        "label": None
+        if label is None
+        else {**json_fields(label), "episodes": len(labels), "successes": labels.count(True)},
+        "episodes": [
+            {"episode": f"{data_set.name}#{episode.number}", **json_fields(episode), "success": success}
+            for episode, success in zip(data_set.episodes, successes, strict=True)
+        ],
+        "features": [
+            {**json_fields(feature), "mappable": feature.name in mappable} for feature in data_set.features
+        ],
+        "objects": list(bodies),
+        "remarks": [*data_set.remarks, *remarks],
+    }
+
+
+def _lines(
+    data_set: DataSet, labels: Sequence[bool | None], bodies: Sequence[dict[str, Any]]
+) -> Iterator[str]:
+    from spatial_replay.mapping.suggest_features import mappable_features, places_text, why_poseless
+
+    frames = [episode.frames for episode in data_set.episodes]
+    total = counted(sum(map(int, filter(None, frames))), "frame") if None not in frames else ""
+    rate = f"at {data_set.fps:g} Hz" if data_set.fps else ""
+    facts = [
+        data_set.kind,
+        counted(len(data_set.episodes), "episode"),
+        " ".join(filter(None, (total, rate))),
+        f"robot {data_set.robot}" if data_set.robot else "",
+    ]
+    yield f"{data_set.name}: {', '.join(filter(None, facts))}"
+    if not data_set.fps and not data_set.has_times:
+        yield "rate     not in the data set: a mapping says it, such as `fps: 20`"
+    tasks = Counter(printable(episode.task) for episode in data_set.episodes if episode.task)
+    if tasks:
+        texts = [f"{task} ({count:,})" for task, count in tasks.most_common(_MOST_TASKS)]
+        more = f", and {len(tasks) - _MOST_TASKS:,} more" if len(tasks) > _MOST_TASKS else ""
+        yield f"tasks    {', '.join(texts)}{more}"
+    yield f"label    {_labels_text(data_set, labels)}"
+    if bodies:
+        yield f"objects  {', '.join(_body_text(body) for body in bodies)}"
+    features = mappable_features(data_set)
+    for number, line in enumerate(align_rows((feature.name, places_text(feature)) for feature in features)):
+        yield f"{'features' if number == 0 else '':8} {line.strip()}"
+    pictures = [feature.name for feature in data_set.features if not feature.width]
+    if pictures:
+        yield f"pictures {printable(', '.join(pictures), 400)}"
+    if not data_set.episodes or why_poseless(data_set):
+        return
+    if not data_set.names_bodies:
+        yield "a mapping says which of these are objects: --suggest-mapping"
+    elif data_set.fps or data_set.has_times:
+        yield "it names its objects, so it needs no mapping"
+    else:
+        yield "it names its objects; a mapping with `fps:` is enough"
+    first = shlex.quote(f"{data_set.path}#{data_set.episodes[0].number}")
+    yield f"each episode is a log: spatial-replay info {first}"
+
+
+def _labels_text(data_set: DataSet, labels: Sequence[bool | None]) -> str:
+    """Return how many episodes are labelled successes, and which state a label is about."""
+    if data_set.label is None:
+        return "none; `label: FIELD` in a mapping names one"
+    about = "; it is about the state after each frame's action" if data_set.label.is_about_next else ""
+    first = "the first " if len(labels) < len(data_set.episodes) else ""
+    unlabelled = f" ({labels.count(None):,} without a label)" if None in labels else ""
+    count = f"true in {labels.count(True):,} of {first}{counted(len(labels), 'episode')}{unlabelled}"
+    return f"{data_set.label.field}: {count}{about}"
+
+
+def _body_text(body: dict[str, Any]) -> str:
+    return f"{body['name']} ({'pose' if body['has_orientation'] else 'place'})"
+
+
+def _label_text(data_set: DataSet, columns: EpisodeColumns) -> str:
+    field = data_set.label.field if data_set.label else "label"
+    if columns.success is None or len(columns.success) != len(columns.times_ns) or not columns.label:
+        return f"{field}: {str(columns.label).lower()}"
+    first = int(columns.success.argmax())
+    return f"{field}: true in {counted(int(columns.success.sum()), 'frame')}, first in frame {first}"
+
+
+def _ranges(feature: Feature, columns: EpisodeColumns) -> Iterator[dict[str, Any]]:
+    """Yield the first, least and greatest number of each place of a feature; null for none."""
+    if feature.name not in columns.features:
+        return
+    rows = columns.features[feature.name].reshape(len(columns.times_ns), -1)
+    for index, column in enumerate(rows.T):
+        numbers = column[np.isfinite(column)]
+        place = feature.places[index] if feature.places else f"[{index}]"
+        yield {
+            "place": place,
+            "first": json_number(float(column[0])) if len(column) else None,
+            "least": float(numbers.min()) if len(numbers) else None,
+            "greatest": float(numbers.max()) if len(numbers) else None,
+        }

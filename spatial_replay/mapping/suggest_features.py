@@ -1,0 +1,352 @@
+"""Suggest a mapping for a data set: names of features and numbers of some frames in; YAML with comments out.
+
+Names say where a position is. Numbers decide the order of a quaternion, and whether it is one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.logs.formats.episodes import AS_STORED, Body, DataSet, Feature
+from spatial_replay.logs.formats.hdf5 import quaternion_order
+from spatial_replay.mapping.trial import yaml_text
+from spatial_replay.text import counted, listed, printable
+
+_NO_OBJECTS: Final = re.compile(
+    r"(.*[./])?(actions?\b.*|rewards?|timestamps?|time|truncat\w*|terminat\w*|is_success|success|done)"
+    r"|next\..*|(frame_|episode_|task_|subtask_)?index|observation\.images?\b.*"
+)
+"""Features without objects: actions, rewards, labels, times, numbers of rows, pictures."""
+_STATES_OF_BODIES: Final = ("states/", "env_states/")
+"""Groups of the bodies that a data set names."""
+_JOINTS: Final = re.compile(
+    r"joint|shoulder|elbow|wrist|waist|forearm|upperarm|hip|knee|ankle|finger|thumb|gripper|torso|neck"
+    r"|\bhead_(pan|tilt)|qvel|velocity|effort|torque|current",
+    re.IGNORECASE,
+)
+"""Names of numbers that are a robot's joints, not a place."""
+_NO_POINT: Final = re.compile(
+    r"vel|acc|force|torque|twist|delta|linear|angular|rot|rpy|euler|axis|joint|image|_to_", re.IGNORECASE
+)
+_AXIS: Final = re.compile(
+    r"(?P<stem>.*?)(?:(?:^|[_. ])(?:pos|position|xyz)[_. ]?(?P<number>[012])"
+    r"|(?:[_. ](?:pos|position)[_. ]|[_. ]|^(?:(?:pos|position)[_. ])?)(?P<axis>[xyz]))",
+    re.IGNORECASE,
+)
+_PART: Final = re.compile(
+    r"(?P<stem>.*?)(?:^|[_. ])(?:q|quat|quaternion|rot|ori|orientation)[_. ]?(?P<part>[wxyz0123])",
+    re.IGNORECASE,
+)
+_POINT: Final = re.compile(r"(?P<stem>.*?)_?(?P<what>pos|position|xyz|xpos|goal)", re.IGNORECASE)
+_POSE: Final = re.compile(r"(?P<stem>.*?)_?pose", re.IGNORECASE)
+_HANDS: Final = re.compile(r"eef|\bee\b|tcp|hand|grip|tool|robot|flange", re.IGNORECASE)
+"""Names of parts of robots, which need not stand upright."""
+_LENGTH_ERROR: Final = 0.01
+_EXACT: Final = 1e-4
+"""A quaternion of a simulator is so close to length 1."""
+_MOST_SIGNALS: Final = 20
+_MOST_EPISODES: Final = 8
+"""Episodes whose numbers are looked at."""
+
+
+class Suggestion(NamedTuple):
+    """An object in a feature.
+
+    Attributes:
+        position, orientation: places, or one text for all; () for none.
+        order: of the numbers of the orientation.
+        signals: other numbers of the feature.
+        remark: what a reader has to check or decide.
+    """
+
+    feature: str
+    name: str
+    position: tuple[str, ...]
+    orientation: tuple[str, ...] = ()
+    order: str = ""
+    signals: tuple[str, ...] = ()
+    remark: str = ""
+
+
+def mappable_features(data_set: DataSet) -> list[Feature]:
+    """Return the features that may hold objects, by name: no actions, rewards, labels, times or pictures."""
+    label = None if data_set.label is None else data_set.label.field
+    return sorted(
+        feature
+        for feature in data_set.features
+        if feature.width
+        and feature.name != label
+        and not _NO_OBJECTS.fullmatch(feature.name)
+        and not (data_set.names_bodies and feature.name.startswith(_STATES_OF_BODIES))
+    )
+
+
+def why_poseless(data_set: DataSet) -> str:
+    """Return why no mapping can find objects in a data set; "" if one may."""
+    features = mappable_features(data_set)
+    joints = [feature for feature in features if _holds_joints(feature)]
+    if data_set.names_bodies or len(joints) < len(features):
+        return ""
+    names = [feature.name for feature in joints]
+    pictures = [feature.name for feature in data_set.features if "image" in feature.name]
+    content = "; ".join(
+        [
+            *([f"the joints of the robot ({listed(names)})"] if names else []),
+            *([f"pictures ({listed(pictures)})"] if pictures else []),
+        ]
+    )
+    return (
+        "no poses in this data set; what would be needed: a feature with the positions of objects in each"
+        f" frame, from a simulator or a tracker, such as observation.environment_state; it has"
+        f" {content or 'no numbers but actions and times'}"
+    )
+
+
+def _holds_joints(feature: Feature) -> bool:
+    if feature.places:
+        return all(_JOINTS.search(place) for place in feature.places)
+    return _JOINTS.search(re.split(r"[./]", feature.name)[-1]) is not None
+
+
+def suggest_feature_mapping(data_set: DataSet) -> str:
+    """Return the text of a mapping file for a data set, with comments.
+
+    Raises:
+        UsageError: the data set has no poses, or needs no mapping.
+        LogError: it cannot be read.
+    """
+    if reason := why_poseless(data_set):
+        raise UsageError(reason)
+    features = mappable_features(data_set)
+    columns, bodies = _numbers(data_set, features)
+    suggestions, twins = _without_bodies(suggest_objects(features, columns), columns, bodies)
+    if data_set.names_bodies and not suggestions and (data_set.fps or data_set.has_times):
+        raise UsageError(f"{data_set.name} needs no mapping: it names its objects")
+    name = printable(data_set.name)
+    lines = [f"# how features of {name} become objects: a start, by their names", *_head_lines(data_set)]
+    if suggestions or not data_set.names_bodies:
+        lines += _feature_lines(suggestions)
+    used = {suggestion.feature for suggestion in suggestions}
+    used |= {place for suggestion in suggestions for place in suggestion.orientation}
+    for feature in features:
+        about = f"# not used: {feature.name}: {places_text(feature)}"
+        if feature.name in twins:
+            about = f"# {feature.name}: the same as the body {twins[feature.name]}"
+        lines += [f"  {printable(about, 400)}"] if feature.name not in used else []
+    return "\n".join(lines) + "\n"
+
+
+def places_text(feature: Feature) -> str:
+    """Return the names of a feature's places, or how many numbers it has."""
+    return " ".join(feature.places) or f"{counted(feature.width, 'number')} without names"
+
+
+def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) -> list[Suggestion]:
+    """Return the objects that names of features and of their places point to.
+
+    Args:
+        columns: numbers (T, W) of some frames by feature.
+    """
+    suggestions: dict[str, Suggestion] = {}
+    for feature in features:
+        values = columns.get(feature.name)
+        if feature.places:
+            objects = _objects_by_places(feature, values)
+        elif re.split(r"[./]", feature.name)[-1] == "qpos":
+            objects = _free_joints(feature, values)
+        else:
+            objects = _whole_feature(feature, features, columns)
+        for suggestion in objects:
+            # an observation and a state may have the same object
+            suggestions.setdefault(suggestion.name, suggestion)
+    return list(suggestions.values())
+
+
+def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, Floats], list[Body]]:
+    """Return the numbers of some episodes by feature, and the bodies of the first one."""
+    names = [feature.name for feature in features]
+    # times do not matter here
+    reading = AS_STORED._replace(fps=data_set.fps or 1.0)
+    rows: dict[str, list[Floats]] = {name: [] for name in names}
+    bodies: list[Body] = []
+    for number, episode in enumerate(data_set.episodes[:_MOST_EPISODES]):
+        try:
+            columns = data_set.columns(episode.number, reading, names)
+        except UsageError:
+            # the mapping has to say something first, such as an order
+            break
+        bodies += columns.bodies if number == 0 else ()
+        for name, values in columns.features.items():
+            rows[name].append(values.reshape(len(values), -1))
+    return {name: np.concatenate(parts) for name, parts in rows.items() if parts}, bodies
+
+
+def _without_bodies(
+    suggestions: Sequence[Suggestion], columns: Mapping[str, Floats], bodies: Sequence[Body]
+) -> tuple[list[Suggestion], dict[str, str]]:
+    """Return the suggestions that are not bodies of the data set, and the bodies that the others are."""
+    twins: dict[str, str] = {}
+    for suggestion in suggestions:
+        for body in bodies:
+            positions = columns[suggestion.feature][: len(body.positions), :3]
+            if suggestion.position == ("[0:3]",) and np.allclose(positions, body.positions, atol=1e-5):
+                twins[suggestion.feature] = body.name
+    return [suggestion for suggestion in suggestions if suggestion.feature not in twins], twins
+
+
+# ------------------------------------------------------------------------------------- objects by their names
+
+
+def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
+    """Yield the objects whose coordinates have names, such as `puck_x`."""
+    points: dict[str, dict[str, str]] = {}
+    turns: dict[str, dict[str, str]] = {}
+    for place in feature.places:
+        if part := _PART.fullmatch(place):
+            turns.setdefault(part["stem"], {})[part["part"].lower()] = place
+        elif (axis := _AXIS.fullmatch(place)) and not _NO_POINT.search(axis["stem"]):
+            letter = axis["axis"].lower() if axis["axis"] else "xyz"[int(axis["number"])]
+            points.setdefault(axis["stem"], {})[letter] = place
+    points = {stem: axes for stem, axes in points.items() if {"x", "y"} <= axes.keys()}
+    used = {place for stem in points for place in (*points[stem].values(), *turns.get(stem, {}).values())}
+    signals = tuple(place for place in feature.places if place not in used)[:_MOST_SIGNALS]
+    for stem, axes in points.items():
+        position = tuple(axes[axis] for axis in "xyz" if axis in axes)
+        suggestion = Suggestion(feature.name, stem or _last_word(feature.name), position, signals=signals)
+        signals = ()
+        parts = turns.get(stem, {})
+        if set("wxyz") <= parts.keys():
+            places, order = tuple(parts[part] for part in "xyzw"), "xyzw"
+        elif set("0123") <= parts.keys():
+            places, order = tuple(parts[part] for part in "0123"), ""
+        else:
+            yield suggestion
+            continue
+        indices = [feature.places.index(place) for place in places]
+        yield _with_orientation(suggestion, places, None if values is None else values[:, indices], order)
+
+
+def _whole_feature(
+    feature: Feature, features: Sequence[Feature], columns: Mapping[str, Floats]
+) -> Iterator[Suggestion]:
+    """Yield the object of a feature that is called a position or a pose, such as `obj_pos`."""
+    parent, last = (["", *re.split(r"[./]", feature.name)])[-2:]
+    point, pose = _POINT.fullmatch(last), _POSE.fullmatch(last)
+    values = columns.get(feature.name)
+    if feature.width in (2, 3) and point is not None and not _NO_POINT.search(last):
+        name = last if point["what"].lower() == "goal" else point["stem"] or parent or last
+        suggestion = Suggestion(feature.name, name, (f"[0:{feature.width}]",))
+        partner = f"{feature.name[: len(feature.name) - len(point['what'])]}quat"
+        if any((sibling.name, sibling.width) == (partner, 4) for sibling in features):
+            suggestion = _with_orientation(suggestion, (partner,), columns.get(partner))
+        yield suggestion
+    elif feature.width == 7 and pose is not None:
+        name = pose["stem"] if pose["stem"] not in ("", "root") else parent or last
+        suggestion = Suggestion(feature.name, name, ("[0:3]",))
+        yield _with_orientation(suggestion, ("[3:7]",), None if values is None else values[:, 3:7])
+
+
+def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
+    """Yield the bodies that move freely in a state of MuJoCo: a place and a unit quaternion (w x y z)."""
+    if values is None or not len(values):
+        return
+    width = values.shape[1]
+    errors = [
+        float(np.abs(np.linalg.norm(values[:, start + 3 : start + 7], axis=1) - 1).max())
+        for start in range(width - 6)
+    ]
+    starts: list[int] = []
+    for start in np.argsort(errors, kind="stable").tolist():
+        if errors[start] < _EXACT and all(abs(start - begin) >= 7 for begin in starts):
+            starts.append(start)
+    for number, start in enumerate(sorted(starts)):
+        yield Suggestion(
+            feature.name,
+            f"body_{number}",
+            (f"[{start}:{start + 3}]",),
+            (f"[{start + 3}:{start + 7}]",),
+            "wxyz",
+            remark=f"its orientation has length 1 in all {len(values):,} frames looked at",
+        )
+
+
+def _with_orientation(
+    suggestion: Suggestion, places: tuple[str, ...], quaternions: Floats | None, order: str = ""
+) -> Suggestion:
+    """Return a suggestion with an orientation, or with a remark that says why it has none."""
+    text = places[0] if len(places) == 1 else f"[{', '.join(places)}]"
+    undecided = f"orientation: {text} needs `order: wxyz` or `order: xyzw`; the numbers do not show which"
+    if quaternions is None:
+        return suggestion._replace(remark=undecided)
+    quaternions = quaternions[np.isfinite(quaternions).all(axis=1)]
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if len(lengths) and np.abs(lengths - 1).max() > _LENGTH_ERROR:
+        return suggestion._replace(
+            remark=f"{text} has lengths from {lengths.min():.3g} to {lengths.max():.3g}, so it is no"
+            " orientation"
+        )
+    if order:
+        return suggestion._replace(orientation=places, order=order)
+    upright = None if _HANDS.search(suggestion.name) else quaternion_order([quaternions])
+    if upright is None:
+        return suggestion._replace(remark=undecided)
+    return suggestion._replace(
+        orientation=places, order=upright, remark="in this order it stands upright in some frames; check it"
+    )
+
+
+# ------------------------------------------------------------------------------------------ the text
+
+
+def _head_lines(data_set: DataSet) -> Iterator[str]:
+    if data_set.names_bodies:
+        yield "# its bodies are objects by themselves; shapes: {NAME: {disc: 0.02}} gives one a footprint"
+    if data_set.fps is None and not data_set.has_times:
+        yield "# frames a second: the data set does not say; put the number here"
+        yield "fps:"
+    yield "# without a shape an object is a point: add shape: {disc: 0.02}, with a radius in metres"
+
+
+def _feature_lines(suggestions: Sequence[Suggestion]) -> Iterator[str]:
+    yield "features:"
+    if not suggestions:
+        yield "  # no name looks like a position; name the places of an object, such as"
+        yield '  # observation.state: {name: cup, position: "[0:3]"}'
+    for feature in dict.fromkeys(suggestion.feature for suggestion in suggestions):
+        yield f"  {yaml_text(feature)}:"
+        for suggestion in suggestions:
+            if suggestion.feature == feature:
+                yield from _entry_lines(suggestion)
+
+
+def _entry_lines(suggestion: Suggestion) -> Iterator[str]:
+    fields = [f"name: {yaml_text(suggestion.name)}", f"position: {_places(suggestion.position)}"]
+    if suggestion.orientation:
+        fields += [f"orientation: {_places(suggestion.orientation)}", f"order: {suggestion.order}"]
+    if suggestion.signals:
+        names = ", ".join(
+            f"{yaml_text(_signal_name(place))}: {yaml_text(place)}" for place in suggestion.signals
+        )
+        fields.append(f"signals: {{{names}}}")
+    if suggestion.remark:
+        yield f"    # {printable(suggestion.name)}: {printable(suggestion.remark, 300)}"
+    yield f"    - {{{', '.join(fields)}}}"
+
+
+def _places(places: tuple[str, ...]) -> str:
+    texts = [yaml_text(place) for place in places]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
+
+
+def _signal_name(place: str) -> str:
+    return re.sub(r"\W+", "_", place, flags=re.ASCII).strip("_") or "signal"
+
+
+def _last_word(name: str) -> str:
+    return re.split(r"[./]", name)[-1]
