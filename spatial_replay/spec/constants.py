@@ -44,7 +44,7 @@ def value_of(
     if any(value is None for value in values):
         return None
     try:
-        result = _computed(written, [value for value in values if value is not None])
+        result = _compute(written, [value for value in values if value is not None])
     except _ImpossibleError as fault:
         report(written.span, str(fault), "durations are added to durations, and multiplied by numbers")
     except (OverflowError, ZeroDivisionError) as fault:
@@ -65,20 +65,20 @@ def names_in(written: Quantity) -> Iterator[Name]:
             yield from names_in(operand)
 
 
-def _computed(written: Arithmetic, values: list[Value]) -> Value:
+def _compute(written: Arithmetic, values: list[Value]) -> Value:
     """Return a result, exact in decimal digits and then rounded: 0.1 * 30 is 3, as written."""
     first, *rest = values
     if not rest:
         return Duration(-first.ns) if isinstance(first, Duration) else 0.0 - first
     durations = [isinstance(value, Duration) for value in values]
-    one, other = _exact(first), _exact(rest[0])
+    left, right = _exact(first), _exact(rest[0])
     match written.operator:
         case "+" | "-" if durations[0] == durations[1]:
-            return _rounded(one + other if written.operator == "+" else one - other, durations[0])
+            return _round(left + right if written.operator == "+" else left - right, durations[0])
         case "*" if not all(durations):
-            return _rounded(one * other, any(durations))
+            return _round(left * right, any(durations))
         case "/" if durations[0] or not durations[1]:
-            return _rounded(one / other, durations[0] and not durations[1])
+            return _round(left / right, durations[0] and not durations[1])
     kinds = " and ".join("a duration" if is_duration else "a number" for is_duration in durations)
     raise _ImpossibleError(f"{kinds} cannot be {_WORDS[written.operator]}")
 
@@ -87,7 +87,7 @@ def _exact(value: Value) -> Fraction:
     return Fraction(value.ns) if isinstance(value, Duration) else Fraction(repr(value))
 
 
-def _rounded(result: Fraction, is_duration: bool) -> Value:
+def _round(result: Fraction, is_duration: bool) -> Value:
     if not is_duration:
         return float(result)
     ns = round(result)
@@ -112,7 +112,7 @@ def _plain(value: Value) -> float:
 
 def range_fault(value: Value, ends: tuple[Value, Value]) -> tuple[str, str] | None:
     """Return what is wrong with the range of a constant, and a hint; None if it holds the value."""
-    kinds = {isinstance(each, Duration) for each in (value, *ends)}
+    kinds = {isinstance(number, Duration) for number in (value, *ends)}
     if len(kinds) > 1:
         return "a range from numbers to durations", "write both ends like the constant itself"
     low, high = ends
@@ -153,13 +153,13 @@ def replaced(
         if name not in statements:
             hint = nearest_hint(name, statements) or f"its constants are: {', '.join(statements) or 'none'}"
             raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
-        pieces.append((statements[name].value.span, _given(name, value, values[name])))
+        pieces.append((statements[name].value.span, _new_text(name, value, values[name])))
     for span, piece in sorted(pieces, key=lambda each: each[0].start, reverse=True):
         text = text[: span.start] + piece + text[span.end :]
     return text
 
 
-def _given(name: str, value: object, written: Value | None) -> str:
+def _new_text(name: str, value: object, written: Value | None) -> str:
     new = value_given(name, value)
     if written is not None and isinstance(new, Duration) != isinstance(written, Duration):
         was, example = (

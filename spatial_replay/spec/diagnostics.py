@@ -45,13 +45,13 @@ class Diagnostic:
     def __str__(self) -> str:
         first = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
         piece = self.source_line[first : first + _SHOWN]
-        shown = "".join(character if character.isprintable() else " " for character in piece)
+        printable_piece = "".join(character if character.isprintable() else " " for character in piece)
         offset = self.column - 1 - first
         caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
         place = f"{escaped(self.filename)}:{self.line}:{self.column}"
         head = f"{place}: {self.severity}: {escaped(self.message)}"
         tail = f"\n  {escaped(self.hint)}" if self.hint else ""
-        return f"{head}\n  {shown}\n  {caret}{tail}"
+        return f"{head}\n  {printable_piece}\n  {caret}{tail}"
 
 
 _SHOWN = 200
@@ -70,7 +70,7 @@ class SourceText:
     @classmethod
     def of(cls, text: str, filename: str) -> SourceText:
         """Index the lines of a text."""
-        return cls(text, filename, (0, *(found.end() for found in _LINE_END.finditer(text))))
+        return cls(text, filename, (0, *(line_end.end() for line_end in _LINE_END.finditer(text))))
 
     def line_of(self, offset: int) -> int:
         """Return the line, counted from 1, that an offset lies in."""
@@ -115,7 +115,7 @@ class Faults:
         if self.is_full:
             self.unreported += 1
             return
-        self.found[span] = self.source.diagnostic("error", span, _cropped(message), _cropped(hint))
+        self.found[span] = self.source.diagnostic("error", span, _crop(message), _crop(hint))
 
     def nearest(self, name: str, known: Iterable[str]) -> str:
         """Return a hint with the known name most like one that is unknown, or ""."""
@@ -144,7 +144,7 @@ class Faults:
 _LONGEST_MESSAGE = 400
 
 
-def _cropped(message: str) -> str:
+def _crop(message: str) -> str:
     """Shorten the middle of a long message, such as one about a name of several pages."""
     if len(message) <= _LONGEST_MESSAGE:
         return message

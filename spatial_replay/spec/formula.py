@@ -42,9 +42,9 @@ class NamedNumber(float):
     is_plain: bool
 
     def __new__(cls, value: float, constants: tuple[str, ...] = (), *, is_plain: bool = False) -> Self:
-        made = super().__new__(cls, value)
-        made.constants, made.is_plain = constants, is_plain
-        return made
+        number = super().__new__(cls, value)
+        number.constants, number.is_plain = constants, is_plain
+        return number
 
 
 # ---------------------------------------------------------------------------------------------- terms
@@ -526,11 +526,11 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
         case "with":
             return Boolean("and", operands)
         case "xor":
-            one, other = Boolean("and", (first, _not(last))), Boolean("and", (_not(first), last))
-            return Boolean("or", (one, other))
+            first_alone, last_alone = Boolean("and", (first, _not(last))), Boolean("and", (_not(first), last))
+            return Boolean("or", (first_alone, last_alone))
         case "<->":
-            one, other = Boolean("or", (_not(first), last)), Boolean("or", (_not(last), first))
-            return Boolean("and", (one, other))
+            forward, backward = Boolean("or", (_not(first), last)), Boolean("or", (_not(last), first))
+            return Boolean("and", (forward, backward))
         case "WX":
             return _not(Temporal("X", (_not(first),)))
         # over a window that begins later, F takes less than half of the time of U
@@ -570,12 +570,14 @@ def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formu
 
     They are the same tuple where no rate stands in them without such an operator in between.
     """
-    conditions = [rate_conditions(each) for each in operands] if operator in _LEFT_OUT_AS else []
+    conditions = [rate_conditions(operand) for operand in operands] if operator in _LEFT_OUT_AS else []
     if not any(conditions):
         return operands
     return tuple(
-        Boolean(how, (_all(own), each), name=each.name) if own else each
-        for how, own, each in zip(_LEFT_OUT_AS[operator], conditions, operands, strict=True)
+        Boolean(how, (_all(operand_conditions), operand), name=operand.name)
+        if operand_conditions
+        else operand
+        for how, operand_conditions, operand in zip(_LEFT_OUT_AS[operator], conditions, operands, strict=True)
     )
 
 
@@ -596,11 +598,15 @@ def rate_conditions(formula: Formula) -> list[Formula]:
         case Atom():
             return [_has_value(rate) for rate in dict.fromkeys(_rates_of(formula.expression))]
         case Boolean() if formula.operator not in ("given", "with"):
-            return list(dict.fromkeys(each for part in formula.operands for each in rate_conditions(part)))
+            return list(
+                dict.fromkeys(condition for part in formula.operands for condition in rate_conditions(part))
+            )
         case Temporal(operator="X" | "WX"):
-            return [Temporal("WX", (each,)) for each in rate_conditions(formula.operands[0])]
+            return [Temporal("WX", (condition,)) for condition in rate_conditions(formula.operands[0])]
         case Temporal(operator="Y"):
-            return [_not(Temporal("Y", (_not(each),))) for each in rate_conditions(formula.operands[0])]
+            return [
+                _not(Temporal("Y", (_not(condition),))) for condition in rate_conditions(formula.operands[0])
+            ]
     return []
 
 

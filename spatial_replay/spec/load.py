@@ -123,13 +123,13 @@ def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...
     Raises:
         UsageError: for a function that cannot be written as a relation.
     """
-    taken = tuple(inspect.signature(relation).parameters.values())
+    parameters = tuple(inspect.signature(relation).parameters.values())
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     terms = 3 if name in THREE_TERM_RELATIONS else 2
-    if len(taken) < terms or any(parameter.kind not in kinds for parameter in taken):
+    if len(parameters) < terms or any(parameter.kind not in kinds for parameter in parameters):
         hint = "give a function of two terms and, after them, numbers, all positional"
         raise UsageError(f"relations: {name!r} cannot be written between two objects; {hint}")
-    return taken[terms:]
+    return parameters[terms:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,23 +188,28 @@ class AtomBuilder:
 
     def _parameters(self, written: RelationSyntax, scope: Scope) -> tuple[float | str, ...] | None:
         expected = parameters_of(written.relation, self.relations[written.relation])
-        given = written.parameters
-        missing = expected[len(given) :]
-        if len(given) > len(expected) or any(each.default is each.empty for each in missing):
+        quantities = written.parameters
+        missing = expected[len(quantities) :]
+        if len(quantities) > len(expected) or any(
+            parameter.default is parameter.empty for parameter in missing
+        ):
             self._report_parameters(written, expected, scope)
             return None
         values = [
             self._axis(quantity, scope) if parameter.name == "axis" else self.resolver.number(quantity, scope)
-            for parameter, quantity in zip(expected, given, strict=False)
+            for parameter, quantity in zip(expected, quantities, strict=False)
         ]
-        values += [each.default if each.name == "axis" else float(each.default) for each in missing]
+        values += [
+            parameter.default if parameter.name == "axis" else float(parameter.default)
+            for parameter in missing
+        ]
         return tuple(values)
 
     def _report_parameters(
         self, written: RelationSyntax, expected: tuple[inspect.Parameter, ...], scope: Scope
     ) -> None:
         name = written.relation
-        bracket = ", ".join("x" if each.name == "axis" else each.name for each in expected)
+        bracket = ", ".join("x" if parameter.name == "axis" else parameter.name for parameter in expected)
         if not expected:
             self.resolver.fault(written.operator, scope, f"{name!r} takes no parameter", f"write a {name} b")
             return
@@ -286,7 +291,7 @@ class QuantifierBuilder:
         self.elaborate(written.body, replace(scope.deeper(), values=values))
 
     def _named_quantifier(self, written: QuantifierSyntax, group: Group, scope: Scope, span: Span) -> Formula:
-        if any(isinstance(each, Variable) for each in group.excluded):
+        if any(isinstance(member, Variable) for member in group.excluded):
             message = "which members are left out is known only once the variable has a value"
             hint = "quantify over a class or all, or define the group without that member"
             self.resolver.fault(written.group.span, scope, message, hint)
@@ -309,14 +314,16 @@ class QuantifierBuilder:
     ) -> Formula:
         variables: list[str] = []
         for name in written.variables:
-            taken = scope.bound.union(variables)
-            variables.append(self._fresh(name.text, taken) if name.text in taken else name.text)
+            bound_names = scope.bound.union(variables)
+            variables.append(self._fresh(name.text, bound_names) if name.text in bound_names else name.text)
         bound: dict[str, Value] = {
             name.text: Variable(variable) for name, variable in zip(written.variables, variables, strict=True)
         }
         inner = replace(scope.deeper(), values={**scope.values, **bound}, bound=scope.bound.union(variables))
         body = self.elaborate(written.body, inner)
-        temporal = next((each for each in iter_formulas(body) if isinstance(each, Temporal)), None)
+        temporal = next(
+            (subformula for subformula in iter_formulas(body) if isinstance(subformula, Temporal)), None
+        )
         if temporal is not None:
             message = f"{temporal.operator!r} inside {written.quantifier} over an open group"
             hint = "its members change from sample to sample; use a template: spec name(object) = ..."
@@ -425,11 +432,11 @@ class Elaborator:
         for definition in self.names.definitions.values():
             if isinstance(definition, DefStatement):
                 self._check_macro(definition)
-        done = [known.spec for known in self.known.values()]
-        total = sum(known.size for name, known in self.known.items() if name not in self.referred)
+        specs = [elaborated.spec for elaborated in self.known.values()]
+        total = sum(elaborated.size for name, elaborated in self.known.items() if name not in self.referred)
         if total > MAX_SIZE:
             self._too_large(statements[-1].name.span)
-        return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in done)
+        return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in specs)
 
     def _spec(self, statement: SpecStatement, order: int) -> None:
         name = statement.name.text
@@ -554,15 +561,15 @@ class Elaborator:
             self.resolver.fault(name.span, scope, message, f"write a relation, such as {name.text} ovlp b")
             return Truth(True)
         defined = self.names.definitions.get(name.text)
-        known = self.known.get(name.text)
-        if known is not None and known.order < scope.order and known.spec.parameter is None:
+        elaborated = self.known.get(name.text)
+        if elaborated is not None and elaborated.order < scope.order and elaborated.spec.parameter is None:
             self.names.used.add(name.text)
             self.referred.add(name.text)
-            self.shared += known.size
-            self._reach(scope.depth + known.depth, name.span)
-            return known.spec.formula
+            self.shared += elaborated.size
+            self._reach(scope.depth + elaborated.depth, name.span)
+            return elaborated.spec.formula
         if not isinstance(defined, BrokenStatement):
-            self._report_reference(name, known, scope)
+            self._report_reference(name, elaborated, scope)
         return Truth(True)
 
     def _report_reference(self, name: Name, known: _Known | None, scope: Scope) -> None:
@@ -586,16 +593,16 @@ class Elaborator:
                 hint = f"truth values are written {name.text.lower()}"
             elif name.text.lower() in SAMPLES:
                 hint = f"it is written {SAMPLES[name.text.lower()]}"
-            written = name.text if name.text.isidentifier() else quoted(name.text)
+            word = name.text if name.text.isidentifier() else quoted(name.text)
             hint = hint or (
-                f"a signal needs a comparison, such as {written} >= 1.0 or, for a flag, {written} == 1; "
-                f"an object needs a relation, such as {written} ovlp other"
+                f"a signal needs a comparison, such as {word} >= 1.0 or, for a flag, {word} == 1; "
+                f"an object needs a relation, such as {word} ovlp other"
             )
             self.resolver.fault(name.span, scope, f"no spec is named {name.text!r}", hint)
 
     def _formula_names(self) -> Iterator[str]:
         kinds = (SpecStatement, DefStatement)
-        return (name for name, each in self.names.definitions.items() if isinstance(each, kinds))
+        return (name for name, statement in self.names.definitions.items() if isinstance(statement, kinds))
 
     def _call(self, written: Call, scope: Scope) -> Formula:
         name = written.name.text
@@ -613,8 +620,8 @@ class Elaborator:
             self.faults.add(written.span, message, "a macro is written out where it is used, so it must end")
             return Truth(True)
         if len(written.arguments) != len(macro.parameters):
-            wanted = ", ".join(parameter.text for parameter in macro.parameters)
-            count = f"{len(macro.parameters)} arguments ({wanted}), not {len(written.arguments)}"
+            parameter_names = ", ".join(parameter.text for parameter in macro.parameters)
+            count = f"{len(macro.parameters)} arguments ({parameter_names}), not {len(written.arguments)}"
             self.resolver.fault(written.span, scope, f"{name!r} takes {count}")
             return Truth(True)
         values = {
@@ -632,9 +639,14 @@ class Elaborator:
             hint = "a template is evaluated for each object by itself; share formulas by def"
             self.resolver.fault(written.name.span, scope, f"{name!r} is a template, not a macro", hint)
             return
-        macros = (each for each, what in self.names.definitions.items() if isinstance(what, DefStatement))
-        given = written.arguments
-        inner = f"({self.faults.source.text[given[0].span.start : given[-1].span.end] if given else 'p'})"
+        macros = (
+            macro_name
+            for macro_name, what in self.names.definitions.items()
+            if isinstance(what, DefStatement)
+        )
+        arguments = written.arguments
+        text = self.faults.source.text
+        inner = f"({text[arguments[0].span.start : arguments[-1].span.end] if arguments else 'p'})"
         hint = self.faults.nearest(name, macros) or function_hint(name, inner) or "define it with def"
         self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
 
@@ -689,13 +701,15 @@ def parse_specification(
     """
     _require_text(text)
     plugins = plugins_of(text)
-    given = {name: each for plugin in plugins.values() for name, each in plugin.relations.items()}
-    given |= relations or {}
-    _check_relations(given)
+    custom_relations = {
+        name: relation for plugin in plugins.values() for name, relation in plugin.relations.items()
+    }
+    custom_relations |= relations or {}
+    _check_relations(custom_relations)
     if profile is not None and profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
     text = text.removeprefix("\ufeff")
-    names = RELATION_NAMES.union(given)
+    names = RELATION_NAMES.union(custom_relations)
     if constants:
         text = _constant_writer(text, filename, names)(constants)
     faults = Faults(SourceText.of(text, filename))
@@ -712,10 +726,12 @@ def parse_specification(
     statements = parse_statements(tokens, names, faults)
     used_profile = _profile(statements, plugins, faults) or profile or DEFAULT_PROFILE
     words = frozenset(token.value for token in tokens)
-    namespace = Namespace(faults, {name: each.place for each in plugins.values() for name in each.signals})
+    namespace = Namespace(
+        faults, {name: plugin.place for plugin in plugins.values() for name in plugin.signals}
+    )
     namespace.declare(statements)
-    listed = namespace.constant_ranges()
-    elaborator = Elaborator(namespace, {**PROFILES[used_profile], **given}, words, faults)
+    constants_with_ranges = namespace.constant_ranges()
+    elaborator = Elaborator(namespace, {**PROFILES[used_profile], **custom_relations}, words, faults)
     specs = [statement for statement in statements if isinstance(statement, SpecStatement)]
     if not specs and not any(isinstance(statement, BrokenStatement) for statement in statements):
         end = Span(len(text), len(text))
@@ -725,31 +741,31 @@ def parse_specification(
                 hint += "; # begins a comment, and a plug-in counts objects"
             faults.add(end, "this text holds no spec", hint)
     try:
-        done = elaborator.specs(specs)
+        elaborated_specs = elaborator.specs(specs)
     except TooLargeError:
-        done = ()
+        elaborated_specs = ()
     faults.raise_if_any()
     warnings: list[Diagnostic] = [
         *reach_warnings(tokens, faults.source, used_profile == "spatial_spec"),
         *spelling_warnings(tokens, faults.source),
-        *past_warnings(done, faults.source),
-        *equality_warnings(done, faults.source),
+        *past_warnings(elaborated_specs, faults.source),
+        *equality_warnings(elaborated_specs, faults.source),
         *unused_warnings(namespace, faults.source),
-        *scale_warnings(statements, done, faults.source),
+        *scale_warnings(statements, elaborated_specs, faults.source),
     ]
     warnings.sort(key=lambda warning: (warning.line, warning.column))
     return Specification(
-        done,
+        elaborated_specs,
         used_profile,
         namespace.regions,
         namespace.groups,
-        frozenset(given),
+        frozenset(custom_relations),
         {
-            name: each.sha256
-            for name, each in plugins.items()
-            if name in used_modules(text) or not words.isdisjoint({*each.relations, *each.signals})
+            name: plugin.sha256
+            for name, plugin in plugins.items()
+            if name in used_modules(text) or not words.isdisjoint({*plugin.relations, *plugin.signals})
         },
-        listed,
+        constants_with_ranges,
         scales=tuple(namespace.scales),
         source=text,
         filename=encodable(filename),
@@ -823,10 +839,10 @@ def listed_specifications(value: object) -> list[Specification]:
         UsageError: anything else, such as the path of a file.
     """
     is_several = isinstance(value, Iterable) and not isinstance(value, (str, bytes))
-    listed: list[Any] = list(value) if is_several else [value]  # type: ignore[call-overload]
-    for each in listed:
-        require_specification(each)
-    return listed
+    specifications: list[Any] = list(value) if is_several else [value]  # type: ignore[call-overload]
+    for specification in specifications:
+        require_specification(specification)
+    return specifications
 
 
 def _require_text(value: object) -> None:
@@ -870,7 +886,11 @@ def _constant_writer(
     namespace = Namespace(faults)
     namespace.declare(parse_statements(_tokens(text, names, faults), names, faults))
     faults.raise_if_any()
-    lines = {name: each for name, each in namespace.definitions.items() if isinstance(each, ConstStatement)}
+    lines = {
+        name: statement
+        for name, statement in namespace.definitions.items()
+        if isinstance(statement, ConstStatement)
+    }
     return partial(replaced, text, lines, namespace.constants)
 
 
@@ -887,7 +907,7 @@ def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:
 
 def _profile(statements: Sequence[Statement], plugins: Mapping[str, Plugin], faults: Faults) -> str | None:
     uses = [statement for statement in statements if isinstance(statement, UseStatement)]
-    uses = [each for each in uses if each.name.text not in plugins]
+    uses = [use for use in uses if use.name.text not in plugins]
     for statement in uses[1:]:
         faults.add(statement.name.span, "a second use line", "a text has one relation profile")
     if not uses:
@@ -951,14 +971,14 @@ def load_specifications(
         SpecificationError: a specification with errors.
         UsageError: a constant that no file has, or a value of another kind.
     """
-    files = [_parsed(source, {}) for source in sources]
+    files = [_parse(source, {}) for source in sources]
     if not constants:
         return files
     _check_names(files, constants)
-    own = [_own_constants(file, constants) for file in files]
+    values_by_file = [_own_constants(file, constants) for file in files]
     return [
-        _with_titles(_parsed(source, values), file, values) if values else file
-        for source, file, values in zip(sources, files, own, strict=True)
+        _with_titles(_parse(source, values), file, values) if values else file
+        for source, file, values in zip(sources, files, values_by_file, strict=True)
     ]
 
 
@@ -995,7 +1015,7 @@ def _with_titles(
         )
         words = quoted(f"{title_text(spec)} ({', '.join(overrides)})")
         text = f"{text[: title.start]}{words}{text[title.end :]}"
-    return _parsed(SpecificationText(text, changed.filename), {})
+    return _parse(SpecificationText(text, changed.filename), {})
 
 
 def _constant_text(constant: Constant) -> str:
@@ -1006,11 +1026,11 @@ def _constant_text(constant: Constant) -> str:
 
 def is_formula(source: Path) -> bool:
     """Return whether a formula was written where a file is expected."""
-    written = str(source)
-    return bool(_FORMULA.search(written)) and not written.endswith(".spatial") and not source.exists()
+    text = str(source)
+    return bool(_FORMULA.search(text)) and not text.endswith(".spatial") and not source.exists()
 
 
-def _parsed(source: Path | SpecificationText, constants: Mapping[str, float | str]) -> Specification:
+def _parse(source: Path | SpecificationText, constants: Mapping[str, float | str]) -> Specification:
     if isinstance(source, SpecificationText):
         return parse_specification(source.text, filename=source.filename, constants=constants)
     if is_formula(source):
@@ -1018,25 +1038,28 @@ def _parsed(source: Path | SpecificationText, constants: Mapping[str, float | st
     return load_specification(source, constants=constants)
 
 
-def _qualified(file: Specification, constant: str) -> str:
+def _qualify(file: Specification, constant: str) -> str:
     return f"{PurePath(file.filename).stem}.{constant}"
 
 
 def _own_constants(file: Specification, constants: Mapping[str, float | str]) -> dict[str, float | str]:
     """Return the values that are for constants of this file, by their names in it."""
     return {
-        own: constants[given]
-        for own in file.constants
-        for given in (own, _qualified(file, own))
-        if given in constants
+        constant_name: constants[given_name]
+        for constant_name in file.constants
+        for given_name in (constant_name, _qualify(file, constant_name))
+        if given_name in constants
     }
 
 
 def _check_names(files: Sequence[Specification], constants: Mapping[str, float | str]) -> None:
     """Check that some file has each of the constants."""
-    own = dict.fromkeys(name for file in files for name in file.constants)
-    known = {*own, *(_qualified(file, name) for file in files for name in file.constants)}
+    constant_names = dict.fromkeys(name for file in files for name in file.constants)
+    accepted_names = {*constant_names, *(_qualify(file, name) for file in files for name in file.constants)}
     for name in constants:
-        if name not in known:
-            hint = nearest_hint(name, known) or f"the constants are: {', '.join(own) or 'none'}"
+        if name not in accepted_names:
+            hint = (
+                nearest_hint(name, accepted_names)
+                or f"the constants are: {', '.join(constant_names) or 'none'}"
+            )
             raise UsageError(f"there is no constant {name!r}; {hint}")

@@ -596,7 +596,7 @@ _COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
 )
 
 
-def _expected(accepted: set[str]) -> str:
+def _expectation(accepted: set[str]) -> str:
     rest = set(accepted)
     parts: list[str] = []
     for marks, words in _EXPECTATIONS:
@@ -646,9 +646,9 @@ def _report(
     if token.type == "$END":
         rest = faults.source.text[span.start :].partition("\n")[0].lstrip()
         hint = _COUNTED_HINT if rest.startswith("#") else ""
-        faults.add(span, f"the statement ends too early: expected {_expected(accepted)}", hint)
+        faults.add(span, f"the statement ends too early: expected {_expectation(accepted)}", hint)
         return
-    message = f"expected {_expected(accepted)}, found {token.value!r}"
+    message = f"expected {_expectation(accepted)}, found {token.value!r}"
     kinds = [token.type for token in tokens[: position + 1]]
     if kinds.count("RPAR") > kinds.count("LPAR"):
         faults.add(span, f"{token.value!r} closes nothing", "leave it out, or open it in front with '('")

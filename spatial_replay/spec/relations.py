@@ -275,7 +275,7 @@ class Plugin(NamedTuple):
 
 def used_modules(text: str) -> dict[str, tuple[int, int]]:
     """Return the names in the `use` lines of a text that are no relation profiles, with their places."""
-    return {found[1]: found.span(1) for found in _USED.finditer(text) if found[1] not in PROFILES}
+    return {use[1]: use.span(1) for use in _USED.finditer(text) if use[1] not in PROFILES}
 
 
 def plugins_of(text: str) -> dict[str, Plugin]:
@@ -287,18 +287,18 @@ def plugins_of(text: str) -> dict[str, Plugin]:
     Raises:
         UsageError: a plug-in that cannot be loaded.
     """
-    given = [each for each in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if each]
+    plugin_places = [place for place in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if place]
     used = set(used_modules(text))
-    allowed = {Path(each).stem if each.endswith(".py") else each: each for each in given}
+    allowed = {Path(place).stem if place.endswith(".py") else place: place for place in plugin_places}
     if used - set(allowed):
-        allowed |= {each: each for each in _listed_plugins() if each in used}
-    return {name: load_plugin(_place(each)) for name, each in allowed.items()}
+        allowed |= {name: name for name in _listed_plugins() if name in used}
+    return {name: load_plugin(_place(place)) for name, place in allowed.items()}
 
 
 def _listed_plugins() -> list[str]:
     path = Path("pyproject.toml")
     try:
-        listed = (
+        plugins = (
             tomllib.loads(path.read_text("utf-8"))
             .get("tool", {})
             .get("spatial-replay", {})
@@ -308,9 +308,9 @@ def _listed_plugins() -> list[str]:
         return []
     except (ValueError, AttributeError) as error:
         raise UsageError(f"{path}: [tool.spatial-replay] plugins cannot be read: {error}") from error
-    if not isinstance(listed, list) or not all(isinstance(each, str) for each in listed):
-        raise UsageError(f'{path}: plugins is {listed!r}; give a list of modules, such as ["mymodule"]')
-    return listed
+    if not isinstance(plugins, list) or not all(isinstance(plugin, str) for plugin in plugins):
+        raise UsageError(f'{path}: plugins is {plugins!r}; give a list of modules, such as ["mymodule"]')
+    return plugins
 
 
 def _place(module: str) -> str:
@@ -332,10 +332,10 @@ def load_plugin(place: str) -> Plugin:
     try:
         if place.endswith(".py"):
             name = Path(place).stem
-            made = spec_from_file_location(name, place)
-            assert made is not None and made.loader is not None
-            module = module_from_spec(made)
-            made.loader.exec_module(module)
+            module_spec = spec_from_file_location(name, place)
+            assert module_spec is not None and module_spec.loader is not None
+            module = module_from_spec(module_spec)
+            module_spec.loader.exec_module(module)
         else:
             name, module = place, import_module(place)
         content = Path(module.__file__ or "").read_bytes()

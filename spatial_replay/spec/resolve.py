@@ -243,7 +243,7 @@ class Namespace:
         if signal is not None and defined is not None:
             hint = f"scale takes a signal of the log, or {LENGTHS}"
             self.faults.add(name.span, f"{name.text!r} is {kind_of(defined)}", hint)
-        elif any(each.signal == signal for each in self.scales):
+        elif any(scale.signal == signal for scale in self.scales):
             self.faults.add(name.span, f"{name.text!r} is scaled twice", "leave one out")
         elif self.faults.count == before and divisor <= 0.0:
             message = f"a scale of {format_number(divisor)}"
@@ -261,7 +261,14 @@ class Namespace:
             if current in self.constants or not isinstance(statement, ConstStatement):
                 pending.pop()
                 continue
-            needed = next((each for each in names_in(statement.value) if self._is_pending(each)), None)
+            needed = next(
+                (
+                    operand_name
+                    for operand_name in names_in(statement.value)
+                    if self._is_pending(operand_name)
+                ),
+                None,
+            )
             if needed is None:
                 self.constants[current] = value_of(statement.value, self.named, self.faults.add)
             elif needed.text in pending:
@@ -277,7 +284,7 @@ class Namespace:
 
     def constant_ranges(self) -> dict[str, Constant]:
         """Return the constants that have a value, each checked against its range."""
-        found: dict[str, Constant] = {}
+        ranges: dict[str, Constant] = {}
         for name, statement in self.definitions.items():
             value = self.constants.get(name)
             if value is None or not isinstance(statement, ConstStatement):
@@ -285,15 +292,15 @@ class Namespace:
             ends = None
             if statement.range is not None:
                 low, high = (
-                    value_of(each, self.named, self.faults.add)
-                    for each in (statement.range.lower, statement.range.upper)
+                    value_of(end, self.named, self.faults.add)
+                    for end in (statement.range.lower, statement.range.upper)
                 )
                 ends = None if low is None or high is None else (low, high)
             fault = None if ends is None else range_fault(value, ends)
             if fault is not None:
                 self.faults.add(statement.value.span, f"const {name!r}: {fault[0]}", fault[1])
-            found[name] = constant_of(statement.value, value, ends)
-        return found
+            ranges[name] = constant_of(statement.value, value, ends)
+        return ranges
 
     def _report_not_a_number(self, name: Name, statement: Statement | None) -> None:
         """Report that a name, and the statement that defines it if one does, is not a number."""
@@ -305,7 +312,11 @@ class Namespace:
             hint = f"an object gets another name by a group: group NAME = {quoted(name.text)}"
             self.faults.add(name.span, "a text, where a number or a duration is expected", hint)
         elif statement is None:
-            consts = (each for each, what in self.definitions.items() if isinstance(what, ConstStatement))
+            consts = (
+                constant_name
+                for constant_name, what in self.definitions.items()
+                if isinstance(what, ConstStatement)
+            )
             hint = self.faults.nearest(name.text, consts) or (
                 f"define it: const {name.text} = 1.0; a text stands in quotes, mode == {quoted(name.text)}; "
                 "a signal is not compared with a signal"
@@ -353,15 +364,15 @@ class Namespace:
         try:
             match shape.kind:
                 case "polygon":
-                    found = polygon(corners, effort)
+                    outline = polygon(corners, effort)
                 case "box":
-                    found = box(*corners[0], *corners[1])
+                    outline = box(*corners[0], *corners[1])
                 case _:
-                    found = circle(corners[0], radius)
+                    outline = circle(corners[0], radius)
         except OutlineError as fault:
             self.faults.add(shape.span, fault.message, fault.hint)
             return Outline(((0.0, 0.0),))
-        return Outline(found.vertices, found.radius, height)
+        return Outline(outline.vertices, outline.radius, height)
 
     def _height(self, statement: RegionStatement) -> tuple[float, float] | None:
         if statement.height is None or statement.height_span is None:
@@ -454,7 +465,7 @@ class Resolver:
         self.size += 1
         match written:
             case Name():
-                return self._named(written, scope)
+                return self._term_of_name(written, scope)
             case OpenGroup():
                 return Group("", class_name=class_of(written))
             case Exclusion():
@@ -462,11 +473,11 @@ class Resolver:
             case Delayed():
                 return self._delay(self.term(written.term, scope), written, scope)
             case Enlargement():
-                return self._enlarged(written, scope)
+                return self._enlarge(written, scope)
             case CentreSyntax():
                 return Centre(standing(self.term(written.term, scope)))
 
-    def _named(self, name: Name, scope: Scope) -> Term:
+    def _term_of_name(self, name: Name, scope: Scope) -> Term:
         value = scope.values.get(name.text)
         if isinstance(value, (float, Duration)):
             self.fault(name.span, scope, f"{name.text!r} is a number; an object is expected here")
@@ -483,17 +494,19 @@ class Resolver:
             case GroupStatement():
                 self.names.used.add(name.text)
                 return self.names.groups[name.text]
-            case other:
-                message = f"{name.text!r} is {kind_of(other)}; an object, region or group is expected here"
+            case definition:
+                message = (
+                    f"{name.text!r} is {kind_of(definition)}; an object, region or group is expected here"
+                )
                 hint = "if an object is meant, rename the definition"
-                if isinstance(other, SpecStatement):
+                if isinstance(definition, SpecStatement):
                     hint = f"if an object is meant, rename the specification; {title_hint(name.text)}"
                 self.fault(name.span, scope, message, hint)
                 return TrackedName(name.text)
 
     def _exclusion(self, written: Exclusion, scope: Scope) -> Term:
         group = self.term(written.group, scope)
-        excluded = [self._named(name, scope) for name in written.excluded]
+        excluded = [self._term_of_name(name, scope) for name in written.excluded]
         if not isinstance(group, Group):
             if not self.is_unknown(written.group, scope):
                 self.fault(written.group.span, scope, "only a group can leave something out with except")
@@ -530,7 +543,7 @@ class Resolver:
         samples = self._samples(amount, written.amount, scope)
         return Earlier(term, samples=samples) if samples else term
 
-    def _enlarged(self, written: Enlargement, scope: Scope) -> Term:
+    def _enlarge(self, written: Enlargement, scope: Scope) -> Term:
         term = self.term(written.term, scope)
         radius = self.number(written.radius, scope)
         if radius < 0.0:
@@ -589,51 +602,53 @@ class Resolver:
 
     def bound(self, operator: TemporalSyntax, scope: Scope) -> Bound | None:
         """Return the window of a temporal operator; None for none, and after a fault."""
-        written = operator.bound
-        if written is None:
+        window = operator.bound
+        if window is None:
             return None
-        lower = self._end(written.lower, scope)
-        upper = self._end(written.upper, scope)
+        lower = self._end(window.lower, scope)
+        upper = self._end(window.upper, scope)
         if lower is None:
-            self.fault(written.lower.span, scope, "a window cannot begin at inf", "write [0, inf]")
+            self.fault(window.lower.span, scope, "a window cannot begin at inf", "write [0, inf]")
             return None
-        known: set[str] = set()
+        units: set[str] = set()
         for end in (lower, upper):
             if isinstance(end, Duration):
-                known.add("ns")
+                units.add("ns")
             elif end:
-                known.add("samples")
-        if len(known) == 2:
+                units.add("samples")
+        if len(units) == 2:
             hint = "write both ends in samples, or both with s or ms"
-            self.fault(written.span, scope, "a window from samples to time, or from time to samples", hint)
+            self.fault(window.span, scope, "a window from samples to time, or from time to samples", hint)
             return None
-        unit: Literal["samples", "ns"] = "ns" if "ns" in known else "samples"
-        if known == {"samples"} and self._lacks_unit(operator, written, scope):
+        unit: Literal["samples", "ns"] = "ns" if "ns" in units else "samples"
+        if units == {"samples"} and self._lacks_unit(operator, window, scope):
             return None
-        first = self._whole(lower, written.lower, scope)
-        last = None if upper is None else self._whole(upper, written.upper, scope)
+        first = self._whole(lower, window.lower, scope)
+        last = None if upper is None else self._whole(upper, window.upper, scope)
         if last is not None and last < first:
-            text = self.faults.source.text[written.span.start : written.span.end]
+            text = self.faults.source.text[window.span.start : window.span.end]
             hint = "the smaller end comes first"
-            self.fault(written.span, scope, f"the window {text} is empty: its ends are reversed", hint)
+            self.fault(window.span, scope, f"the window {text} is empty: its ends are reversed", hint)
             return None
         return Bound(first, last, unit)
 
     def _lacks_unit(self, operator: TemporalSyntax, written: BoundSyntax, scope: Scope) -> bool:
         """Refuse a window in samples that is decimal, or written as in tools whose windows are seconds."""
         text, ends = self.faults.source.text, (written.lower, written.upper)
-        word, window = (text[each.start : each.end] for each in (operator.keyword, written.span))
-        values = [self._end(each, scope) for each in ends]
-        numbers = [each for each in values if isinstance(each, float)]
-        is_whole = all(each.is_integer() for each in numbers)
-        is_decimal = not is_whole or any("." in text[each.span.start : each.span.end] for each in ends)
+        word, window = (text[span.start : span.end] for span in (operator.keyword, written.span))
+        values = [self._end(end, scope) for end in ends]
+        numbers = [value for value in values if isinstance(value, float)]
+        is_whole = all(number.is_integer() for number in numbers)
+        is_decimal = not is_whole or any("." in text[end.span.start : end.span.end] for end in ends)
         is_ours = word == operator.operator and ":" not in window
         if (is_ours and not is_decimal) or numbers[0] < 0.0 or numbers != sorted(numbers):
             return False
 
         def remedy(unit: str) -> str:
-            shown = [format_number(each) + unit if isinstance(each, float) else "inf" for each in values]
-            return f"{operator.operator}[{', '.join(shown)}] for {'seconds' if unit else 'samples'}"
+            end_texts = [
+                format_number(value) + unit if isinstance(value, float) else "inf" for value in values
+            ]
+            return f"{operator.operator}[{', '.join(end_texts)}] for {'seconds' if unit else 'samples'}"
 
         kind = "needs its unit in this spelling" if not is_ours else "of decimal numbers needs its unit"
         remedies = [remedy(unit) for unit in (["", "s"] if is_whole else ["s"])]

@@ -478,13 +478,13 @@ def meant_statement(tokens: Sequence[Token]) -> str:
     if not value:
         return ""
     is_number = all(token.type in ("NUMBER", "NAME", *_ARITHMETIC) for token in value)
-    definition = f"{line[0].value} = {_as_written(value)}"
+    definition = f"{line[0].value} = {_source_text(value)}"
     if is_number:
         return f"a number is defined by const {definition}; equality is written =="
     return f"a formula is named by spec {definition}"
 
 
-def _as_written(tokens: Sequence[Token]) -> str:
+def _source_text(tokens: Sequence[Token]) -> str:
     """Return tokens as a text, with blanks where there were some."""
     gaps = ["" if first.end_pos == second.start_pos else " " for first, second in pairwise(tokens)]
     return "".join(token.value + gap for token, gap in zip(tokens, [*gaps, ""], strict=True))
@@ -537,7 +537,7 @@ def _argument(tokens: Sequence[Token], start: int) -> str:
     while end < len(tokens) and depth:
         depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end].type, 0)
         end += 1
-    return f"({_as_written(tokens[start : end - (depth == 0)])})"
+    return f"({_source_text(tokens[start : end - (depth == 0)])})"
 
 
 def function_hint(name: str, argument: str, arguments: Sequence[str] = ()) -> str:
@@ -650,8 +650,8 @@ def written_name(name: str, relations: Iterable[str]) -> str:
 
 def title_hint(name: str) -> str:
     """Return how a specification that needs another name keeps its own as a title."""
-    other = re.sub(r"\W", "_", name) + "_holds"
-    return f"a title keeps its name: spec {other} {quoted(name)} = ..."
+    identifier = re.sub(r"\W", "_", name) + "_holds"
+    return f"a title keeps its name: spec {identifier} {quoted(name)} = ..."
 
 
 def quoted(name: str) -> str:
@@ -694,7 +694,7 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             token_type = _SIGNS[value]
         elif kind == "quoted":
             token_type = "TITLE" if _is_title_expected(tokens) else "NAME"
-            value = _unquoted(value, span, faults)
+            value = _unquote(value, span, faults)
         elif kind == "foreign":
             sign = value[:2] if value.startswith(("//", "/*", "-- ", "--\t")) else value
             faults.add(span, f"'{sign}' is not part of the language", meant_sign(sign))
@@ -740,7 +740,7 @@ def _is_title_expected(before: list[Token]) -> bool:
     return before[-1].type == "RPAR"
 
 
-def _unquoted(literal: str, span: Span, faults: Faults) -> str:
+def _unquote(literal: str, span: Span, faults: Faults) -> str:
     name = literal[1:-1]
     if not name:
         faults.add(span, "a name is empty", "write at least one character between the quotes")
