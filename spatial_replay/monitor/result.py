@@ -13,6 +13,8 @@ import numpy as np
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed, data_frame
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene, look_back
 from spatial_replay.monitor.doubtful import doubts_of_instances
 from spatial_replay.monitor.ends import Needs, trim_trace
 from spatial_replay.monitor.invariants import (
@@ -23,6 +25,7 @@ from spatial_replay.monitor.invariants import (
     invariant_sentences,
 )
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
+from spatial_replay.monitor.online.codes import distinct_channels
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.sentences import (
     Cause,
@@ -807,21 +810,36 @@ def evaluate(
     stream = EvaluationStream(
         find_instances(specification, each or {}, [trace], *window), specification.regions, semantics
     )
-    instances = [own.instance for own in stream.streams]
+    blocks = stream.extend(trace)
+    evaluation = _evaluation_of(specification, semantics, trace, first_ns, stream.streams, blocks)
+    return replace(evaluation, each=dict(each or {}), left_out=counted_from(left_out, first_ns))
+
+
+def _evaluation_of(
+    specification: Specification,
+    semantics: Semantics,
+    trace: Trace,
+    first_ns: int,
+    streams: Sequence[InstanceStream],
+    blocks: Sequence[SeriesBlock],
+) -> Evaluation:
+    """Return the results of streams that have seen all samples of a trace.
+
+    Args:
+        first_ns: the time that sentences count from.
+        blocks: the numbers of each stream.
+    """
     doubts = distinct_doubts(trace.doubts, first_ns)
+    instances = [stream.instance for stream in streams]
+    doubts_by_result = doubts_of_instances(instances, doubts, lambda: [trace])
     results = tuple(
         SpecResult.from_stream(
-            own,
-            Evidence(own.instance, specification.regions, lambda: [trace], trace.units, first_ns),
+            stream,
+            Evidence(stream.instance, specification.regions, lambda: [trace], trace.units, first_ns),
             block,
-            doubts=of_result,
+            doubts=doubts_of_result,
         )
-        for own, block, of_result in zip(
-            stream.streams,
-            stream.extend(trace),
-            doubts_of_instances(instances, doubts, lambda: [trace]),
-            strict=True,
-        )
+        for stream, block, doubts_of_result in zip(streams, blocks, doubts_by_result, strict=True)
     )
     return Evaluation(
         results,
@@ -830,10 +848,82 @@ def evaluate(
         trace.names,
         tuple(trace.signals),
         _classes(trace),
-        dict(each or {}),
-        counted_from(left_out, first_ns),
-        doubts,
+        {},
+        doubts=doubts,
     )
+
+
+_MOST_TOGETHER: Final = 2**14
+"""Samples that `evaluate_many` measures together: they bound its memory."""
+
+
+def evaluate_many(
+    specification: Specification, traces: Iterable[Trace], *, semantics: Semantics = "ltlf"
+) -> Iterator[Evaluation]:
+    """Evaluate a specification on each of many traces; each evaluation equals that of `evaluate`.
+
+    Short traces are measured together. Specifications with templates, and those whose terms look back, are
+    evaluated trace by trace.
+
+    Raises:
+        UsageError: see `evaluate`; a trace without samples.
+    """
+    require_specification(specification)
+    is_apart = any(spec.parameter is not None for spec in specification.results) or bool(
+        look_back([spec.formula for spec in specification.results])
+    )
+    group: list[Trace] = []
+    for trace in traces:
+        _require_trace(trace)
+        if is_apart or not len(trace) or len(trace) >= _MOST_TOGETHER:
+            yield from _evaluate_group(specification, group, semantics)
+            group = []
+            yield evaluate(specification, trace, semantics=semantics)
+            continue
+        samples = sum(map(len, group)) + len(trace)
+        if group and (samples > _MOST_TOGETHER or trace.units != group[0].units):
+            yield from _evaluate_group(specification, group, semantics)
+            group = []
+        group.append(trace)
+    yield from _evaluate_group(specification, group, semantics)
+
+
+def _evaluate_group(
+    specification: Specification, traces: Sequence[Trace], semantics: Semantics
+) -> Iterator[Evaluation]:
+    """Evaluate traces with the same units, of which no sample needs another one to be measured."""
+    if not traces:
+        return
+    checked_semantics(semantics, [specification])
+    needs = Needs.of([specification], {})
+    trimmed = [trim_trace(trace, needs, start=True, end=True) for trace in traces]
+    specification = with_numbers(specification, traces[0].units)
+    instances = find_instances(specification, {}, (), 0, FOREVER)
+    scene = TraceScene(_one_after_another([trace for trace, _ in trimmed]), specification.regions)
+    columns = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
+    begin = 0
+    for whole, (trace, left_out) in zip(traces, trimmed, strict=True):
+        end, first_ns = begin + len(trace), int(whole.times_ns[0])
+        streams = [InstanceStream(instance, semantics) for instance in instances]
+        blocks = [
+            stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
+            for stream, leaves in zip(streams, columns, strict=True)
+        ]
+        evaluation = _evaluation_of(specification, semantics, trace, first_ns, streams, blocks)
+        yield replace(evaluation, left_out=counted_from(left_out, first_ns))
+        begin = end
+
+
+def _one_after_another(traces: Sequence[Trace]) -> Trace:
+    """Join traces whatever their times are: each sample gets its number as its time."""
+    shifted, begin = [], 0
+    for trace in traces:
+        times_ns = np.arange(begin, begin + len(trace), dtype=np.int64)
+        shifted.append(
+            replace(trace, times_ns=times_ns, reported_ns=None, signals_reported_ns={}, spans=(), doubts=())
+        )
+        begin += len(trace)
+    return Trace.concatenate(shifted)
 
 
 def _require_trace(value: object) -> None:

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import MappingProxyType
 
+import numpy as np
+
 from spatial_replay.geometry.arrays import Floats, joined
 
 SAMPLES, NANOSECONDS = 0, 1
@@ -102,6 +104,13 @@ _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3
 def in_channels(numbers: Floats, channels: int) -> Floats:
     """Expand numbers (C, …) to the given number of channels, at least C: 1, 2 or 4."""
     return numbers if len(numbers) == channels else numbers[list(_STANDS_FOR[len(numbers)][:channels])]
+
+
+def distinct_channels(numbers: Floats) -> Floats:
+    """Return numbers (C, …) in as few channels as hold them: one where the ends are equal, two if sure."""
+    if len(numbers) == CHANNELS and np.array_equal(numbers[:2], numbers[2:]):
+        numbers = numbers[:2]
+    return numbers[:1] if len(numbers) == 2 and np.array_equal(numbers[0], numbers[1]) else numbers
 
 
 def joined_channels(parts: Sequence[Floats], axis: int) -> Floats:
