@@ -375,9 +375,12 @@ class SpecResult(Displayed):
 
         Where the leaves were not stored, the log is read again.
         """
+        leaves, times_ns = self._stored
         lower, upper = self.final[0].tolist()
         infinite = End.LOW if lower == np.inf else End.HIGH if upper == -np.inf else None
-        return find_vacuous(self.evidence, *self._stored, infinite=infinite)
+        # no path leads through atoms that the paper's semantics leaves out
+        infinite = None if np.isnan(leaves).any() else infinite
+        return find_vacuous(self.evidence, leaves, times_ns, infinite=infinite)
 
     @property
     def tested(self) -> Tested:

@@ -120,6 +120,11 @@ def test_terms_that_look_back_before_the_log_are_left_out():
     assert same(value("G a dist a[-1] <= 2", trace, start_ns=SECOND), [-1, -1, -3])
 
 
+def test_a_result_of_samples_that_are_left_out_says_what_it_was_tested_by():
+    (result,) = judged("spec s = (a dist a[-1] <= 1) and true", points(a=[0]), semantics="paper")
+    assert (result.robustness, result.tested) == (inf, "full")
+
+
 def test_quantifiers_are_left_out_as_a_whole():
     trace = points(a=[0, 3, 4], b=[1, 1, 1])
     assert same(value("G forall x in all: x dist x[-1] <= 2 and x dist b <= 9", trace), [nan, -1, -1])
