@@ -492,9 +492,11 @@ def windows_of(
     count = len(times_ns)
     indices = np.arange(count, dtype=np.int64)
     is_ahead = formula.operator in FUTURE_OPERATORS
-    bound = formula.bound or Bound(0, None, "samples")
-    if formula.operator in ("X", "WX", "Y"):
-        bound = Bound(1, 1, "samples")
+    bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX", "Y") else formula.bound
+    if bound is None:
+        own = indices if samples is None else samples
+        edge = np.full(len(own), count if is_ahead else 0, np.int64)
+        return (own, edge) if is_ahead else (edge, own + 1)
     # as distances from the first sample, and no further than the last: sums stay below 64 bits
     places = indices if bound.unit == "samples" else times_ns - times_ns[0]
     furthest = int(places[-1]) + 1

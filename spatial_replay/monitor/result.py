@@ -811,7 +811,10 @@ def evaluate(
     if strict_names:
         _require_names(specification, trace, each or {})
     stream = EvaluationStream(
-        find_instances(specification, each or {}, [trace], *window), specification.regions, semantics
+        find_instances(specification, each or {}, [trace], *window),
+        specification.regions,
+        semantics,
+        len(trace),
     )
     blocks = stream.extend(trace)
     evaluation = _evaluation_of(specification, semantics, trace, first_ns, stream.streams, blocks)
@@ -907,7 +910,7 @@ def _evaluate_group(
     begin = 0
     for whole, (trace, left_out) in zip(traces, trimmed, strict=True):
         end, first_ns = begin + len(trace), int(whole.times_ns[0])
-        streams = [InstanceStream(instance, semantics) for instance in instances]
+        streams = [InstanceStream(instance, semantics, len(trace)) for instance in instances]
         blocks = [
             stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
             for stream, leaves in zip(streams, columns, strict=True)

@@ -20,7 +20,7 @@ from spatial_replay.monitor.atoms.terms import TO_REPORTS, iter_delays
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.step import ROOM, OnlineRun
+from spatial_replay.monitor.online.step import ROOM, TILE, OnlineRun
 from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import (
@@ -728,11 +728,19 @@ class Evaluator(NamedTuple):
         """Whether numbers before the end of a log are about its continuations, too."""
         return self.semantics == "ltlf"
 
-    def begin(self, *, is_live: bool = False) -> Run:
-        """Start a run before the first sample; samples of a live one come one by one."""
+    def begin(self, *, is_live: bool = False, samples: int | None = None) -> Run:
+        """Start a run before the first sample; samples of a live one come one by one.
+
+        Args:
+            samples: how many there will be, if that is known: a short run has little room.
+        """
         if self.semantics == "paper":
             return PaperRun(self.formula, self.program.leaves)
-        return OnlineRun(self.program, room=ROOM, tile=1) if is_live else OnlineRun(self.program)
+        if is_live:
+            return OnlineRun(self.program, room=ROOM, tile=1)
+        if samples is not None and samples < TILE:
+            return OnlineRun(self.program, room=samples, tile=samples)
+        return OnlineRun(self.program)
 
     def leaves_within_log(
         self, leaves: Floats, positions: Integers, times_ns: Integers, first_ns: int

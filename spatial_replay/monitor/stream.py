@@ -216,15 +216,19 @@ class InstanceStream:
         robustness: (N,): each node's value on the samples so far.
     """
 
-    def __init__(self, instance: Instance, semantics: Semantics = "ltlf") -> None:
-        """Start before the first sample."""
+    def __init__(self, instance: Instance, semantics: Semantics = "ltlf", samples: int | None = None) -> None:
+        """Start before the first sample.
+
+        Args:
+            samples: how many there will be, if that is known.
+        """
         self.instance = instance
         self.semantics: Semantics = semantics
         self.first_satisfied_ns: int | None = None
         self.robustness = np.full(len(instance.program.reports), np.nan)
         self.settled_ns = np.full((len(instance.program.reports), 2), NEVER, np.int64)
         self._evaluator = Evaluator(instance.formula, instance.program, semantics)
-        self._run = self._evaluator.begin()
+        self._run = self._evaluator.begin(samples=samples)
 
     def __len__(self) -> int:
         """Return the number of samples evaluated."""
@@ -290,10 +294,14 @@ class EvaluationStream:
     """The instances of a specification, and the recent samples that they may still look back at."""
 
     def __init__(
-        self, instances: Iterable[Instance], regions: Mapping[str, Outline], semantics: Semantics = "ltlf"
+        self,
+        instances: Iterable[Instance],
+        regions: Mapping[str, Outline],
+        semantics: Semantics = "ltlf",
+        samples: int | None = None,
     ) -> None:
-        """Start before the first sample."""
-        self.streams = tuple(InstanceStream(instance, semantics) for instance in instances)
+        """Start before the first sample; for `samples` see `InstanceStream`."""
+        self.streams = tuple(InstanceStream(instance, semantics, samples) for instance in instances)
         self._regions = regions
         self._reach = look_back([stream.instance.formula for stream in self.streams])
         self._before: Trace | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,6 +28,7 @@ from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
     Boolean,
+    Bound,
     Earlier,
     Equality,
     Formula,
@@ -142,12 +144,12 @@ def find_vacuous(
     """
     instance = evidence.instance
     nodes = nodes_of(instance.formula)
-    implications = _implications_of(instance.formula)
-    held = _Holding(instance, leaves, times_ns)
-    scopes = _scopes(instance.formula, times_ns, held)
-    active = _scopes(implications.formula, times_ns, held, is_conditional=True)
+    implications = _with_implications(instance.formula)
+    windows, held = _Windows(times_ns), _Holding(instance, leaves, times_ns)
+    scopes = _scopes(instance.formula, windows, held)
+    active = _scopes(implications.formula, windows, held, is_conditional=True)
     found = [
-        *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), times_ns, evidence),
+        *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), windows, evidence),
         *_idle_implications(implications, active, held, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
@@ -201,6 +203,12 @@ class _Implications(NamedTuple):
         for node, scope in zip(self.nodes, scopes, strict=True):
             joined[node] |= scope
         return joined
+
+
+@lru_cache(maxsize=256)
+def _with_implications(formula: Formula) -> _Implications:
+    """Return `_implications_of` a whole formula; many logs are evaluated with the same one."""
+    return _implications_of(formula)
 
 
 def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
@@ -304,8 +312,22 @@ class _Holding:
 # ---------------------------------------------------------------------------------------------- scopes
 
 
+class _Windows:
+    """The window of each operator at each sample, computed once (see `windows_of`)."""
+
+    def __init__(self, times_ns: Integers) -> None:
+        self.times_ns = times_ns
+        self._windows: dict[tuple[str, Bound | None], tuple[Integers, Integers]] = {}
+
+    def __call__(self, node: Temporal) -> tuple[Integers, Integers]:
+        key = node.operator, node.bound
+        if key not in self._windows:
+            self._windows[key] = windows_of(node, self.times_ns)
+        return self._windows[key]
+
+
 def _scopes(
-    formula: Formula, times_ns: Integers, held: _Holding, *, is_conditional: bool = False
+    formula: Formula, windows: _Windows, held: _Holding, *, is_conditional: bool = False
 ) -> list[_Samples]:
     """Return for each node the samples (T,) at which the number of the formula depends on it.
 
@@ -315,12 +337,12 @@ def _scopes(
         is_conditional: only those at which the verdict depends on a node, where antecedents may hold.
     """
     tree = nodes_with_operands(formula)
-    scopes = [np.arange(len(times_ns)) == 0 for _ in tree]
+    scopes = [np.arange(len(windows.times_ns)) == 0] * len(tree)
     for scope, (node, operands) in zip(scopes, tree, strict=True):
         for place, operand in enumerate(operands):
             within = scope
             if isinstance(node, Temporal):
-                within = _below(node, place, scope, times_ns)
+                within = _below(node, place, scope, windows)
                 read = judged(node).operands[place]
                 if operator_of(read) in ("given", "with"):
                     within = within & held(operands_of(read)[0])
@@ -330,9 +352,9 @@ def _scopes(
     return scopes
 
 
-def _below(formula: Temporal, place: int, scope: _Samples, times_ns: Integers) -> _Samples:
+def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) -> _Samples:
     """Return the samples at which an operand counts, if its operator does so in the samples of `scope`."""
-    begin, end = windows_of(formula, times_ns)
+    begin, end = windows(formula)
     here = np.flatnonzero(scope & (begin < end))
     begin, end = begin[here], end[here]
     if place < len(formula.operands) - 1:
@@ -357,7 +379,7 @@ def _empty_windows(
     nodes: Sequence[Formula],
     scopes: Sequence[_Samples],
     active: Sequence[_Samples],
-    times_ns: Integers,
+    windows: _Windows,
     evidence: Evidence,
 ) -> Iterator[_Idle]:
     """Find the operators whose windows are empty in all samples at which they count.
@@ -369,7 +391,7 @@ def _empty_windows(
     for identifier, (node, scope, own) in enumerate(zip(nodes, scopes, active, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
             continue
-        begin, end = windows_of(node, times_ns)
+        (begin, end), times_ns = windows(node), windows.times_ns
         counts = own if own.any() else scope
         if not (begin < end)[counts].any():
             where = " where it counts" if (begin < end)[scope].any() else ""
@@ -565,7 +587,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
         return formula
 
     both = joined_channels([unknown, known], axis=1)
-    formula = tested(_implications_of(instance.formula).formula)
+    formula = tested(_with_implications(instance.formula).formula)
     done = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
     return final_verdict(*done.interval(0)) is verdict
 
