@@ -74,7 +74,7 @@ def _machine(
 def merged(machine: Machine) -> Machine:
     """Return a machine that accepts the same runs, without equivalent states."""
     _, firsts, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
-    places, decisions = _relabelled(machine, classes)
+    places, decisions = _relabel(machine, classes)
     moves = places[machine.moves[firsts]]
     return Machine(moves, decisions, machine.accepting[firsts], int(places[machine.start]))
 
@@ -96,7 +96,7 @@ def least(machine: Machine) -> Machine:
         first = len(machine.moves)
         moves, accepting = np.append(machine.moves, machine.start), np.append(machine.accepting, False)
         machine = Machine(moves, machine.decisions, accepting, machine.start)
-    return _ordered(machine, [first, *(state for state in reachable if state != first)])
+    return _select_states(machine, [first, *(state for state in reachable if state != first)])
 
 
 def _reachable(machine: Machine) -> list[int]:
@@ -107,7 +107,7 @@ def _reachable(machine: Machine) -> list[int]:
     # a decision visited before leads to no new state
     visited = [False] * len(rows)
     stack = [machine.start]
-    done = 0
+    expanded = 0
     while stack:
         place = stack.pop()
         if place < 0:
@@ -118,13 +118,13 @@ def _reachable(machine: Machine) -> list[int]:
             visited[place] = True
             _, low, high = rows[place]
             stack += (high, low)
-        if not stack and done < len(waiting):
-            stack.append(moves[waiting[done]])
-            done += 1
+        if not stack and expanded < len(waiting):
+            stack.append(moves[waiting[expanded]])
+            expanded += 1
     return waiting
 
 
-def _ordered(machine: Machine, states: Sequence[int]) -> Machine:
+def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
     """Return only some states, in the order given, and decisions in theirs; no move leads to another."""
     numbers = {state: number for number, state in enumerate(states)}
     rows = machine.decisions.tolist()
@@ -147,7 +147,7 @@ def _ordered(machine: Machine, states: Sequence[int]) -> Machine:
     return _machine(moves, decisions, machine.accepting[np.array(states, np.int64)].tolist(), start)
 
 
-def _relabelled(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
+def _relabel(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
     """Give the states other numbers, and merge decisions that have become equal.
 
     Returns:
@@ -157,7 +157,7 @@ def _relabelled(machine: Machine, numbers: Integers) -> tuple[Integers, Integers
     decisions = machine.decisions
     places = np.concatenate([np.empty(len(decisions), np.int64), ~numbers[::-1]])
     span = len(places) + 1
-    found: list[Integers] = []
+    levels: list[Integers] = []
     count = 0
     for rows in _levels(decisions):
         variable = decisions[rows[0], 0]
@@ -169,9 +169,9 @@ def _relabelled(machine: Machine, numbers: Integers) -> tuple[Integers, Integers
         places[rows[differ]] = count + inverse.ravel()
         level = np.empty((len(kinds), 3), np.int64)
         level[:, 0], level[:, 1], level[:, 2] = variable, low[differ][firsts], high[differ][firsts]
-        found.append(level)
+        levels.append(level)
         count += len(kinds)
-    return places, np.concatenate(found) if found else np.empty((0, 3), np.int64)
+    return places, np.concatenate(levels) if levels else np.empty((0, 3), np.int64)
 
 
 def _levels(decisions: Integers) -> Iterator[Integers]:
@@ -197,24 +197,24 @@ def _split_classes(machine: Machine) -> list[int]:
     diagrams = Diagrams()
     pending: Collection[int] = range(len(classes))
     while pending:
-        known: dict[int, int] = {}
+        copies: dict[int, int] = {}
 
-        def copy(place: int, known: dict[int, int] = known) -> int:
+        def copy(place: int, copies: dict[int, int] = copies) -> int:
             if place < 0:
                 return diagrams.leaf(classes[~place])
-            if place not in known:
+            if place not in copies:
                 variable, low, high = rows[place]
-                known[place] = diagrams.decide(variable, copy(low), copy(high))
-            return known[place]
+                copies[place] = diagrams.decide(variable, copy(low), copy(high))
+            return copies[place]
 
         for state in pending:
-            own = parts[classes[state]]
+            parts_of_class = parts[classes[state]]
             if state in leading:
-                own[leading[state]].remove(state)
-                if not own[leading[state]]:
-                    del own[leading[state]]
+                parts_of_class[leading[state]].remove(state)
+                if not parts_of_class[leading[state]]:
+                    del parts_of_class[leading[state]]
             leading[state] = copy(moves[state])
-            own.setdefault(leading[state], set()).add(state)
+            parts_of_class.setdefault(leading[state], set()).add(state)
         moved = _split(parts, classes, dict.fromkeys(classes[state] for state in pending))
         pending = sources_of(above, moved)
     return classes
@@ -224,10 +224,10 @@ def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterab
     """Make all parts of some classes but the largest classes of their own; gives the states in these."""
     moved: list[int] = []
     for number in touched:
-        own = parts[number]
-        largest = max(own, key=lambda node: len(own[node]))
-        for node in [each for each in own if each != largest]:
-            members = own.pop(node)
+        parts_of_class = parts[number]
+        largest = max(parts_of_class, key=lambda node: len(parts_of_class[node]))
+        for node in [part for part in parts_of_class if part != largest]:
+            members = parts_of_class.pop(node)
             for state in members:
                 classes[state] = len(parts)
             parts.append({node: members})
@@ -259,12 +259,12 @@ def sources_of(
     seen = set() if visited is None else visited
     stack = [~target for target in targets]
     while stack:
-        for each in above.get(stack.pop(), ()):
-            if each < 0:
-                sources[~each] = None
-            elif each not in seen:
-                seen.add(each)
-                stack.append(each)
+        for parent_row in above.get(stack.pop(), ()):
+            if parent_row < 0:
+                sources[~parent_row] = None
+            elif parent_row not in seen:
+                seen.add(parent_row)
+                stack.append(parent_row)
     return sources
 
 
@@ -318,14 +318,18 @@ class Automaton(Displayed):
             NoAutomatonError: more than 100 000 transitions, or cubes of their guards; `iter_transitions`,
                 `successors` and `transition` have them one by one.
         """
-        found, cubes = [], 0
-        for each in self.iter_transitions():
-            found.append(each)
-            cubes += len(each.guard)
-            if each.is_cut or max(len(found), cubes) > MAX_LISTED:
-                what = "transitions" if len(found) > MAX_LISTED else "cubes in the guards of its transitions"
+        transitions, cubes = [], 0
+        for transition in self.iter_transitions():
+            transitions.append(transition)
+            cubes += len(transition.guard)
+            if transition.is_cut or max(len(transitions), cubes) > MAX_LISTED:
+                what = (
+                    "transitions"
+                    if len(transitions) > MAX_LISTED
+                    else "cubes in the guards of its transitions"
+                )
                 raise NoAutomatonError(f"{self.name} has more than {MAX_LISTED} {what}")
-        return tuple(found)
+        return tuple(transitions)
 
     @cached_property
     def is_listable(self) -> bool:
@@ -433,8 +437,8 @@ class Automaton(Displayed):
 
     def transition(self, source: int, target: int) -> Transition | None:
         """Return the move from one state to another, if one sample can lead there."""
-        known = source in self.states and target in self.successors[source]
-        return self._moves.transition(source, target) if known else None
+        is_move = source in self.states and target in self.successors[source]
+        return self._moves.transition(source, target) if is_move else None
 
     def paths(
         self, state: int, without: Collection[tuple[int, int]] = ()
@@ -457,16 +461,16 @@ class Automaton(Displayed):
         paths: list[tuple[Transition, ...]] = [()]
         while paths:
             path = paths.pop()
-            here = path[-1].target if path else state
-            if distances[here] == 0:
+            end = path[-1].target if path else state
+            if distances[end] == 0:
                 yield path
                 continue
             nearer = [
                 target
-                for target in self.successors[here]
-                if (here, target) not in left_out and distances.get(target) == distances[here] - 1
+                for target in self.successors[end]
+                if (end, target) not in left_out and distances.get(target) == distances[end] - 1
             ]
-            paths.extend((*path, self._moves.transition(here, target)) for target in reversed(nearer))
+            paths.extend((*path, self._moves.transition(end, target)) for target in reversed(nearer))
 
     def guard_words(self, transition: Transition, longest: int | None = None) -> str:
         """Return a transition's guard as a sentence of the specification language.
@@ -523,7 +527,10 @@ class Automaton(Displayed):
         visited: set[int] = set()
         for state in waiting:
             direct = sources_of(self._above, (state,), visited)
-            for source in (*(each for each in direct if each not in left_out), *before.get(state, ())):
+            for source in (
+                *(predecessor for predecessor in direct if predecessor not in left_out),
+                *before.get(state, ()),
+            ):
                 if source not in distances:
                     distances[source] = distances[state] + 1
                     waiting.append(source)

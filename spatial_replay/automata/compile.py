@@ -69,7 +69,7 @@ def mona_program(skeleton: Skeleton) -> str:
     """
     # a thread of its own has the whole depth of recursion left, however deep its caller is
     with ThreadPoolExecutor(max_workers=1) as thread:
-        return thread.submit(_translated, skeleton).result()
+        return thread.submit(_translate, skeleton).result()
 
 
 def _depth_and_size(skeleton: Skeleton) -> tuple[int, int]:
@@ -78,8 +78,8 @@ def _depth_and_size(skeleton: Skeleton) -> tuple[int, int]:
     sizes: list[int] = []
     for node in skeleton.nodes:
         operands = _operands(node)
-        depths.append(1 + max((depths[each] for each in operands), default=-1))
-        sizes.append(1 + sum(sizes[each] for each in operands))
+        depths.append(1 + max((depths[operand] for operand in operands), default=-1))
+        sizes.append(1 + sum(sizes[operand] for operand in operands))
     return depths[skeleton.root], sizes[skeleton.root]
 
 
@@ -95,7 +95,7 @@ def _operands(node: Node) -> tuple[int, ...]:
     return node.first, node.second
 
 
-def _translated(skeleton: Skeleton) -> str:
+def _translate(skeleton: Skeleton) -> str:
     from ltlf2dfa.base import MonaProgram
 
     formula = _parser()(_text(skeleton.nodes, skeleton.root))
@@ -178,7 +178,7 @@ def _output(executable: str, program: str) -> str:
         timer = Timer(_TIMEOUT_S, process.kill)
         timer.start()
         try:
-            printed = _exchanged(process, program.encode("ascii"))
+            printed = _exchange(process, program.encode("ascii"))
         finally:
             timer.cancel()
             process.kill()
@@ -192,7 +192,7 @@ def _output(executable: str, program: str) -> str:
     return printed.decode("ascii", "replace")
 
 
-def _exchanged(process: subprocess.Popen[bytes], program: bytes) -> bytes:
+def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
     """Send the program, which MONA reads to its end first, and read what it prints."""
     if process.stdin is None or process.stdout is None:
         return b""
@@ -222,11 +222,11 @@ def _machine(printed: str, propositions: int) -> Machine:
         raise NoAutomatonError(f"it printed no automaton: {printed.strip()[:200]!r}")
     order = [int(name.removeprefix("P")) for name in header[1].split()]
     states = int(count[1])
-    found = _MOVE.findall(printed)
-    if len(found) > _MAX_MOVES:
+    moves_printed = _MOVE.findall(printed)
+    if len(moves_printed) > _MAX_MOVES:
         raise NoAutomatonError(f"the automaton has {states} states and more than {_MAX_MOVES} moves")
     cubes: list[list[_Cube]] = [[] for _ in range(states)]
-    for state, symbol, target in found:
+    for state, symbol, target in moves_printed:
         letters = ["X"] * propositions
         for number, letter in zip(order, symbol, strict=True):
             letters[number] = letter
@@ -234,7 +234,7 @@ def _machine(printed: str, propositions: int) -> Machine:
     if not all(cubes):
         raise NoAutomatonError("it printed an automaton without moves from some state")
     diagrams = Diagrams()
-    moves = tuple(_node(diagrams, each, 0) for each in cubes)
+    moves = tuple(_node(diagrams, cubes_of_state, 0) for cubes_of_state in cubes)
     first = cubes[0][0].target
     accepts = {int(number) for number in accepting[1].split()}
     return machine_of(diagrams, moves, [state in accepts for state in range(states)], moves[first])
@@ -245,7 +245,7 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
-    low, high = ([cube for cube in cubes if cube.symbol[variable] != other] for other in ("1", "0"))
+    low, high = ([cube for cube in cubes if cube.symbol[variable] != letter] for letter in ("1", "0"))
     if not low or not high:
         raise NoAutomatonError(f"it printed moves that leave {symbol!r} open")
     when_false = _node(diagrams, low, variable + 1)
@@ -313,14 +313,14 @@ class Obligations:
             Pairs of a count and a function. The function applies where fewer members of the chain fail than
             the count, and at least as many as the count of the pair before.
         """
-        found: list[tuple[int, int]] = []
+        cases: list[tuple[int, int]] = []
         below = 0
         for count, rest in self._rests(chain, node, 0):
             below += count
-            if found and found[-1][1] == rest:
-                found.pop()
-            found.append((below, rest))
-        return found
+            if cases and cases[-1][1] == rest:
+                cases.pop()
+            cases.append((below, rest))
+        return cases
 
     def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
         """Yield the functions that are left, each with the number of counts in a row that it holds for."""
@@ -336,7 +336,7 @@ class Obligations:
         bits = len(members).bit_length()
         chain = Chain(members, strong, self._first + len(self._chains), bits)
         self._chains += [chain] * bits
-        self._places.update({(each, strong): (chain, index) for index, each in enumerate(members)})
+        self._places.update({(member, strong): (chain, index) for index, member in enumerate(members)})
 
 
 def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ...]]:
@@ -351,7 +351,7 @@ def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ..
             members.append(after)
         # until by a sooner deadline implies until by a later one; holding longer implies holding shorter
         ordered = tuple(members if strong else reversed(members))
-        chains.update({(each, strong): ordered for each in members})
+        chains.update({(member, strong): ordered for member in members})
     return chains
 
 
@@ -495,27 +495,27 @@ class _Composition:
     def machine(self, number: int) -> Machine:
         """Return the automaton of a subformula."""
         if number not in self._known:
-            self._known[number] = self._compiled(number)
+            self._known[number] = self._compile(number)
         return self._known[number]
 
-    def _compiled(self, number: int) -> Machine:
+    def _compile(self, number: int) -> Machine:
         try:
-            return self._progressed(number, _FEW_STATES, _FEW_DECISIONS)
+            return self._progress(number, _FEW_STATES, _FEW_DECISIONS)
         except NoAutomatonError:
             kind, operands = self._skeleton.split(number)
         if len(operands) > 1:
             try:
-                return self._joined(operands, kind == "and")
+                return self._join(operands, kind == "and")
             except NoAutomatonError:
                 pass
-        return self._progressed(number, MAX_STATES, MAX_DECISIONS)
+        return self._progress(number, MAX_STATES, MAX_DECISIONS)
 
-    def _progressed(self, number: int, states: int, decisions: int) -> Machine:
+    def _progress(self, number: int, states: int, decisions: int) -> Machine:
         return progressed(self._skeleton, self._propositions, number, states=states, decisions=decisions)
 
-    def _joined(self, operands: tuple[int, ...], both: bool) -> Machine:
-        machines = [merged(self.machine(each)) for each in operands]
-        waiting = [(each.size, number) for number, each in enumerate(machines)]
+    def _join(self, operands: tuple[int, ...], both: bool) -> Machine:
+        machines = [merged(self.machine(operand)) for operand in operands]
+        waiting = [(machine.size, number) for number, machine in enumerate(machines)]
         heapify(waiting)
         while len(waiting) > 1:
             first, second = (machines[heappop(waiting)[1]] for _ in range(2))
@@ -544,7 +544,7 @@ class _Joining:
         self._both = both
         self._left, self._right = first.decisions.tolist(), second.decisions.tolist()
         # a trap of one loses for both, and a state that always accepts wins for either
-        self._decided = _decided(first, not both), _decided(second, not both)
+        self._decided = _permanent_states(first, not both), _permanent_states(second, not both)
         self._rows: list[tuple[int, int, int]] = []
         self._known: dict[tuple[int, int], int] = {}
         self._states: dict[tuple[int, int], int] = {}
@@ -556,8 +556,8 @@ class _Joining:
         start = self._place(first.start, second.start)
         # the list grows while it is iterated: moves lead to new pairs
         moves = [
-            ~state if one < 0 else self._place(left[one], right[other])
-            for state, (one, other) in enumerate(self._pairs)
+            ~state if left_state < 0 else self._place(left[left_state], right[right_state])
+            for state, (left_state, right_state) in enumerate(self._pairs)
         ]
         join = np.logical_and if self._both else np.logical_or
         pairs = np.array(self._pairs, np.int64)
@@ -602,7 +602,7 @@ class _Joining:
         return ~number
 
 
-def _decided(machine: Machine, accepts: bool) -> frozenset[int]:
+def _permanent_states(machine: Machine, accepts: bool) -> frozenset[int]:
     """Return the places of states that accept permanently, or never."""
     stays = machine.moves == ~np.arange(len(machine.moves))
     return frozenset((~np.flatnonzero(stays & (machine.accepting == accepts))).tolist())
@@ -619,7 +619,7 @@ def stored_text(automaton: Automaton, specification: Specification, spec: NamedS
         {
             "version": _VERSION,
             "specification": _canonical(specification, spec),
-            "propositions": [each.text for each in automaton.propositions],
+            "propositions": [proposition.text for proposition in automaton.propositions],
             "accepting": sorted(automaton.accepting),
             "entries": automaton.entries,
             "decisions": automaton.decisions,
@@ -640,7 +640,7 @@ def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -
     if not isinstance(stored, dict) or stored.get("version") != _VERSION:
         return None
     propositions = Propositions(spec.formula).all
-    expected = (_canonical(specification, spec), [each.text for each in propositions])
+    expected = (_canonical(specification, spec), [proposition.text for proposition in propositions])
     if (stored.get("specification"), stored.get("propositions")) != expected:
         return None
     entries, accepting = _numbers(stored.get("entries")), _numbers(stored.get("accepting"))
@@ -656,7 +656,11 @@ def _canonical(specification: Specification, spec: NamedSpec) -> str:
 
 
 def _numbers(value: object) -> list[int] | None:
-    if not isinstance(value, list) or len(value) > MAX_ROWS or any(type(each) is not int for each in value):
+    if (
+        not isinstance(value, list)
+        or len(value) > MAX_ROWS
+        or any(type(number) is not int for number in value)
+    ):
         return None
     return value
 
@@ -733,12 +737,12 @@ def automaton(
     skeleton = Skeleton(spec.formula, propositions, source, rate_hz)
     compilers = get_args(Compiler) if compiler is None else (compiler,)
     try:
-        return _compiled(spec, skeleton, propositions, compilers, _read(stored, specification, spec))
+        return _compile_spec(spec, skeleton, propositions, compilers, _read(stored, specification, spec))
     except NoAutomatonError as error:
         raise no_automaton(spec, source, str(error)) from error
 
 
-def _compiled(
+def _compile_spec(
     spec: NamedSpec,
     skeleton: Skeleton,
     propositions: Propositions,
@@ -754,18 +758,18 @@ def _compiled(
     if count > MAX_PROPOSITIONS:
         raise NoAutomatonError(f"it has {count} propositions, an automaton at most {MAX_PROPOSITIONS}")
     reasons = []
-    for each in compilers:
-        if each == "mona" and (before := next(stored, None)) is not None:
+    for compiler in compilers:
+        if compiler == "mona" and (before := next(stored, None)) is not None:
             return before
         try:
-            if each == "own":
-                machine = _composed(_Shape.of(skeleton, count))
+            if compiler == "own":
+                machine = _compose_least(_Shape.of(skeleton, count))
             else:
                 machine = least(compiled_by_mona(skeleton, count))
         except NoAutomatonError as error:
-            reasons.append(f"{_NAMES[each]}: {error}")
+            reasons.append(f"{_NAMES[compiler]}: {error}")
         else:
-            return _checked(automaton_of(machine, spec.name, propositions.all))
+            return _check_size(automaton_of(machine, spec.name, propositions.all))
     raise NoAutomatonError("; ".join(reasons))
 
 
@@ -787,7 +791,7 @@ class _Shape:
 
 # a formula with another threshold has the same machine
 @lru_cache(maxsize=16)
-def _composed(shape: _Shape) -> Machine:
+def _compose_least(shape: _Shape) -> Machine:
     """Return the least machine of a shape, by this package.
 
     Raises:
@@ -799,12 +803,12 @@ def _composed(shape: _Shape) -> Machine:
 def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:
     """Yield those of files that are of a spec, read when they are asked for."""
     for data in stored:
-        found = automaton_from(data, specification, spec)
-        if found is not None:
-            yield found
+        automaton = automaton_from(data, specification, spec)
+        if automaton is not None:
+            yield automaton
 
 
-def _checked(automaton: Automaton) -> Automaton:
+def _check_size(automaton: Automaton) -> Automaton:
     """Return an automaton that is small enough.
 
     Raises:
@@ -822,14 +826,14 @@ def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
     Raises:
         UsageError: no such spec, several to choose from.
     """
-    known = {spec.name: spec for spec in specification.specs}
+    specs_by_name = {spec.name: spec for spec in specification.specs}
     if name is None:
         if len(specification.results) != 1:
             names = ", ".join(spec.name for spec in specification.results)
             raise UsageError(f"{specification.filename} has several results; choose one with name=: {names}")
         return specification.results[0]
-    if name not in known:
-        hint = nearest_hint(name, known)
-        others = f"{f'{hint} ' if hint else ''}there are {', '.join(known)}"
+    if name not in specs_by_name:
+        hint = nearest_hint(name, specs_by_name)
+        others = f"{f'{hint} ' if hint else ''}there are {', '.join(specs_by_name)}"
         raise UsageError(f"no spec {name!r} in {specification.filename}; {others}")
-    return known[name]
+    return specs_by_name[name]

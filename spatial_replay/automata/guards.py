@@ -132,16 +132,16 @@ def copied(
         variables: nodes that decide on none of the first so many variables count as leaves.
         leaf: the number of the leaf in the target for such a node of the source.
     """
-    known: dict[int, int] = {}
+    copies: dict[int, int] = {}
 
     def copy(node: int) -> int:
-        if node not in known:
+        if node not in copies:
             variable, low, high = source[node]
             if variable < variables:
-                known[node] = target.decide(variable, copy(low), copy(high))
+                copies[node] = target.decide(variable, copy(low), copy(high))
             else:
-                known[node] = target.leaf(leaf(node))
-        return known[node]
+                copies[node] = target.leaf(leaf(node))
+        return copies[node]
 
     return copy
 
@@ -170,15 +170,15 @@ class Proposition:
             return self.name if value else f"not {self.name}"
         if isinstance(self.formula, Boolean) and self.formula.operator == "not":
             # the opposite of a negation is what it negates
-            return self.text if value else _bracketed(self.formula.operands[0])
-        return _bracketed(self.formula) if value else f"not ({self.text})"
+            return self.text if value else _bracket(self.formula.operands[0])
+        return _bracket(self.formula) if value else f"not ({self.text})"
 
 
-def _bracketed(formula: Formula) -> str:
-    text, written = format_formula(formula), formula
+def _bracket(formula: Formula) -> str:
+    text, innermost = format_formula(formula), formula
     if operator_of(formula) in ("given", "with"):
-        written = operands_of(formula)[-1]
-    return f"({text})" if isinstance(written, (Boolean, Quantified)) else text
+        innermost = operands_of(formula)[-1]
+    return f"({text})" if isinstance(innermost, (Boolean, Quantified)) else text
 
 
 class Propositions:
@@ -193,8 +193,8 @@ class Propositions:
         self._numbers: dict[int, int] = {}
         self._literals: dict[int, tuple[int, bool]] = {}
         self.all: list[Proposition] = []
-        for each in _maximal(formula):
-            self._add(each)
+        for proposition in _maximal(formula):
+            self._add(proposition)
 
     def literal(self, formula: Formula) -> tuple[int, bool] | None:
         """Return a maximal spatial subformula's proposition and whether it is that or its negation.
@@ -220,7 +220,7 @@ class Propositions:
     def _text(self, formula: Formula) -> str:
         """Return the text of a proposition, which says how it treats a rate without a value if it has to."""
         text = format_formula(formula)
-        if all(each.text != text for each in self.all):
+        if all(proposition.text != text for proposition in self.all):
             return text
         ends = {"given": " or there is no rate", "with": " and there is a rate"}
         return f"({text}){ends.get(operator_of(formula), '')}"
@@ -273,16 +273,16 @@ class Shapes:
             case Truth():
                 return YES if formula.value else NO
             case Atom():
-                expression, is_positive = _signed(formula)
+                expression, is_positive = _split_sign(formula)
                 variable = self._variable(expression)
                 return variable if is_positive else self._diagrams.complement(variable)
             case Boolean(operator="not"):
                 return self._diagrams.complement(self.of(formula.operands[0]))
             case Boolean():
                 join = self._diagrams.both if formula.operator == "and" else self._diagrams.either
-                nodes = [self.of(each) for each in formula.operands]
+                nodes = [self.of(operand) for operand in formula.operands]
                 # the last ones first: their variables are below those of the others
-                return reduce(lambda below, each: join(each, below), reversed(nodes))
+                return reduce(lambda below, operand: join(operand, below), reversed(nodes))
             case Quantified():
                 # "exists" is not "forall" of the negation
                 body, is_every = self.of(without_variables(formula)), formula.quantifier == "forall"
@@ -300,7 +300,7 @@ MAX_SHAPES = 200_000
 """How many nodes the diagrams have by which propositions are compared."""
 
 
-def _signed(atom: Atom) -> tuple[Expression, bool]:
+def _split_sign(atom: Atom) -> tuple[Expression, bool]:
     """Return an expression that says the same as a relation, or the opposite, and whether it is the same.
 
     Comparisons of signals are left as they are: signals are often equal to their limits, where both hold.
@@ -359,16 +359,16 @@ class Covers:
 
     def some(self, node: int) -> Guard:
         """Return some cubes of a function, `FEW_CUBES` at most, of which no two hold at once."""
-        found: list[Cube] = []
+        cubes: list[Cube] = []
         stack: list[tuple[int, Cube]] = [(node, ())]
-        while stack and len(found) < FEW_CUBES:
-            each, cube = stack.pop()
-            variable, low, high = self._diagrams[each]
-            if each == YES:
-                found.append(cube)
-            elif each != NO:
+        while stack and len(cubes) < FEW_CUBES:
+            current, cube = stack.pop()
+            variable, low, high = self._diagrams[current]
+            if current == YES:
+                cubes.append(cube)
+            elif current != NO:
                 stack += ((high, (*cube, (variable, True))), (low, (*cube, (variable, False))))
-        return tuple(found)
+        return tuple(cubes)
 
     def _between(self, lower: int, upper: int) -> _Cover:
         """Return cubes that hold where `lower` does and at most where `upper` does."""
@@ -511,10 +511,10 @@ class Moves:
             if variable == LEAF:
                 leaves.add(low)
                 continue
-            for each in (low, high):
-                if each not in visited:
-                    visited.add(each)
-                    stack.append(each)
+            for branch in (low, high):
+                if branch not in visited:
+                    visited.add(branch)
+                    stack.append(branch)
         return leaves
 
     def _to(self, target: int, node: int, known: dict[int, int]) -> int:
@@ -540,7 +540,7 @@ class Successors(Sequence[tuple[int, ...]]):
 
     def __getitem__(self, state: Any) -> Any:
         if isinstance(state, slice):
-            return tuple(self[each] for each in range(len(self))[state])
+            return tuple(self[place] for place in range(len(self))[state])
         if not -len(self) <= state < len(self):
             raise IndexError(f"no state {state}; there are 0 to {len(self) - 1}")
         return self._moves.successors(state % len(self))

@@ -42,12 +42,12 @@ def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
 
 def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
     """Return what bounds in seconds become: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without any."""
-    found: dict[str, None] = {}
+    sentences: dict[str, None] = {}
     for node in _temporal(formula):
         if node.bound is not None and _counts_seconds(node.bound):
             bound = in_samples(node.bound, rate_hz)
-            found[f"`{written(node)}` is `{operator_of(node)}{format_bound(bound)}`"] = None
-    return f"at {rate_hz:g} Hz, {', '.join(found)}" if found else ""
+            sentences[f"`{written(node)}` is `{operator_of(node)}{format_bound(bound)}`"] = None
+    return f"at {rate_hz:g} Hz, {', '.join(sentences)}" if sentences else ""
 
 
 def counts_seconds(formula: Formula) -> bool:
@@ -86,7 +86,7 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
     """Return the error for a spec that no compiler can compile, at its widest window or at all of it."""
     place = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(place):
-        place = _unnamed(spec.formula)
+        place = _without_names(spec.formula)
     message = f"`{written(place)}` leaves {spec.name} without an automaton: {reason}"
     hint = "for an automaton, write smaller bounds, or split it into several specs"
     return obstacle(source, place, message, hint)
@@ -124,7 +124,7 @@ def _width(node: Formula) -> int:
     return 0 if bound is None else bound.upper or bound.lower
 
 
-def _unnamed(formula: Formula) -> Formula:
+def _without_names(formula: Formula) -> Formula:
     """Return the formula that one that only names another spec stands for."""
     while isinstance(formula, Boolean) and formula.operator == "spec":
         (formula,) = formula.operands
@@ -209,20 +209,20 @@ class Skeleton:
                 over: Literal["and", "or"] = "and" if kind == "R" else "or"
                 parts = self._operands(over, second)
                 if len(parts) > 1:
-                    return over, tuple(self._node(kind, first, each) for each in parts)
+                    return over, tuple(self._node(kind, first, part) for part in parts)
         return "and", (number,)
 
     def _operands(self, kind: Kind, number: int) -> tuple[int, ...]:
         """Return the operands of a conjunction or disjunction, however it is bracketed."""
-        found: dict[int, None] = {}
+        operands: dict[int, None] = {}
         stack = [number]
         while stack:
-            each = self.nodes[stack.pop()]
-            if each.kind == kind:
-                stack += (each.second, each.first)
+            current = self.nodes[stack.pop()]
+            if current.kind == kind:
+                stack += (current.second, current.first)
             else:
-                found[self._numbers[each]] = None
-        return tuple(found)
+                operands[self._numbers[current]] = None
+        return tuple(operands)
 
     def _of(self, formula: Formula, positive: bool) -> int:
         """Return the number of a formula, or of its negation."""
@@ -236,11 +236,11 @@ class Skeleton:
         formula = expand(formula)
         key = (id(formula), positive)
         if key not in self._known:
-            self._known[key] = self._built(formula, positive)
+            self._known[key] = self._build(formula, positive)
         self._operator = outer
         return self._known[key]
 
-    def _built(self, formula: Formula, positive: bool) -> int:
+    def _build(self, formula: Formula, positive: bool) -> int:
         match formula:
             case Truth():
                 return TRUE if formula.value == positive else FALSE
@@ -248,9 +248,9 @@ class Skeleton:
                 return self._of(formula.operands[0], not positive)
             case Boolean():
                 join = self._both if (formula.operator == "and") == positive else self._either
-                return reduce(join, [self._of(each, positive) for each in formula.operands])
+                return reduce(join, [self._of(operand, positive) for operand in formula.operands])
             case Temporal():
-                operands = [self._of(each, positive) for each in formula.operands]
+                operands = [self._of(operand, positive) for operand in formula.operands]
                 return self._temporal(formula, operands, positive)
         raise ValueError(f"{formula!r} is not a proposition")
 

@@ -39,12 +39,16 @@ def words_text(automaton: Automaton) -> str:
     If not all transitions can be listed, it has the states nearest to the start.
     """
     lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
-    lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
+    lines += [
+        f"  {proposition.name} means {proposition.text}"
+        for proposition in automaton.propositions
+        if proposition.name is not None
+    ]
     for state, transitions in _by_source(automaton).items():
         lines.append(f"  state {state}: {state_words(automaton, state)}")
-        for each in transitions:
-            to = "stays" if each.target == state else f"to {each.target}"
-            lines.append(f"    {to} if {_guard_text(automaton, each)}")
+        for transition in transitions:
+            to = "stays" if transition.target == state else f"to {transition.target}"
+            lines.append(f"    {to} if {_guard_text(automaton, transition)}")
     if not automaton.is_listable:
         lines.append(f"  … {_left_out(automaton)}")
     return "\n".join(lines)
@@ -77,18 +81,22 @@ def state_colour(automaton: Automaton, state: int) -> str:
 
 def abbreviated(automaton: Automaton) -> Automaton:
     """Return the automaton with short names for long propositions, as fit on arrows."""
-    taken = {each.label for each in automaton.propositions}
-    names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
+    labels = {proposition.label for proposition in automaton.propositions}
+    names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
     short = (
-        each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
-        for each in automaton.propositions
+        proposition if len(proposition.label) <= _LONGEST_LABEL else replace(proposition, name=next(names))
+        for proposition in automaton.propositions
     )
     return automaton.renamed(tuple(short))
 
 
 def meanings(automaton: Automaton) -> list[str]:
     """Return the text of each named proposition: "p0: cup leftof plate"."""
-    return [f"{each.name}: {each.text}" for each in automaton.propositions if each.name is not None]
+    return [
+        f"{proposition.name}: {proposition.text}"
+        for proposition in automaton.propositions
+        if proposition.name is not None
+    ]
 
 
 def dot_text(automaton: Automaton) -> str:
@@ -104,7 +112,7 @@ def dot_text(automaton: Automaton) -> str:
 
 def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
     lines = [
-        f"digraph {_quoted(automaton.name)} {{",
+        f"digraph {_quote(automaton.name)} {{",
         "  rankdir=LR;",
         '  node [shape=circle, style=filled, fillcolor=white, fontname="Helvetica"];',
         '  edge [fontname="Helvetica", fontsize=10];',
@@ -112,16 +120,16 @@ def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
         f"  start -> {automaton.initial};",
     ]
     if legend:
-        text = "".join(f"{_escaped(line)}\\l" for each in legend for line in _legend_lines(each))
+        text = "".join(f"{_escape(line)}\\l" for meaning in legend for line in _legend_lines(meaning))
         lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{text}"];')
     moves = _by_source(automaton)
     for state in moves:
         shape = "doublecircle" if state in automaton.accepting else "circle"
-        colour, about = state_colour(automaton, state), _quoted(state_words(automaton, state))
+        colour, about = state_colour(automaton, state), _quote(state_words(automaton, state))
         lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
-    for each in (move for state in moves.values() for move in state):
-        label = "\\n".join(map(_escaped, _broken(_guard_text(automaton, each))))
-        lines.append(f'  {each.source} -> {each.target} [label="{label}"];')
+    for transition in (move for state in moves.values() for move in state):
+        label = "\\n".join(map(_escape, _broken(_guard_text(automaton, transition))))
+        lines.append(f'  {transition.source} -> {transition.target} [label="{label}"];')
     return "\n".join([*lines, "}", ""])
 
 
@@ -141,10 +149,10 @@ def hoa_text(automaton: Automaton) -> str:
             f"({size_words(automaton)}); text and .dot files show the states nearest to the start"
         )
     numbers = range(len(automaton.propositions))
-    names = [_quoted(each.label) for each in automaton.propositions]
+    names = [_quote(proposition.label) for proposition in automaton.propositions]
     lines = [
         "HOA: v1",
-        f"name: {_quoted(automaton.name)}",
+        f"name: {_quote(automaton.name)}",
         f"States: {len(automaton.states)}",
         f"Start: {automaton.initial}",
         " ".join(["AP:", str(len(numbers)), *names]),
@@ -156,7 +164,7 @@ def hoa_text(automaton: Automaton) -> str:
     ]
     for state, transitions in _by_source(automaton).items():
         lines.append(f"State: {state} {{0}}" if state in automaton.accepting else f"State: {state}")
-        lines += [f"  [{_hoa_guard(each)}] {each.target}" for each in transitions]
+        lines += [f"  [{_hoa_guard(transition)}] {transition.target}" for transition in transitions]
     return "\n".join([*lines, "--END--", ""])
 
 
@@ -188,7 +196,7 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
         )
     try:
         command = [executable, f"-T{form}"]
-        done = subprocess.run(
+        process = subprocess.run(
             command, input=text.encode(), capture_output=True, timeout=_DRAWING_S, check=False
         )
     except subprocess.TimeoutExpired:
@@ -196,17 +204,22 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
             f"Graphviz did not draw {len(automaton.states)} states and {len(automaton.transitions)} "
             f"transitions within {_DRAWING_S:g} s; write them as text to a file that ends in .dot"
         ) from None
-    if done.returncode != 0:
-        reason = done.stderr.decode(errors="replace").strip()[:200]
-        raise OutputError(f"Graphviz ended with code {done.returncode}: {reason}")
-    return done.stdout.decode()
+    if process.returncode != 0:
+        reason = process.stderr.decode(errors="replace").strip()[:200]
+        raise OutputError(f"Graphviz ended with code {process.returncode}: {reason}")
+    return process.stdout.decode()
 
 
 def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
     """Return for each state that is shown, the moves from it to others that are."""
-    shown = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
-    ends = [(state, target) for state in shown for target in automaton.successors[state] if target in shown]
-    moves: dict[int, list[Transition]] = {state: [] for state in shown}
+    shown_states = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
+    ends = [
+        (state, target)
+        for state in shown_states
+        for target in automaton.successors[state]
+        if target in shown_states
+    ]
+    moves: dict[int, list[Transition]] = {state: [] for state in shown_states}
     for source, target in ends if automaton.is_listable else ends[:MOST_MOVES]:
         move = automaton.transition(source, target)
         if move is not None:
@@ -245,13 +258,13 @@ def _legend_lines(text: str) -> list[str]:
     return wrap(text, _LEGEND_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     printable = "".join(character if character.isprintable() else " " for character in text)
     return printable.replace("\\", "\\\\").replace('"', '\\"')
 
 
-def _quoted(text: str) -> str:
-    return f'"{_escaped(text)}"'
+def _quote(text: str) -> str:
+    return f'"{_escape(text)}"'
 
 
 _SWEEPS: Final = 4
@@ -307,12 +320,14 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
     """
     first = {automaton.initial, *visited}
     others = [state for state in automaton.states if state not in first]
-    shown = sorted([*sorted(first), *others][:MOST_STATES])
-    places = _places(automaton, shown)
+    drawn_states = sorted([*sorted(first), *others][:MOST_STATES])
+    places = _places(automaton, drawn_states)
     distances = automaton.distances
-    ends = [(each, to) for each in shown for to in automaton.successors[each] if to in places]
+    ends = [(source, to) for source in drawn_states for to in automaton.successors[source] if to in places]
     ends.sort(key=lambda move: move[0] not in first)
-    moves = [move for each in ends[:MOST_MOVES] if (move := automaton.transition(*each)) is not None]
+    moves = [
+        move for move_ends in ends[:MOST_MOVES] if (move := automaton.transition(*move_ends)) is not None
+    ]
     return AutomatonDrawing(
         size_words(automaton),
         tuple(
@@ -325,27 +340,32 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
                 state not in automaton.can_reject,
                 distances.get(state),
             )
-            for state in shown
+            for state in drawn_states
         ),
         tuple(
             DrawnMove(move.source, move.target, automaton.guard_words(move, LONGEST_GUARD)) for move in moves
         ),
-        len(automaton.states) - len(shown),
+        len(automaton.states) - len(drawn_states),
     )
 
 
 def guard_of(automaton: Automaton, move: DrawnMove) -> str:
     """Return the guard of a move in words, as this automaton names its propositions; it has the move."""
-    found = automaton.transition(move.source, move.target)
-    return "" if found is None else automaton.guard_words(found, LONGEST_GUARD)
+    transition = automaton.transition(move.source, move.target)
+    return "" if transition is None else automaton.guard_words(transition, LONGEST_GUARD)
 
 
 def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
     """Return column and row of each state: columns follow the transitions, rows make few of them cross."""
-    kept = set(shown)
-    successors = {state: [each for each in automaton.successors[state] if each in kept] for state in shown}
+    state_set = set(shown)
+    successors = {
+        state: [successor for successor in automaton.successors[state] if successor in state_set]
+        for state in shown
+    }
     column = _columns(successors, automaton.initial)
-    layers = [[state for state in shown if column[state] == each] for each in range(max(column.values()) + 1)]
+    layers = [
+        [state for state in shown if column[state] == number] for number in range(max(column.values()) + 1)
+    ]
     row = {state: height for layer in layers for state, height in _heights(layer)}
     for _ in range(_SWEEPS):
         for layer in layers[1:]:
@@ -391,5 +411,7 @@ def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
 
 def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
     """Return the mean row of the states that lead to one, or its own."""
-    found = [row[each] for each, targets in successors.items() if each != state and state in targets]
-    return sum(found) / len(found) if found else row[state]
+    rows_before = [
+        row[source] for source, targets in successors.items() if source != state and state in targets
+    ]
+    return sum(rows_before) / len(rows_before) if rows_before else row[state]
