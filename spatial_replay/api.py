@@ -404,6 +404,8 @@ def judge(
     *,
     labels: PathName | None = None,
     result: str | None = None,
+    against: PathName | Sequence[PathName] | None = None,
+    same_start: float | None = None,
     output: PathName | None = None,
     jobs: int = 1,
     allow: Sequence[str] = (),
@@ -420,26 +422,39 @@ def judge(
         labels: a JSON or CSV file, or a field of the data set. Without it, labels are in labels.json or
             labels.csv next to the logs, or in the data set.
         result: the name of the spec that judges; by default the last one that no other spec uses.
+        against: earlier episodes to compare with.
+        same_start: how far the objects of a pair may be apart in the first sample; 0.001 unless given.
         output: the folder of results; without one, results are not stored.
 
     The other arguments and errors are those of `evaluate_logs`.
 
     Returns:
-        `rows`, one for each episode, `rate`, `label_rate` and `agreement`. `to_pandas()` returns the rows as
-        a data frame.
+        `rows`, one for each episode, `rate`, `label_rate`, `agreement`, `comparison`. `to_pandas()` returns
+        the rows as a data frame.
     """
     from spatial_replay.batch.run import run_batch, workers_of
     from spatial_replay.batch.suite import Conditions
     from spatial_replay.judging.judgement import prepare_judgement
+    from spatial_replay.judging.pairs import SAME_START, compare_judgements
 
     refuse_unknown(reading, Reading.__annotations__)
     allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
     conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
-    suite = _suite(logs, specifications, conditions).allowing(allowed)
-    prepared = prepare_judgement(suite, None if labels is None else fspath(labels), result)
+    suites = [_suite(episodes, specifications, conditions) for episodes in (logs, against) if episodes]
+    files = (None if labels is None else fspath(labels), None)
+    prepared = [
+        prepare_judgement(suite.allowing(allowed), file, result)
+        for suite, file in zip(suites, files, strict=False)
+    ]
     with TemporaryDirectory() as folder:
-        batch = run_batch([prepared.case], folder if output is None else output, workers_of(jobs))
-    return prepared.judgement(batch, allowed)
+        cases = [part.case for part in prepared]
+        batch = run_batch(cases, folder if output is None else output, workers_of(jobs))
+    judgement, *earlier = (part.judgement(batch, allowed) for part in prepared)
+    if not earlier:
+        return judgement
+    distance = SAME_START if same_start is None else same_start
+    comparison = compare_judgements(judgement, earlier[0], conditions, distance)
+    return replace(judgement, comparison=comparison)
 
 
 def _suite(

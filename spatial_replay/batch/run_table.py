@@ -208,7 +208,7 @@ class FlakyResult:
         return f"{self.log}: {name} is flaky: {self.failed:,} of {self.runs:,} runs failed"
 
 
-_RUN: Final = re.compile(r"#\d+(?=[./]|$)")
+RUN: Final = re.compile(r"#\d+(?=[./]|$)")
 """The number of a run in the name of its log: "cross#2.mcap"."""
 
 
@@ -217,7 +217,7 @@ def flaky_results(table: pa.Table) -> list[FlakyResult]:
     failures: dict[Key, list[bool]] = defaultdict(list)
     for key, failure in zip(keys_of(table), table.column("failure").to_pylist(), strict=True):
         case, log, file, spec, object_name = key
-        name = _RUN.sub("", log)
+        name = RUN.sub("", log)
         if name != log:
             failures[case, name, file, spec, object_name].append(failure is not None)
     return [

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +29,7 @@ from spatial_replay.cli.options import (
     semantics_option,
 )
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
+from spatial_replay.errors import UsageError
 from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.text import counted
 
@@ -61,6 +64,30 @@ if TYPE_CHECKING:
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Judgement to write, as one JSON object.")
 @click.option(
+    "--write-labels",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Table of the verdicts as labels: .parquet or .csv.",
+)
+@click.option(
+    "--annotate",
+    metavar="NEW",
+    type=click.Path(path_type=Path),
+    help="Copy of a LeRobot data set, whose episodes have the verdicts.",
+)
+@click.option(
+    "--against",
+    metavar="LOG",
+    multiple=True,
+    help="Earlier episodes to compare with: a log, folder, pattern or data set.",
+)
+@click.option(
+    "--same-start",
+    metavar="DISTANCE",
+    type=click.FloatRange(min=0.0),
+    help="With --against: how far objects of a pair may start apart, in units of length.  [default: 0.001]",
+)
+@click.option(
     "--at-least",
     metavar="RATE",
     type=click.FloatRange(0.0, 1.0),
@@ -79,6 +106,10 @@ def judge(
     output: str | None,
     html: Path | None,
     json_file: str | None,
+    write_labels: Path | None,
+    annotate: Path | None,
+    against: tuple[str, ...],
+    same_start: float | None,
     at_least: float | None,
     jobs: int | None,
     allow: frozenset[str],
@@ -100,16 +131,43 @@ def judge(
     # imported here so that --help stays fast
     from spatial_replay.batch.run import workers_of
     from spatial_replay.judging.judgement import prepare_judgement
+    from spatial_replay.judging.pairs import SAME_START, compare_judgements
+    from spatial_replay.judging.writers import annotate_data_set, check_annotation, ending_of_labels
+    from spatial_replay.judging.writers import write_labels as write_label_table
 
+    if same_start is not None and not against:
+        raise UsageError("--same-start is about pairs; add --against LOG")
     suite = suite_of_logs(logs, conditions, semantics).allowing(allow)
-    prepared = prepare_judgement(suite, labels, result, progress)
-    warnings = [warning for file in prepared.case.files for warning in file.warnings]
+    prepared = [prepare_judgement(suite, labels, result, progress)]
+    if against:
+        earlier = suite_of_logs(against, conditions, semantics).allowing(allow)
+        prepared.append(prepare_judgement(earlier, None, result, progress))
+    cases = [part.case for part in prepared]
+    warnings = [warning for file in cases[0].files for warning in file.warnings]
     show_diagnostics({str(warning): warning for warning in warnings}.values())
-    inputs = [*inputs_of(suite), *prepared.labels.files]
-    check_outputs({"--json": None if json_file == "-" else json_file}, inputs)
-    folder = output or f"{prepared.name}.results"
+    inputs = [*inputs_of(suite), *prepared[0].labels.files]
+    outputs = {"--json": None if json_file == "-" else json_file, "--write-labels": write_labels}
+    check_outputs(outputs, inputs)
+    if write_labels is not None:
+        ending_of_labels(write_labels)
+    paths = [log.path for log in cases[0].logs]
+    data_set = None if annotate is None else check_annotation(paths, annotate)
+    folder = output or f"{prepared[0].name}.results"
     workers = workers_of(jobs or os.cpu_count() or 1)
-    judgement = prepared.judgement(evaluated_batch([prepared.case], folder, workers), allow)
+    batch = evaluated_batch(cases, folder, workers)
+    judgement = prepared[0].judgement(batch, allow)
+    if against:
+        comparison = compare_judgements(
+            judgement,
+            prepared[1].judgement(batch, allow),
+            cases[0].case.conditions,
+            SAME_START if same_start is None else same_start,
+        )
+        judgement = replace(judgement, comparison=comparison)
+    if write_labels is not None:
+        write_label_table(judgement, write_labels, inputs)
+    if annotate is not None and data_set is not None:
+        annotate_data_set(judgement, data_set, annotate)
     if html is not None:
         from spatial_replay.batch.outputs import write_pages
         from spatial_replay.judging.writers import labelled_batch
@@ -118,24 +176,28 @@ def judge(
     if json_file is not None:
         write_json_lines([judgement.document], json_file, inputs)
     if json_file != "-":
-        _print(judgement, folder, conditions)
+        written = [str(file) for file in (write_labels, annotate) if file is not None]
+        _print(judgement, [folder, *written], conditions)
     warn(*judgement.remarks, *judgement.batch.remarks)
     warn_of_names(judgement.batch.table)
     warn_of_damage(judgement.batch.table)
     return _exit_code(judgement, at_least)
 
 
-def _print(judgement: Judgement, folder: str, conditions: ConditionArguments) -> None:
+def _print(judgement: Judgement, outputs: Sequence[str], conditions: ConditionArguments) -> None:
+    from spatial_replay.judging.pairs import comparison_lines
     from spatial_replay.judging.sentences import difference_lines, summary_lines
 
     show(*summary_lines(judgement), *difference_lines(judgement), "")
+    if judgement.comparison is not None:
+        show(*comparison_lines(judgement.comparison), "")
     rows = [[row for row in judgement.rows if row.kind == kind] for kind in ("only_theirs", "only_ours")]
     failed = [row for row in judgement.rows if not row.is_success]
     example = [*rows[0], *rows[1], *failed, *judgement.rows][0]
     specs = "".join(f" --spec {spec}" for spec in conditions.specs)
     mapping = conditions.reading.get("mapping")
     options = f"{specs} --mapping {mapping}" if mapping else specs
-    show(f"wrote {folder}; spatial-replay explain {example.log}{options}")
+    show(f"wrote {', '.join(outputs)}; spatial-replay explain {example.log}{options}")
 
 
 def _exit_code(judgement: Judgement, at_least: float | None) -> ExitCode:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from spatial_replay.batch.rows import parsed_specifications
 from spatial_replay.batch.run import BatchResult, PreparedCase, prepare
-from spatial_replay.batch.run_table import Values, worst_rows
+from spatial_replay.batch.run_table import RUN, Values, worst_rows
 from spatial_replay.batch.suite import Suite
 from spatial_replay.batch.workers import Progress, no_progress
 from spatial_replay.errors import UsageError
 from spatial_replay.judging.labels import Labels, SuccessLabel, read_labels
-from spatial_replay.judging.statistics import Rate
+from spatial_replay.judging.statistics import Rate, pass_hat_k
 from spatial_replay.logs.remote import is_address
 from spatial_replay.sources.open_log import LOG_ENDINGS
 from spatial_replay.spec.format import format_formula
@@ -26,6 +27,8 @@ from spatial_replay.text import json_value, listed, nearest_hint, printable, wit
 if TYPE_CHECKING:
     import pandas
     import pyarrow as pa
+
+    from spatial_replay.judging.pairs import Comparison
 
 Kind: TypeAlias = Literal[
     "both", "only_theirs", "only_ours", "neither", "unstored", "undecided", "unlabelled"
@@ -36,6 +39,8 @@ _AGREEMENTS: Final[Mapping[tuple[bool, bool], Kind]] = {
     (False, True): "only_ours",
     (False, False): "neither",
 }
+_MOST_RUNS: Final = 8
+"""The greatest k of `pass_k`."""
 _SMALL_M: Final = 0.1
 """Shorter lengths are reported in millimetres."""
 
@@ -113,6 +118,7 @@ class Judgement:
         file, result, formula: the specification file, the name of the spec, and its text.
         rows: one for each episode, in their order.
         batch: the results of all specs.
+        comparison: with earlier episodes, if there are any.
     """
 
     name: str
@@ -121,6 +127,7 @@ class Judgement:
     formula: str
     rows: tuple[JudgedEpisode, ...]
     batch: BatchResult
+    comparison: Comparison | None = None
 
     @cached_property
     def agreement(self) -> Agreement:
@@ -155,6 +162,23 @@ class Judgement:
         return low if low == high else None
 
     @property
+    def pass_k(self) -> dict[int, float]:
+        """Mean probability that k runs of one start all succeed, by k from 2; none without repeated starts.
+
+        A start is a task with a seed, or a log whose name differs only in the number of its run: `cross#2`.
+        """
+        outcomes = defaultdict[object, list[bool]](list)
+        for row in self.rows:
+            start = RUN.sub("", row.log) if row.seed is None else (row.task, row.seed)
+            if row.is_success is not None and (row.seed is not None or start != row.log):
+                outcomes[start].append(row.is_success)
+        most = min(map(len, outcomes.values()), default=0)
+        return {
+            k: fmean(pass_hat_k(sum(runs), len(runs), k) for runs in outcomes.values())
+            for k in range(2, min(most, _MOST_RUNS) + 1)
+        }
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """Messages about the labels."""
         rate = self.label_rate
@@ -179,7 +203,10 @@ class Judgement:
         ]
         document = {"name": self.name, "episodes": len(self.rows), "decided": self.rate.episodes}
         document |= {"file": self.file, "result": self.result, "formula": self.formula}
-        document |= {"agreement": asdict(self.agreement), **numbers, "remarks": self.remarks, "rows": rows}
+        document |= {"agreement": asdict(self.agreement), **numbers, "pass_k": self.pass_k}
+        if self.comparison is not None:
+            document["comparison"] = self.comparison.document
+        document |= {"remarks": self.remarks, "rows": rows}
         return {name: json_value(value) for name, value in document.items()}
 
     @property

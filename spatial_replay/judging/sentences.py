@@ -27,11 +27,12 @@ def summary_lines(judgement: Judgement) -> Iterator[str]:
     rates = {"ours": judgement.rate}
     rates |= {"": judgement.rate_with_unstored} if agreement.unstored else {}
     rates |= {"label": judgement.label_rate} if judgement.label_rate.episodes else {}
+    rates |= {"against": judgement.comparison.old_rate} if judgement.comparison else {}
     counts = {name: f"{rate.successes:,} of {rate.episodes:,}" for name, rate in rates.items()}
     width = max(map(len, counts.values()))
     yield f"{'':10}{'success':<{width + 9}}95 %"
     for name, rate in rates.items():
-        end = f"   if the unstored {agreement.unstored:,} count" if not name else ""
+        end = "" if name else f"   if the unstored {agreement.unstored:,} count"
         yield f"{name:<10}{counts[name]:<{width}}  {_percents(rate)}{end}"
     numbers = {
         "both": agreement.both,
@@ -48,6 +49,8 @@ def summary_lines(judgement: Judgement) -> Iterator[str]:
         agreeing = f"{agreement.both + agreement.neither:,} of {agreement.compared:,}"
         start = f"agreement {agreeing:<{width + 9}}" if judgement.label_rate.episodes else ""
         yield f"{start}{', '.join(f'{name} {number:,}' for name, number in numbers.items())}"
+    if judgement.pass_k:
+        yield ", ".join(f"pass^{k} {100.0 * value:.0f} %" for k, value in judgement.pass_k.items())
 
 
 def _percents(rate: Rate) -> str:

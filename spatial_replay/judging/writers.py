@@ -1,13 +1,25 @@
-"""Judgements as pages and tables."""
+"""Judgements as pages, as tables, and as labels in data sets for training."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.batch.outputs import AGREEMENT, LABEL
 from spatial_replay.batch.run import BatchResult
+from spatial_replay.errors import UsageError
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement
+from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
+from spatial_replay.logs.output_file import output_error, replacing
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _DIFFERENCES: Final = {
     "only_theirs": "only the label counts a success",
@@ -39,3 +51,158 @@ def labelled_batch(judgement: Judgement) -> BatchResult:
 
 def _failure(row: JudgedEpisode, failure: str | None) -> str | None:
     return failure if row.kind == "undecided" else _DIFFERENCES.get(row.kind)
+
+
+def label_table(judgement: Judgement) -> pa.Table:
+    """Return a table of decided episodes for training and for comparing rates.
+
+    `success` is true or false, `policy_id` the name of the data set. Columns `task` and `seed` are left out
+    where the data set has none.
+    """
+    import pyarrow as pa
+
+    # names that read as numbers would become one: 0.10 and 0.1
+    name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
+    rows = [(index, row) for index, row in enumerate(judgement.rows) if row.is_success is not None]
+    columns: dict[str, tuple[pa.DataType, list[Any]]] = {
+        "run_id": (pa.string(), [name for _ in rows]),
+        "policy_id": (pa.string(), [name for _ in rows]),
+        "task": (pa.string(), [row.task for _, row in rows]),
+        "episode": (pa.string(), [row.episode for _, row in rows]),
+        "episode_idx": (pa.int64(), [_number(row, index) for index, row in rows]),
+        "seed": (pa.int64(), [row.seed for _, row in rows]),
+        **{column: _judged_column(column, [row for _, row in rows]) for column in _JUDGED},
+    }
+    optional = {name for name in ("task", "seed") if not any(value is not None for value in columns[name][1])}
+    present = {name: column for name, column in columns.items() if name not in optional}
+    return pa.table({name: pa.array(values, kind) for name, (kind, values) in present.items()})
+
+
+_JUDGED: Final = ("success", "margin", "success_at", "tested", "reason")
+"""Columns of labels that are written."""
+
+
+def _judged_column(name: str, rows: Sequence[JudgedEpisode | None]) -> tuple[pa.DataType, list[Any]]:
+    import pyarrow as pa
+
+    kinds = {"success": pa.bool_(), "margin": pa.float64(), "success_at": pa.float64()}
+    attribute = "is_success" if name == "success" else name
+    return kinds.get(name, pa.string()), [None if row is None else getattr(row, attribute) for row in rows]
+
+
+def _number(row: JudgedEpisode, index: int) -> int:
+    address = data_set_address(row.log)
+    return index if address is None else address[1]
+
+
+def _is_number(name: str) -> bool:
+    try:
+        float(name)
+    except ValueError:
+        return False
+    return True
+
+
+def ending_of_labels(file: Path) -> str:
+    """Return the ending of a file for labels.
+
+    Raises:
+        UsageError: it is not the ending of a table.
+    """
+    ending = file.suffix.lower()
+    if ending not in (".parquet", ".csv"):
+        raise UsageError(f"--write-labels {file}: give a name that ends in .parquet or .csv")
+    return ending
+
+
+def write_labels(judgement: Judgement, file: Path, inputs: Sequence[Path] = ()) -> None:
+    """Write the table of labels as Parquet or CSV, by the ending of the file's name.
+
+    Raises:
+        UsageError: another ending, or an output that is an input.
+        OutputError: the file cannot be written.
+    """
+    from pyarrow import csv, parquet
+
+    ending, table = ending_of_labels(file), label_table(judgement)
+    with replacing(file, inputs) as stream:
+        if ending == ".csv":
+            csv.write_csv(table, stream)
+        else:
+            parquet.write_table(table, stream)
+
+
+def check_annotation(logs: Sequence[str], new: Path) -> Path:
+    """Return the data set that a copy with labels is made of.
+
+    Raises:
+        UsageError: the copy exists, or the logs are no episodes of one LeRobot data set of version 3.
+    """
+    if new.exists() or new.is_symlink():
+        raise UsageError(f"--annotate {new}: it exists; give a new name, since no data set is changed")
+    if not new.absolute().parent.is_dir():
+        raise UsageError(f"--annotate {new}: there is no folder {new.parent}; make it first")
+    folders = {None if address is None else address[0] for address in map(data_set_address, logs)}
+    folder = folders.pop() if len(folders) == 1 else None
+    data_set = None if folder is None else open_data_set(folder)
+    if folder is None or data_set is None or not (Path(folder) / "meta/episodes").is_dir():
+        raise UsageError(
+            "--annotate copies one LeRobot data set with meta/episodes (version 3); "
+            "for others write a table: --write-labels FILE.parquet"
+        )
+    return Path(folder)
+
+
+def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
+    """Make a copy of a LeRobot data set, whose episodes have the columns `judge/success` and so on.
+
+    Files of data and videos are links to those of the original, the metadata is copied.
+
+    Raises:
+        OutputError: the copy cannot be written; nothing stays of it.
+    """
+    from pyarrow import parquet
+
+    numbered = {_number(row, index): row for index, row in enumerate(judgement.rows)}
+    spec = f"{judgement.file}: {judgement.result} = {judgement.formula}"
+    partial = Path(tempfile.mkdtemp(prefix=f".{new.name}.", dir=new.absolute().parent))
+    try:
+        for part in folder.iterdir():
+            if part.is_dir():
+                copy = shutil.copy2 if part.name == "meta" else _link
+                shutil.copytree(part, partial / part.name, copy_function=copy)
+            else:
+                shutil.copy2(part, partial / part.name)
+        for file in sorted((partial / "meta/episodes").glob("chunk-*/file-*.parquet")):
+            table = parquet.read_table(file)
+            rows = [numbered.get(number) for number in table["episode_index"].to_pylist()]
+            parquet.write_table(_annotated_episodes(table, rows, spec), file)
+        partial.chmod(folder.stat().st_mode & 0o777)
+        partial.rename(new)
+    except OSError as error:
+        raise output_error(new, error) from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(partial)
+
+
+def _link(source: str, target: str) -> None:
+    """Link a file; on another disk by its path."""
+    source = os.path.realpath(source)
+    try:
+        os.link(source, target)
+    except OSError:
+        os.symlink(source, target)  # noqa: PTH211 - as texts, which copytree gives
+
+
+def _annotated_episodes(table: pa.Table, rows: Sequence[JudgedEpisode | None], spec: str) -> pa.Table:
+    import pyarrow as pa
+
+    # columns of an earlier judgement, and descriptions of the old columns
+    names = [name for name in table.column_names if not name.startswith("judge/")]
+    table = table.select(names).replace_schema_metadata(None)
+    for name in _JUDGED:
+        kind, values = _judged_column(name, rows)
+        table = table.append_column(f"judge/{name}", pa.array(values, kind))
+    specs = [None if row is None else spec for row in rows]
+    return table.append_column("judge/spec", pa.array(specs, pa.string()))

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 import spatial_replay as sr
@@ -194,3 +195,84 @@ def test_bad_labels_are_refused_with_the_place_and_the_remedy(fleet: Path, label
 def test_a_field_of_labels_needs_a_data_set(fleet: Path) -> None:
     assert "--labels next.success: no such file" in judge("--labels", "next.success", code=2)
     assert "missing.json" in judge("--labels", "missing.json", code=2)
+
+
+def test_a_table_of_labels_has_true_and_false_and_leaves_undecided_episodes_out(fleet: Path) -> None:
+    Path("logs/run-3.jsonl").write_text("{")
+    judge("--write-labels", "labels.parquet")
+    rows = pq.read_table("labels.parquet").to_pylist()
+    assert [(row["episode"], row["episode_idx"], row["success"]) for row in rows] == [
+        ("run-0", 0, True),
+        ("run-1", 1, True),
+        ("run-2", 2, False),
+    ]
+    assert rows[0]["policy_id"] == "logs"
+    assert not {"seed", "task"} & rows[0].keys()
+    judge("--write-labels", "labels.csv")
+    assert Path("labels.csv").read_text().splitlines()[1].startswith('"logs","logs","run-0",0,true,0.2')
+    assert "ends in .parquet or .csv" in judge("--write-labels", "labels.txt", code=2)
+    Path("all.csv").write_text("log,success\nlogs/run-0,true\n")
+    assert "is an input" in judge("--labels", "all.csv", "--write-labels", "all.csv", code=2)
+
+
+def test_only_a_data_set_is_annotated(fleet: Path) -> None:
+    assert "--write-labels FILE.parquet" in judge("--annotate", "new", code=2)
+    assert "it exists" in judge("--annotate", "logs", code=2)
+
+
+def write_pairs(new: list[float], old: list[float]) -> None:
+    """Write two fleets in which the cart keeps these distances at last, and starts at the same places."""
+    for name, distances in {"new": new, "old": old}.items():
+        for number, distance in enumerate(distances):
+            file = Path(name) / f"{number}.jsonl"
+            start = write_log(file, 0.5, samples=1).read_text()
+            end = write_log(file, distance).read_text().splitlines(keepends=True)[-1]
+            file.write_text(start + end)
+
+
+def test_pairs_that_start_alike_decide_which_side_is_better(fleet: Path) -> None:
+    write_pairs([0.5] * 9 + [0.1] + [0.4] * 2, [0.1] * 9 + [0.5] + [0.4] * 2)
+    ended = command("judge", "new", "--spec", "gate.spatial", "--jobs", "1", "--against", "old")
+    assert ended.code == 0, ended.err
+    assert "against old: 12 pairs with the same start\n" in ended.out
+    assert "new is better: 9 won, 1 lost of 12 pairs, p = 0.021\nevidence 9.3 of the 20" in ended.out
+    assert re.search(r"against   3 of 12 +25 %", ended.out)
+    comparison = sr.judge("old", "gate.spatial", against="new").comparison
+    assert comparison is not None
+    assert (comparison.decision, comparison.won, comparison.lost) == ("worse", 1, 9)
+
+
+def test_too_few_pairs_are_undecided_with_a_number_of_further_ones(fleet: Path) -> None:
+    write_pairs([0.5] * 12, [0.1, *[0.5] * 11])
+    arguments = ["--spec", "gate.spatial", "--jobs", "1", "--against", "old"]
+    more = statistics.more_pairs(1, 0, 12)
+    text = command("judge", "new", *arguments).out
+    assert f"undecided: 1 won, 0 lost of 12, p = 1; about {more} more pairs would decide" in text
+    Path("old/11.jsonl").rename("old/12.jsonl")
+    document = json.loads(command("judge", "new", *arguments, "--json", "-").out)["comparison"]
+    assert (document["decision"], document["pairs"], document["alone"]) == ("undecided", 11, 2)
+
+
+def test_equal_names_are_no_pair_if_objects_start_elsewhere(fleet: Path) -> None:
+    write_pairs([0.5, 0.5], [0.1, 0.1])
+    # the cart of the second old run starts 5 mm away
+    text = Path("old/1.jsonl").read_text()
+    Path("old/1.jsonl").write_text(text.replace("[0.0, 0]", "[-0.02, 0]", 1))
+    assert Path("old/1.jsonl").read_text() != text
+    for distance, counts in {None: (1, 1), 0.02: (2, 0)}.items():
+        comparison = sr.judge("new", "gate.spatial", against="old", same_start=distance).comparison
+        assert comparison is not None
+        assert (len(comparison.pairs), comparison.elsewhere) == counts
+
+
+def test_repeated_runs_say_how_often_all_of_them_succeed(fleet: Path) -> None:
+    for start, distances in {"a": [0.5, 0.5, 0.1], "b": [0.5, 0.5, 0.5]}.items():
+        for number, distance in enumerate(distances):
+            write_log(Path(f"runs/{start}#{number}.jsonl"), distance)
+    ended = command("judge", "runs", "--spec", "gate.spatial", "--jobs", "1", "--json", "-")
+    # of three runs of a, two succeed: one of its three pairs does
+    assert json.loads(ended.out)["pass_k"] == pytest.approx({"2": 2 / 3, "3": 0.5})
+
+
+def test_same_start_needs_earlier_episodes(fleet: Path) -> None:
+    assert "add --against LOG" in judge("--same-start", "0.1", code=2)

@@ -1,0 +1,196 @@
+"""Two judgements compared by pairs of episodes that start alike."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import dist, isfinite
+from typing import Any, Final, TypeAlias
+
+from spatial_replay.batch.rows import Task, opened_task
+from spatial_replay.batch.suite import Conditions
+from spatial_replay.errors import SpatialReplayError
+from spatial_replay.geometry.footprint import centres_of
+from spatial_replay.judging.judgement import JudgedEpisode, Judgement
+from spatial_replay.judging.statistics import (
+    EVIDENCE,
+    SIGNIFICANCE,
+    Rate,
+    SignedRank,
+    e_value,
+    mcnemar_p,
+    more_pairs,
+    wilcoxon,
+)
+from spatial_replay.text import json_value
+
+SAME_START: Final = 0.001
+"""Distance of first places that counts as none, in units of length."""
+_Place: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """New episodes against old ones.
+
+    Attributes:
+        new, old: names of both.
+        old_rate: of all decided old episodes.
+        pairs: decided episodes of both that have the same key and first places.
+        elsewhere: number of pairs with the same key whose objects start elsewhere, or are others.
+        undecided: number of pairs in which one episode is undecided, or its success unstored.
+        alone: number of episodes without a partner.
+    """
+
+    new: str
+    old: str
+    old_rate: Rate
+    pairs: tuple[tuple[JudgedEpisode, JudgedEpisode], ...]
+    elsewhere: int
+    undecided: int
+    alone: int
+
+    @property
+    def won(self) -> int:
+        """Number of pairs in which only the new episode succeeds."""
+        return sum(bool(new.is_success and not old.is_success) for new, old in self.pairs)
+
+    @property
+    def lost(self) -> int:
+        """Number of pairs in which only the old episode succeeds."""
+        return sum(bool(old.is_success and not new.is_success) for new, old in self.pairs)
+
+    @property
+    def p(self) -> float:
+        """McNemar's exact p-value."""
+        return mcnemar_p(self.won, self.lost)
+
+    @property
+    def evidence(self) -> float:
+        """The e-value, see `e_value`; 20 decides."""
+        return e_value(self.won, self.lost)
+
+    @property
+    def more_pairs(self) -> int | None:
+        """How many further pairs would decide, see `statistics.more_pairs`."""
+        return more_pairs(self.won, self.lost, len(self.pairs))
+
+    @property
+    def margins(self) -> SignedRank | None:
+        """Wilcoxon's signed-rank test of the finite margins; None if no pair differs."""
+        margins = [
+            (new.margin, old.margin)
+            for new, old in self.pairs
+            if new.margin is not None and old.margin is not None and isfinite(new.margin - old.margin)
+        ]
+        return wilcoxon([new for new, _ in margins], [old for _, old in margins])
+
+    @property
+    def decision(self) -> str:
+        """The word "better", "worse" or "undecided"."""
+        if self.p > SIGNIFICANCE:
+            return "undecided"
+        return "better" if self.won > self.lost else "worse"
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The comparison for JSON."""
+        names = ["old", "decision", "won", "lost", "elsewhere", "undecided", "alone"]
+        names += ["p", "evidence", "more_pairs", "margins"]
+        numbers = {name: getattr(self, name) for name in names}
+        return {
+            "pairs": len(self.pairs),
+            "old_rate": self.old_rate.value,
+            **{name: json_value(value) for name, value in numbers.items()},
+        }
+
+
+def compare_judgements(
+    new: Judgement, old: Judgement, conditions: Conditions, same_start: float = SAME_START
+) -> Comparison:
+    """Pair episodes by their seed, or their name or number, and by the places of their objects.
+
+    Args:
+        conditions: how the logs are read.
+        same_start: how far first places may be apart in each object.
+    """
+    by_seed = all(row.seed is not None for row in (*new.rows, *old.rows))
+    partners = dict(_keyed(old.rows, by_seed))
+    pairs, counts = [], Counter[str]()
+    for key, row in _keyed(new.rows, by_seed):
+        partner = partners.pop(key, None)
+        if partner is None:
+            counts["alone"] += 1
+        elif None in (row.is_success, partner.is_success) or "unstored" in (row.kind, partner.kind):
+            counts["undecided"] += 1
+        elif not _start_alike(row, partner, conditions, same_start):
+            counts["elsewhere"] += 1
+        else:
+            pairs.append((row, partner))
+    counts["alone"] += len(partners)
+    numbers = counts["elsewhere"], counts["undecided"], counts["alone"]
+    return Comparison(new.name, old.name, old.rate, tuple(pairs), *numbers)
+
+
+def _keyed(
+    rows: Sequence[JudgedEpisode], by_seed: bool
+) -> Iterator[tuple[tuple[object, ...], JudgedEpisode]]:
+    """Yield each row with its key; of rows with one key, the first ones of both sides belong together."""
+    counts = Counter[tuple[object, ...]]()
+    for row in rows:
+        key = (row.task, row.seed) if by_seed else (row.episode.rpartition("#")[2],)
+        counts[key] += 1
+        yield (*key, counts[key]), row
+
+
+def _start_alike(new: JudgedEpisode, old: JudgedEpisode, conditions: Conditions, same_start: float) -> bool:
+    places, others = _first_places(new.log, conditions), _first_places(old.log, conditions)
+    if not places or places.keys() != others.keys():
+        return False
+    return all(dist(place, others[name]) <= same_start for name, place in places.items())
+
+
+def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
+    """Return the centre of each object in the first sample of a log; none if it cannot be read."""
+    try:
+        source, options = opened_task(Task(log, (), conditions), ())
+        window = options.window
+        traces = (block.trace for block in source.iter_blocks(window.start_ns or None, window.end_ns))
+        trace = next((trace for trace in traces if len(trace)), None)
+    except SpatialReplayError:
+        return {}
+    if trace is None:
+        return {}
+    centres = centres_of(trace.footprints)
+    rows = {name: row for name, row in zip(trace.names, trace.rows[0].tolist(), strict=True) if row >= 0}
+    places = {}
+    for name, row in rows.items():
+        bottom, top = trace.footprints.height(row) or (0.0, 0.0)
+        x, y = centres.vertices[row].tolist()
+        places[name] = (x, y, (bottom + top) / 2.0)
+    return places
+
+
+def comparison_lines(comparison: Comparison) -> Iterator[str]:
+    """Yield how many pairs there are, which side is better, and how sure that is."""
+    pairs, won, lost = len(comparison.pairs), comparison.won, comparison.lost
+    rest = {
+        "start elsewhere": comparison.elsewhere,
+        "undecided": comparison.undecided,
+        "episodes without a partner": comparison.alone,
+    }
+    others = "".join(f", {count:,} {name}" for name, count in rest.items() if count)
+    yield f"against {comparison.old}: {pairs:,} pairs with the same start{others}"
+    if not pairs:
+        return
+    more = comparison.more_pairs
+    if comparison.decision == "undecided":
+        after = "" if more is None else f"; about {more:,} more pairs would decide"
+        yield f"undecided: {won:,} won, {lost:,} lost of {pairs:,}, p = {comparison.p:.2g}{after}"
+    else:
+        counts = f"{won:,} won, {lost:,} lost of {pairs:,} pairs"
+        yield f"{comparison.new} is {comparison.decision}: {counts}, p = {comparison.p:.2g}"
+    yield f"evidence {comparison.evidence:.2g} of the {EVIDENCE:.0f} needed"
+    if comparison.margins is not None:
+        yield f"margins differ by Wilcoxon's signed ranks: p = {comparison.margins.p:.2g}"
