@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -17,6 +18,7 @@ from spatial_replay.bags.open import McapLog, open_messages
 from spatial_replay.bags.reader import Message, MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.formats.datasets import data_set_address
 from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap
 from spatial_replay.logs.messages import OBJECTS, Source, TrackSource, read_blocks
 from spatial_replay.logs.read_options import FaultList, gap_ns
@@ -79,13 +81,16 @@ class Survey:
 
 
 def messages_in(path: str | PathLike[str]) -> MessageReader | None:
-    """Return a reader of a log of messages that needs a mapping; None for logs that name their objects.
+    """Return a reader of a log of messages that needs a mapping; None for logs that name their objects, and
+    for episodes of data sets.
 
     Raises:
         MissingFileError: there is no such file.
     """
     file = log_file(path)
     if isinstance(file, Path) and file.is_dir() and not is_bag_folder(file):
+        return None
+    if data_set_address(path) is not None:
         return None
     file = readable_file(path)
     try:
@@ -207,22 +212,22 @@ def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
     if not len(samples):
         raise LogError(f"{source.name} has no sample")
     of_topics: dict[str, list[Integers]] = defaultdict(list)
-    try:
-        reader: MessageReader | None = open_messages(readable_file(path))
-    except LogError:
-        reader = None
-    for columns in reader.iter_columns({each.name for each in reader.topics()}) if reader else ():
+    reader = None
+    # an episode of a data set has no messages
+    with suppress(LogError):
+        reader = None if data_set_address(path) is not None else open_messages(readable_file(path))
+    for columns in reader.iter_columns({topic.name for topic in reader.topics()}) if reader else ():
         for name, rows in columns.by_topic():
             of_topics[name].append(columns.log_time_ns[rows])
-    topics = {name: np.concatenate(each) for name, each in sorted(of_topics.items())}
-    start_ns = min((int(each[0]) for each in topics.values()), default=0)
-    end_ns = max((int(each[-1]) for each in topics.values()), default=0)
+    topics = {name: np.concatenate(pieces) for name, pieces in sorted(of_topics.items())}
+    start_ns = min((int(times_ns[0]) for times_ns in topics.values()), default=0)
+    end_ns = max((int(times_ns[-1]) for times_ns in topics.values()), default=0)
     return Fitness(
         Regularity.of(samples, int(samples[0]), int(samples[-1])),
-        {name: Regularity.of(each, start_ns, end_ns) for name, each in topics.items()},
+        {name: Regularity.of(times_ns, start_ns, end_ns) for name, times_ns in topics.items()},
         {
-            each.name: math.floor(1000.0 * (each.samples - each.unreadable) / tally.samples) / 1000.0
-            for each in tally.objects()
+            tracked.name: math.floor(1000.0 * (tracked.samples - tracked.unreadable) / tally.samples) / 1000.0
+            for tracked in tally.objects()
         },
     )
 

@@ -150,3 +150,14 @@ def test_contents_of_logs_are_refused_for_a_data_set(
     folder = lerobot(tmp_path / "fill", {"observation.state": (STATE, [0.0] * 4)})
     assert run(["info", str(folder), "--fit"]) == 2
     assert f"--fit is about one episode; give its address: {folder}#0" in capsys.readouterr().err
+
+
+def test_a_mapped_episode_is_shown_as_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lerobot(tmp_path / "fill", {"observation.state": (STATE, [0.0] * 4)})
+    mapping = tmp_path / "fill.yaml"
+    mapping.write_text("features: {observation.state: {name: hand, position: [hand_x, hand_y, hand_z]}}")
+    assert run(["info", f"{tmp_path}/fill#1", "--mapping", str(mapping), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["name"], document["samples"]) == ("fill#1", 3)
+    assert run(["info", f"{tmp_path}/fill#1", "--mapping", str(mapping), "--fit"]) == 0
+    assert "    hand: 1" in capsys.readouterr().out.replace('"', "")
