@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import isfinite
 from reprlib import repr as shortened
 from types import MappingProxyType
@@ -273,10 +273,21 @@ class Monitor:
             trial.extend(Sample(time_ns))
         if checked == "ltlf":
             rehearse(specification)
-        self._live = LiveStream(specification, checked, start_ns or 0)
-        self._violations = ViolationLog(specification, start_ns or 0, known) if checked == "ltlf" else None
-        self._awaited = _AwaitedNames(specification, missing_after, strict=strict_names)
-        self._start = _Start(wait_for, start_within)
+        first_ns = start_ns or 0
+        self._begin = partial(LiveStream, specification, checked, first_ns)
+        self._remember: Callable[[], ViolationLog | None] = lambda: None
+        if checked == "ltlf":
+            self._remember = partial(ViolationLog, specification, first_ns, known)
+        self._await = partial(_AwaitedNames, specification, missing_after, strict=strict_names)
+        self._wait = partial(_Start, wait_for, start_within)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin another run, as a new monitor does; the next sample is its first one."""
+        self._live = self._begin()
+        self._violations = self._remember()
+        self._awaited = self._await()
+        self._start = self._wait()
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
         self._unknown: dict[int, Settled] = {}
@@ -329,6 +340,17 @@ class Monitor:
             return float("-inf"), float("inf")
         lower, upper = final[identifier].tolist()
         return lower, upper
+
+    def leaves(self, place: int = 0) -> Floats:
+        """Return the leaves (C, A, 1) of the newest sample, as `SpecResult.leaves` of its log has them.
+
+        Args:
+            place: that of the spec in `Update.specs`.
+
+        Raises:
+            UsageError: no sample has been evaluated, or under the paper's semantics.
+        """
+        return self._live.leaves(place)
 
     def update(self, sample: Sample) -> Update:
         """Add the next sample and return its numbers and verdicts.

@@ -353,6 +353,7 @@ class LiveStream:
         self._start_ns = start_ns
         self._first_ns: int | None = None
         self._position = -1
+        self._newest: Floats | None = None
 
     @property
     def finals(self) -> list[Floats | None]:
@@ -373,10 +374,21 @@ class LiveStream:
         if sample.time_ns < self._start_ns:
             return [None] * len(self._evaluators)
         leaves = self._leaves.values(samples)
+        self._newest = leaves
         return [
             cast(OnlineRun, run).add_sample(leaves, own.start, sample.time_ns)
             for run, own in zip(self._runs, self._own_leaves, strict=True)
         ]
+
+    def leaves(self, place: int) -> Floats:
+        """Return the leaves (C, A, 1) of a formula in the newest evaluated sample.
+
+        Raises:
+            UsageError: no sample has been evaluated, or under the paper's semantics.
+        """
+        if self._newest is None:
+            raise UsageError("no sample has been evaluated, or under the paper's semantics; add a sample")
+        return self._newest[:, self._own_leaves[place]]
 
     def _extend_apart(self, sample: Sample, samples: Sequence[Sample | None]) -> list[Floats | None]:
         self._position += 1

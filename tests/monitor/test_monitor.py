@@ -10,6 +10,7 @@ import sys
 import tracemalloc
 from math import inf
 
+import numpy as np
 import pytest
 
 from monitor.scenes import SECOND
@@ -222,3 +223,23 @@ def test_nodes_are_read_one_by_one_or_as_numbers():
         spec.numbers[0, 0] = 1
     with pytest.raises(UsageError, match="3 is not a sample"):
         monitor.update(3)
+
+
+def test_a_monitor_that_is_reset_is_as_good_as_new() -> None:
+    specification = parse_specification("spec near = G (a dist b <= 1)\nspec rising = F (a[-1] dist a >= 1)")
+    monitor = Monitor(specification)
+    apart = {"a": Footprint.disc(0, 0, 0.1), "b": Footprint.disc(5, 0, 0.1)}
+    for time_ns in (10, 20):
+        monitor.update(Sample(time_ns, apart, {"z": float(time_ns)}))
+    assert monitor.update(Sample(30, apart, {"z": 0.0})).violations
+    monitor.reset()
+    assert [ending.verdict for ending in monitor.endings()] == ["unknown", "unknown"]
+    fresh = Monitor(specification)
+    near = {name: Footprint.disc(0, 0, 0.1) for name in "ab"}
+    for time_ns in (0, 10):
+        sample = Sample(time_ns, near, {"z": 0.0})
+        reset, new = monitor.update(sample), fresh.update(sample)
+        for numbers, expected in zip(reset.numbers, new.numbers, strict=True):
+            np.testing.assert_array_equal(numbers, expected)
+        assert not reset.violations
+        assert str(monitor.endings()) == str(fresh.endings())
