@@ -115,6 +115,11 @@ def test_a_loop_stops_its_robot_at_the_first_violation_and_its_log_says_why(
 
 
 @pytest.mark.usefixtures("desk")
+def test_episodes_are_judged_while_they_are_trained_on(capsys: pytest.CaptureFixture[str]) -> None:
+    follow("training.md", {}, capsys)
+
+
+@pytest.mark.usefixtures("desk")
 def test_a_failure_is_traced_from_the_verdict_to_a_report_and_an_annotated_log(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,7 +16,7 @@ from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.guards import Transition
 from spatial_replay.automata.text import size_words
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.geometry.arrays import Flags, Integers, combined, equal_places
+from spatial_replay.geometry.arrays import Flags, Floats, Integers, combined, equal_places
 from spatial_replay.logs.messages import AUTOMATA_PREFIX, Attachment
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -86,6 +87,10 @@ class AutomatonRun:
         self._is_node = [id(each.formula) in numbers for each in automaton.propositions]
         self._possible = np.zeros(len(automaton.states), np.bool_)
         self._possible[automaton.initial] = True
+        self._are_nodes = all(self._is_node)
+        self._state: int | None = automaton.initial
+        # whether the state has been stepped since the possible states were set
+        self._is_behind = False
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
         self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
@@ -117,6 +122,23 @@ class AutomatonRun:
     def states(self, block: SeriesBlock) -> NDArray[np.bool_] | Integers:
         """Take in the next samples, at least one; return the states after each, (T,) or as sets (T, S)."""
         return self._steps(self._values(block))[1]
+
+    def step(self, time_ns: int, numbers: Floats, leaves: Callable[[], Floats]) -> tuple[int, ...]:
+        """Take in one sample; return the states after it, as `states` does of a block of one sample.
+
+        Where all propositions are known, that takes a hundredth of the time.
+
+        Args:
+            numbers: (N, 4), those of the formula's nodes after the sample.
+            leaves: returns (C, A, 1), its leaves, for a sample that leaves a proposition unknown.
+        """
+        now = [numbers.item(node, _NOW) for node in self.propositions]
+        if self._state is None or not self._are_nodes or any(map(math.isnan, now)):
+            block = SeriesBlock(np.array([time_ns]), numbers[:, :, None], leaves())
+            return tuple(_members(self.states(block)[-1]).tolist())
+        self._state = self._automaton.step(self._state, [number >= 0.0 for number in now])
+        self._is_behind = True
+        return (self._state,)
 
     def words(self) -> tuple[list[str], Integers]:
         """Return states in words, and which of them is after each of the samples last taken in."""
@@ -174,16 +196,21 @@ class AutomatonRun:
 
     def _steps(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
         """Return the states before and after each sample: (T,), or as sets of states (T, S)."""
+        if self._is_behind:
+            self._possible = np.arange(len(self._possible)) == self._state
+            self._is_behind = False
         states = np.flatnonzero(self._possible)
         if len(states) == 1 and not (values == UNKNOWN).any():
             first = int(states[0])
             self._after = after = self._table.states(first, values)
-            self._possible = np.zeros_like(self._possible)
-            self._possible[after[-1]] = True
+            self._state = int(after[-1])
+            self._possible = np.arange(len(self._possible)) == self._state
             return np.concatenate([[first], after[:-1]]), after
         self._after = sets = self._table.state_sets(self._possible, values)
         before = np.concatenate([self._possible[None], sets[:-1]])
         self._possible = sets[-1].copy()
+        members = np.flatnonzero(self._possible)
+        self._state = int(members[0]) if len(members) == 1 else None
         return before, sets
 
     def _summary(self, after: NDArray[np.bool_] | Integers) -> NDArray[np.uint8]:

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from heapq import heappop, heappush
 from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.automaton_state import states_of_result
+from spatial_replay.annotate.automaton_state import AutomatonRun, states_of_result
 from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compile import automaton
 from spatial_replay.automata.ltlf import counts_seconds
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
+from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.result import Evaluation, SpecResult
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.text import shortened_formula
 
 LOST: Final = "lost"
@@ -27,6 +29,9 @@ UNKNOWN: Final = "unknown"
 
 _MOST_WAYS: Final = 1_000_000
 """Pairs of a decision and a state that follows it, of an automaton whose stages are computed."""
+
+_MOST_HELD: Final = 1024
+"""Sets of states whose stage is held while samples come."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +91,36 @@ class Stages:
     def __getitem__(self, sample: int) -> Stage:
         """Return the stage after a sample; -1 is the last one."""
         return self.stages[int(self.numbers[sample])]
+
+
+class LiveStages:
+    """The stages of a spec while its samples come, equal to those of a log of the same samples."""
+
+    def __init__(self, specification: Specification, spec: NamedSpec, *, rate_hz: float | None) -> None:
+        """Start before the first sample.
+
+        Raises:
+            NoAutomatonError: the spec has no automaton, or too large a one.
+        """
+        self._spec = spec
+        self._automaton = automaton(replace(specification, specs=(spec,)), spec.name, rate_hz=rate_hz)
+        self._stages = stages_of_automaton(self._automaton)
+        self._stage_of = lru_cache(_MOST_HELD)(self._stages.stage_of)
+        self._leaves = compile_formula(spec.formula).leaves
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin another run."""
+        self._run = AutomatonRun(self._spec.name, None, self._automaton, self._spec.formula, self._leaves)
+
+    def extend(self, time_ns: int, numbers: Floats, leaves: Callable[[], Floats]) -> tuple[Stage, float]:
+        """Add a sample; return the stage and the progress after it.
+
+        Args:
+            numbers, leaves: see `AutomatonRun.step`.
+        """
+        number, progress = self._stage_of(self._run.step(time_ns, numbers, leaves))
+        return self._stages.stages[number], progress
 
 
 def stages(

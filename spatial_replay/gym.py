@@ -1,0 +1,363 @@
+"""Episodes of gymnasium environments, judged while they happen."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from fractions import Fraction
+from os import PathLike
+from typing import Any, Final, Literal, TypeAlias
+
+import numpy as np
+
+from spatial_replay.annotate.stages import LiveStages
+from spatial_replay.errors import NoAutomatonError, UsageError, importing
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.monitor.monitor import Monitor, Update
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.recording.recorder import Recorder
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.load import require_specification
+from spatial_replay.text import listed, nearest_hint
+from spatial_replay.trace.trace import Sample
+
+with importing("judging environments takes gymnasium", extra="gym"):
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+    from gymnasium.vector.utils import iterate
+
+Objects: TypeAlias = Callable[[Any, dict[str, Any]], Mapping[str, TrackedObject | Footprint]]
+"""From an observation and its info, the objects by name."""
+Signals: TypeAlias = Callable[[Any, dict[str, Any]], Mapping[str, float | str]]
+"""From an observation and its info, the signals by name."""
+Judged: TypeAlias = dict[str, Any]
+"""The `info["judge"]` of a step, see `Judge`."""
+LogPath: TypeAlias = Callable[[Judged], str | PathLike[str] | None]
+"""From the last `info["judge"]` of an episode, the log to write; None for none."""
+
+_UNTIL: Final = ("satisfied", "violated", "settled")
+_REWARDS: Final = ("margin", "progress")
+
+
+class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment whose episodes are judged by a specification.
+
+    A sample is taken of every reset and of every step. `info["judge"]` has:
+
+    - `episode`: its number, from 0; `env`: that of the environment, in a vector of them.
+    - `verdict`: "satisfied", "violated" or "unknown", if the episode ended with this sample.
+    - `success`: whether that is "satisfied".
+    - `settled`: whether no later sample can change it.
+    - `margin`: the robustness of the episode so far; NaN if it is not determined.
+    - `stage`, `owed`, `progress`: how far the episode has come (see `annotate.stages`); only of a spec that
+      has an automaton.
+    - `reason`: what violated the spec, in a sentence; only where an episode ends with a settled violation.
+
+    The numbers equal those of a replay of the log of the episode.
+    """
+
+    def __new__(cls, env: Any = None, *arguments: Any, **options: Any) -> Any:
+        """Return a `VectorJudge` for a vector environment."""
+        if isinstance(env, VectorEnv):
+            return VectorJudge(env, *arguments, **options)
+        return super().__new__(cls)
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        specification: Specification,
+        objects: Objects | None = None,
+        *,
+        rate_hz: float,
+        signals: Signals | None = None,
+        result: str | None = None,
+        until: Literal["satisfied", "violated", "settled"] | None = None,
+        reward: Literal["margin", "progress"] | None = None,
+        log: LogPath | None = None,
+    ) -> None:
+        """Wrap an environment, or a vector of them.
+
+        Args:
+            objects, signals: return what a sample has, from an observation and its info.
+            rate_hz: steps a second; the reset of an episode has the time 0.
+            result: the name of the spec that judges; by default the last one that no other spec uses.
+            until: the settled verdict that terminates an episode.
+            reward: replaces the environment's reward by the gain in margin or progress since the sample
+                before. A margin that is not finite gains 0, and the next one counts from the last finite one.
+            log: called at the end of each episode; the episode is written to the path that it returns.
+
+        Raises:
+            UsageError: no such spec or option, a template, no objects or signals; `until` with a vector
+                environment that resets its episodes itself.
+            NoAutomatonError: `reward="progress"` with a spec that has no automaton.
+        """
+        super().__init__(env)
+        self._episodes = _Episodes(
+            specification,
+            objects,
+            rate_hz=rate_hz,
+            signals=signals,
+            result=result,
+            until=until,
+            reward=reward,
+            log=log,
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Reset the environment; its observation is the first sample of another episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, {**info, "judge": self._episodes.begin(observation, info)}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment, and judge the observation that follows."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        episodes = self._episodes
+        judged = episodes.extend(observation, info, ended=bool(terminated or truncated))
+        terminated = bool(terminated or episodes.ends)
+        return observation, episodes.gain(reward), terminated, truncated, {**info, "judge": judged}
+
+    def close(self) -> None:
+        """Write the log of an unfinished episode, if it is wanted, and close the environment."""
+        self._episodes.end()
+        super().close()
+
+
+class VectorJudge(VectorWrapper[Any, Any, Any, Any, Any]):
+    """A vector environment whose episodes are judged; `Judge` returns it for a vector environment.
+
+    Values of `info["judge"]` are arrays with masks (`_verdict`, …). Where the same step resets an episode,
+    its last sample is in `info["final_info"]["judge"]`.
+    """
+
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], specification: Specification, *arguments: Any, **options: Any
+    ) -> None:
+        """Wrap a vector environment, with the arguments of `Judge`."""
+        super().__init__(env)
+        self._mode = env.metadata.get("autoreset_mode")
+        if not isinstance(self._mode, AutoresetMode):
+            raise UsageError(
+                f'metadata["autoreset_mode"] of the vector environment is {self._mode!r}; set it to the'
+                " gymnasium.vector.AutoresetMode that the environment has"
+            )
+        if options.get("until") is not None and self._mode is not AutoresetMode.DISABLED:
+            raise UsageError(
+                "until: a vector environment resets its episodes itself; wrap each environment:"
+                " make_vec(…, wrappers=[lambda env: Judge(env, …)])"
+            )
+        self._episodes = [
+            _Episodes(specification, *arguments, env=number, **options) for number in range(env.num_envs)
+        ]
+        self._ended = np.zeros(env.num_envs, np.bool_)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset all environments, or those of the option `reset_mask`."""
+        mask = (options or {}).get("reset_mask")
+        begins = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask, np.bool_)
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._ended &= ~begins
+        infos = dict(infos)
+        for number, observation in enumerate(iterate(self.env.observation_space, observations)):
+            if begins[number]:
+                judged = self._episodes[number].begin(observation, _info_of(infos, number))
+                infos = self._add_info(infos, {"judge": judged}, number)
+        return observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all environments, and judge the observations that follow."""
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        begins = self._ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._ended)
+        self._ended = np.logical_or(terminations, truncations)
+        rewards, terminations, infos = np.array(rewards), np.array(terminations), dict(infos)
+        for number, observation in enumerate(iterate(self.env.observation_space, observations)):
+            episodes, info = self._episodes[number], _info_of(infos, number)
+            last = info.pop("final_obs", None), info.pop("final_info", None)
+            if begins[number]:
+                # the step of a reset: its action was ignored
+                judged = episodes.begin(observation, info)
+            elif self._mode is AutoresetMode.SAME_STEP and self._ended[number]:
+                judged = episodes.extend(*_last_of(last), ended=True)
+                infos = self._add_info(infos, {"final_info": {"judge": judged}}, number)
+                rewards[number] = episodes.gain(rewards[number])
+                judged = episodes.begin(observation, info)
+            else:
+                judged = episodes.extend(observation, info, ended=self._ended[number])
+                rewards[number] = episodes.gain(rewards[number])
+                terminations[number] |= episodes.ends
+            infos = self._add_info(infos, {"judge": judged}, number)
+        return observations, rewards, terminations, truncations, infos
+
+    def close(self, **options: Any) -> None:
+        """Write the logs of unfinished episodes, if they are wanted, and close the environments."""
+        for episodes in self._episodes:
+            episodes.end()
+        super().close(**options)
+
+
+class _Episodes:
+    """The episodes of one environment; see `Judge` for the arguments.
+
+    Attributes:
+        ends: whether the verdict terminates the episode.
+    """
+
+    def __init__(
+        self,
+        specification: Specification,
+        objects: Objects | None = None,
+        *,
+        rate_hz: float,
+        signals: Signals | None = None,
+        result: str | None = None,
+        until: str | None = None,
+        reward: str | None = None,
+        log: LogPath | None = None,
+        env: int | None = None,
+    ) -> None:
+        if objects is None and signals is None:
+            raise UsageError("no objects and no signals; give objects=, a function of observation and info")
+        for name, value, values in (("until", until, _UNTIL), ("reward", reward, _REWARDS)):
+            if value is not None and value not in values:
+                raise UsageError(f"{name} is {value!r}; give {listed(values)}, or None")
+        self._specification = _judging(specification, result)
+        self._spec = self._specification.results[-1].name
+        self._monitor = Monitor(self._specification, missing_after=1)
+        self._stages = _stages(self._specification, rate_hz, is_needed=reward == "progress")
+        self._objects, self._signals, self._log = objects, signals, log
+        self._until, self._reward = until, reward
+        period_ns = Fraction(10**9) / Fraction(repr(float(rate_hz)))
+        # whole numbers are multiplied in a tenth of the time
+        self._period_ns = int(period_ns) if period_ns.denominator == 1 else period_ns
+        self._about: Judged = {} if env is None else {"env": env}
+        self._episode = -1
+        self._frame = 0
+        self._samples: list[Sample] = []
+        self._judged: Judged | None = None
+        self._remarked: set[str] = set()
+        self._gain = 0.0
+        self._level: float | None = None
+        self.ends = False
+
+    def begin(self, observation: Any, info: dict[str, Any]) -> Judged:
+        """Begin an episode with its first sample."""
+        self.end()
+        self._monitor.reset()
+        if self._stages is not None:
+            self._stages.reset()
+        self._episode += 1
+        self._frame, self._samples, self._level = 0, [], None
+        return self.extend(observation, info)
+
+    def extend(self, observation: Any, info: dict[str, Any], *, ended: bool = False) -> Judged:
+        """Add a sample, the last one if the episode has ended; return what `info["judge"]` is."""
+        sample = Sample(
+            round(self._frame * self._period_ns),
+            self._objects(observation, info) if self._objects is not None else {},
+            self._signals(observation, info) if self._signals is not None else {},
+        )
+        self._frame += 1
+        if self._log is not None:
+            self._samples.append(sample)
+        update = self._monitor.update(sample)
+        judged = self._judge(update)
+        self._gain = 0.0
+        level = judged[self._reward] if self._reward is not None else math.nan
+        if math.isfinite(level):
+            if self._level is not None:
+                self._gain = level - self._level
+            self._level = level
+        is_settled = judged["settled"] and self._until in ("settled", judged["verdict"])
+        self.ends = self._until is not None and is_settled
+        self._judged = judged
+        if ended or self.ends:
+            if update.violations:
+                judged["reason"] = str(update.violations[0])
+            self.end()
+        return judged
+
+    def gain(self, reward: Any) -> Any:
+        """Return the reward of the last step: that of the environment, or the gain."""
+        return reward if self._reward is None else self._gain
+
+    def end(self) -> None:
+        """End the episode, if that has not happened, and write its log, if that is wanted."""
+        judged, self._judged = self._judged, None
+        path = None if self._log is None or judged is None else self._log(judged)
+        if path is not None:
+            with Recorder(path, specifications=self._specification) as recorder:
+                for sample in self._samples:
+                    recorder.write(sample)
+
+    def _judge(self, update: Update) -> Judged:
+        for remark in update.remarks:
+            if remark.message not in self._remarked:
+                self._remarked.add(remark.message)
+                warnings.warn(f"{remark.message}; {remark.hint}", stacklevel=4)
+        numbers = update.numbers[0]
+        if numbers is None:
+            raise UsageError("the monitor has no numbers")
+        margin, _, lower, upper = numbers[0].tolist()
+        verdict = final_verdict(*self._monitor.interval(self._spec))
+        judged: Judged = {
+            **self._about,
+            "episode": self._episode,
+            "verdict": verdict.value,
+            "success": verdict is Verdict.SATISFIED,
+            "settled": lower >= 0.0 or upper < 0.0,
+            "margin": margin,
+        }
+        if self._stages is not None:
+            stage, progress = self._stages.extend(update.time_ns, numbers, self._monitor.leaves)
+            judged |= {"stage": stage.name, "owed": stage.owed, "progress": progress}
+        return judged
+
+
+def _judging(specification: Specification, result: str | None) -> Specification:
+    """Return a specification with the only result that judges."""
+    require_specification(specification)
+    names = [spec.name for spec in specification.results]
+    name = names[-1] if result is None else result
+    if name not in names:
+        hint = nearest_hint(name, names) or f"results are {listed(names)}"
+        raise UsageError(f"result is {name!r}, and no result has this name; {hint}")
+    specs = tuple(spec for spec in specification.specs if not spec.is_result or spec.name == name)
+    return replace(specification, specs=specs)
+
+
+def _stages(specification: Specification, rate_hz: float, *, is_needed: bool) -> LiveStages | None:
+    """Return the stages of the only result, or None if it has no automaton."""
+    try:
+        return LiveStages(specification, specification.results[-1], rate_hz=rate_hz)
+    except NoAutomatonError:
+        if is_needed:
+            raise
+        return None
+
+
+def _last_of(last: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
+    """Return the last observation of an episode that was reset in the same step, and its info."""
+    observation, info = last
+    if observation is None:
+        raise UsageError(
+            'the vector environment has no info["final_obs"]: the last observation of an episode is lost; use'
+            " the autoreset mode NEXT_STEP"
+        )
+    return observation, {} if info is None else info
+
+
+def _info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
+    """Return the info of one environment of a vector, without what its masks say it does not have."""
+    info: dict[str, Any] = {}
+    for key, values in infos.items():
+        mask = infos.get(f"_{key}")
+        is_mask = key.startswith("_") and key[1:] in infos
+        if is_mask or (mask is not None and not mask[number]):
+            continue
+        if isinstance(values, dict):
+            info[key] = _info_of(values, number)
+        else:
+            # without a mask, a value may be about all environments
+            info[key] = values[number] if mask is not None or np.ndim(values) else values
+    return info
