@@ -146,10 +146,10 @@ class _ManiSkill(GroupedEpisodes):
         raise LogError(f"{place} has neither env_states nor obs; record with `record_env_state=True`")
 
     def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
-        bodies = []
-        for name in names_in(member(group, "env_states/actors")):
+        bodies, actors = [], member(group, "env_states/actors")
+        for name in names_in(actors):
             where = f"{place}: env_states/actors/{name}"
-            poses = pose_rows(member(group, f"env_states/actors/{name}"), where, 7)
+            poses = pose_rows(member(actors, name, group), where, 7)
             quaternions = unit_quaternions(poses[:, 3:7], where, reading.order or "wxyz")
             bodies.append(Body(name, poses[:, :3], quaternions))
         frames: Integers = np.arange(count, dtype=np.int64)
@@ -217,9 +217,9 @@ class _IsaacLab(GroupedEpisodes):
     def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
         frames: Integers = np.arange(count, dtype=np.int64)
         times_ns, order = frame_times_ns(frames, self.required_fps(reading)), reading.order or self._decide()
-        bodies = []
-        for name in names_in(member(group, _BODIES)):
-            poses, where = _poses(group, name, place), f"{place}: {_BODIES}/{name}"
+        bodies, home = [], member(group, _BODIES)
+        for name in names_in(home):
+            poses, where = _poses(home, name, group, place), f"{place}: {_BODIES}/{name}"
             if len(poses) != count:
                 raise LogError(f"{where} has {len(poses)} poses, and the first body {count}; record it again")
             bodies.append(Body(name, poses[:, :3], unit_quaternions(poses[:, 3:7], where, order)))
@@ -247,16 +247,16 @@ class _IsaacLab(GroupedEpisodes):
         for episode in self.episodes[:_ASKED]:
             place = f"{self.name}#{episode.number}"
             group = episode_group(file, f"{self.folder}/{episode.key}", place)
-            for name in names_in(member(group, _BODIES)):
-                yield _poses(group, name, place, rows)[:, 3:7]
+            home = member(group, _BODIES)
+            for name in names_in(home):
+                yield _poses(home, name, group, place, rows)[:, 3:7]
 
 
-def _poses(group: Any, body: str, place: str, rows: slice = slice(None)) -> Floats:
-    name = f"{_BODIES}/{body}/root_pose"
-    array = member(group, name)
+def _poses(home: Any, body: str, episode: Any, place: str, rows: slice = slice(None)) -> Floats:
+    where, array = f"{place}: {_BODIES}/{body}/root_pose", member(home, f"{body}/root_pose", episode)
     if array is None:
-        raise LogError(f"{place}: {name} is missing; record it again")
-    return pose_rows(array, f"{place}: {name}", 7, rows)
+        raise LogError(f"{where} is missing; record it again")
+    return pose_rows(array, where, 7, rows)
 
 
 def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
