@@ -22,7 +22,7 @@ from spatial_replay.mapping.feature_reader import FeatureReading, bind_features,
 from spatial_replay.mapping.mapping_file import LogMapping
 from spatial_replay.mapping.tracker import ObservationRows, rows_from_detections
 from spatial_replay.mapping.transforms import matrices_from_quaternions
-from spatial_replay.text import Instant, Sentence, encodable
+from spatial_replay.text import Instant, Sentence, encodable, listed
 from spatial_replay.trace.trace import Trace, class_order, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -96,7 +96,7 @@ class EpisodeSource(Source):
             trace = self._trace(columns, faults)
         if not len(trace):
             raise LogError(f"{self.name} has no frame")
-        remarks = [f"{self.name}: {remark}" for remark in columns.remarks]
+        remarks = [f"{self.name}: {remark}" for remark in (*columns.remarks, *self._point_remarks(columns))]
         if self.mapped_by is not None:
             remarks += [
                 f"{self.name}: it has no feature {feature!r}, which {self.mapped_by.name} marks as optional"
@@ -105,6 +105,17 @@ class EpisodeSource(Source):
         yield Block(
             replace(within(trace, start_ns, end_ns), faults=faults.take(last=True)), remarks=tuple(remarks)
         )
+
+    def _point_remarks(self, columns: EpisodeColumns) -> Iterator[str]:
+        """Yield a remark on bodies of which neither the data set nor the mapping says the shape."""
+        shapes = {} if self.mapped_by is None else self.mapped_by.shapes
+        names = [body.name for body in columns.bodies if body.shapes is None and body.name not in shapes]
+        if names:
+            subject = f"{listed(names)} {'is a point' if len(names) == 1 else 'are points'}"
+            yield (
+                f"{subject} without a shape in the data; give it by `shapes: {{{names[0]}: …}}`, or"
+                " the meshes of a model by `assets:`"
+            )
 
     def _trace(self, columns: EpisodeColumns, faults: FaultList) -> Trace:
         """Return the samples of an episode: each frame is one.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import spatial_replay as sr
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.formats.datasets import open_data_set
 from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, EpisodeReading
@@ -192,6 +193,14 @@ def test_episodes_go_by_number_and_keep_their_names(tmp_path: Path) -> None:
     columns = data_set.columns(10, AT_20_HZ)
     assert body(columns, "a", 0)[0] == 10
     assert columns.label is False
+
+
+def test_bodies_without_shapes_are_points_with_a_remark(tmp_path: Path) -> None:
+    path = isaac(tmp_path / "set.hdf5", {"cup": [IDENTITY], "tray": [IDENTITY]})
+    bodies = tmp_path / "bodies.yaml"
+    bodies.write_text("fps: 20\nshapes: {tray: {box: [0.4, 0.3]}}\n")
+    (remark,) = sr.replay_log(f"{path}#0", "cup enclosedin tray", mapping=str(bodies)).remarks
+    assert "cup is a point without a shape in the data; give it by `shapes: {cup: …}`" in str(remark)
 
 
 # ------------------------------------------------------------------------------------- labels and runs

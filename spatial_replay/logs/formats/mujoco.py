@@ -97,21 +97,19 @@ class SceneModel:
         self.names = tuple(self._bodies)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        geoms = {name: self._geoms_of(body, data) for name, body in self._bodies.items()}
-        self._geoms = {name: counting or () for name, counting in geoms.items()}
-        shapeless = [name for name, counting in geoms.items() if counting is None]
+        self._geoms = {name: self._geoms_of(body, data) for name, body in self._bodies.items()}
         mocap = [model.body(body).name for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
-        self.remarks = (*remarks, *_remarks(shapeless, mocap))
+        self.remarks = (*remarks, *_remarks(mocap))
 
-    def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...] | None:
-        """Return the geoms that count for a body's footprint; None if one of them has lost its mesh."""
+    def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...]:
+        """Return the geoms that count for a body's footprint; none if one of them has lost its mesh."""
         model, kinds = self._model, self._mujoco.mjtGeom
         indices = np.flatnonzero(model.body_weldid[model.geom_bodyid] == body)
         indices = indices[~np.isin(model.geom_type[indices], (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD))]
         collides = (model.geom_contype[indices] != 0) | (model.geom_conaffinity[indices] != 0)
         counting = (indices[collides] if collides.any() else indices).tolist()
         if any(model.geom(index).name.startswith(_LOST) for index in counting):
-            return None
+            return ()
         turn = data.xmat[body].reshape(3, 3).T
         return tuple(
             _Geom(
@@ -191,12 +189,7 @@ class SceneModel:
         return positions, quaternions
 
 
-def _remarks(shapeless: Sequence[str], mocap: Sequence[str]) -> Iterator[str]:
-    for name in shapeless:
-        yield (
-            f"{name} is a point, because its mesh is not in the data; give the folder of meshes by `assets:`,"
-            f" or its shape: `shapes: {{{name}: …}}`"
-        )
+def _remarks(mocap: Sequence[str]) -> Iterator[str]:
     if mocap:
         yield (
             f"mocap bodies are not in the states of the model: {', '.join(mocap)}; name such goals by"
