@@ -138,12 +138,12 @@ def definitions_from_msg(text: str, type_name: str) -> Definitions:
         LogError: a line that is not a field, a malformed name.
     """
     sections = list(iter_sections(text, type_name))
-    known = {name for name, _ in sections}
-    found: dict[str, tuple[Field, ...]] = {}
+    section_names = {name for name, _ in sections}
+    fields_by_type: dict[str, tuple[Field, ...]] = {}
     for name, body in sections:
-        if name not in found:
-            found[name] = tuple(_iter_fields(body, name, known))
-    return found
+        if name not in fields_by_type:
+            fields_by_type[name] = tuple(_iter_fields(body, name, section_names))
+    return fields_by_type
 
 
 def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
@@ -178,28 +178,28 @@ def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
         bare = _ANNOTATIONS.sub("", line.partition("#")[0])
         if not bare.strip():
             continue
-        found = _FIELD.fullmatch(bare)
-        if found is None:
+        field_match = _FIELD.fullmatch(bare)
+        if field_match is None:
             raise LogError(
                 f"the definition of {owner!r}, line {number}: {line.strip()!r:.100} is not a field"
             )
-        if found["rest"].startswith("="):
+        if field_match["rest"].startswith("="):
             continue
-        limit, longest = found["limit"] or "", int(found["longest"] or 0)
-        kind: Kind = "scalar" if not found["brackets"] else "array" if limit.isdigit() else "sequence"
-        type_name = _resolved(found["type"], owner, known)
-        yield Field(found["name"], type_name, kind, int(limit.removeprefix("<=") or 0), longest)
+        limit, longest = field_match["limit"] or "", int(field_match["longest"] or 0)
+        kind: Kind = "scalar" if not field_match["brackets"] else "array" if limit.isdigit() else "sequence"
+        type_name = _resolve(field_match["type"], owner, known)
+        yield Field(field_match["name"], type_name, kind, int(limit.removeprefix("<=") or 0), longest)
 
 
-def _resolved(name: str, owner: str, known: set[str]) -> str:
+def _resolve(name: str, owner: str, known: set[str]) -> str:
     if name in BASE_BYTES or name in _NOT_READ:
         return name
     if name in _BUILT_IN:
         return _BUILT_IN[name]
     if "/" in name:
         return full_type_name(name)
-    own = f"{owner.rpartition('/')[0]}/{name}"
-    return "std_msgs/msg/Header" if name == "Header" and own not in known else own
+    neighbour = f"{owner.rpartition('/')[0]}/{name}"
+    return "std_msgs/msg/Header" if name == "Header" and neighbour not in known else neighbour
 
 
 def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: int) -> Definitions:
@@ -242,8 +242,8 @@ class _Walk:
         self.used[checked_type_name(name)] = fields
         _check_field_names(name, fields)
         values = least = 0
-        for each in fields:
-            field_values, field_least = self._field(each, name, (*above, name))
+        for member in fields:
+            field_values, field_least = self._field(member, name, (*above, name))
             values += field_values
             least += field_least
         if values > MOST_VALUES:
@@ -277,12 +277,12 @@ class _Walk:
 
 def _check_field_names(name: str, fields: tuple[Field, ...]) -> None:
     seen: set[str] = set()
-    for each in fields:
-        if len(each.name) > 256 or not _NAME.fullmatch(each.name):
-            raise LogError(f"{each.name!r:.100} is not a name of a field; it is in {name!r}")
-        if each.name in seen:
-            raise LogError(f"the type {name!r} has two fields {each.name!r}")
-        seen.add(each.name)
+    for member in fields:
+        if len(member.name) > 256 or not _NAME.fullmatch(member.name):
+            raise LogError(f"{member.name!r:.100} is not a name of a field; it is in {name!r}")
+        if member.name in seen:
+            raise LogError(f"the type {name!r} has two fields {member.name!r}")
+        seen.add(member.name)
 
 
 def _used_by(above: tuple[str, ...]) -> str:
@@ -295,11 +295,11 @@ def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
     for name in sorted(definitions, key=lambda name: name != type_name):
         if name != type_name:
             lines += ["=" * 80, f"MSG: {name.replace('/msg/', '/')}"]
-        lines += [f"{_written(field)} {field.name}" for field in definitions[name]]
+        lines += [f"{_field_text(field)} {field.name}" for field in definitions[name]]
     return "".join(f"{line}\n" for line in lines)
 
 
-def _written(field: Field) -> str:
+def _field_text(field: Field) -> str:
     name = field.type.replace("/msg/", "/") + (f"<={field.longest}" if field.longest else "")
     match field.kind:
         case "scalar":
@@ -351,17 +351,21 @@ def ros_definitions(
         )
     checked_type_name(type_name)
     if schema is None or not schema.data.strip():
-        found = [
+        definitions = [
             check_definitions(standard, type_name, empty_bytes=empty_bytes)
             for standard in _standards(encoding, distribution)
             if type_name in standard
         ]
-        if not found:
+        if not definitions:
             raise LogError(f"the log has no definition of {type_name!r}, which is not a standard ROS type")
-        return tuple(each for index, each in enumerate(found) if each not in found[:index])
-    own = _parsed(type_name, schema)
+        return tuple(
+            definition
+            for index, definition in enumerate(definitions)
+            if definition not in definitions[:index]
+        )
+    from_schema = _parse(type_name, schema)
     standard = next(iter(_standards(encoding, distribution)))
-    return (check_definitions({**standard, **own}, type_name, empty_bytes=empty_bytes),)
+    return (check_definitions({**standard, **from_schema}, type_name, empty_bytes=empty_bytes),)
 
 
 @lru_cache(64)
@@ -383,7 +387,7 @@ def _decoder(type_name: str, encoding: RosEncoding, definitions: Definitions) ->
 
     try:
         store = get_typestore(Stores.EMPTY)
-        store.register(_described(definitions, store))
+        store.register(_describe(definitions, store))
         store.get_msgdef(type_name)
     # rosbags raises errors of many undocumented types if it cannot generate code
     except Exception as error:
@@ -443,7 +447,7 @@ def _reason(error: Exception) -> str:
     return f"{error!s:.200}" or type(error).__name__
 
 
-def _parsed(type_name: str, schema: Schema) -> Definitions:
+def _parse(type_name: str, schema: Schema) -> Definitions:
     try:
         text = schema.data.decode()
     except UnicodeDecodeError:
@@ -452,24 +456,27 @@ def _parsed(type_name: str, schema: Schema) -> Definitions:
         return definitions_from_msg(text, type_name)
     if schema.encoding == "ros2idl":
         return _from_idl(text, type_name)
-    known = "ros1msg, ros2msg and ros2idl are read"
-    raise LogError(f"the definition of {type_name!r} is in {schema.encoding!r:.100}; {known}")
+    readable = "ros1msg, ros2msg and ros2idl are read"
+    raise LogError(f"the definition of {type_name!r} is in {schema.encoding!r:.100}; {readable}")
 
 
 def _from_idl(text: str, type_name: str) -> Definitions:
     from rosbags.typesys import get_types_from_idl
 
     _check_idl(text, type_name)
-    found: dict[str, tuple[Field, ...]] = {}
+    fields_by_type: dict[str, tuple[Field, ...]] = {}
     try:
         for _, body in iter_sections(text, type_name):
-            found |= _fields(get_types_from_idl(body))
+            fields_by_type |= _fields(get_types_from_idl(body))
     except LogError:
         raise
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be read: {_reason(error)}") from None
     enums = {*_IDL_ENUM.findall(_IDL_ASIDE.sub(" ", text))}
-    return {name: tuple(_without_enum(field, found, enums) for field in own) for name, own in found.items()}
+    return {
+        name: tuple(_without_enum(field, fields_by_type, enums) for field in fields)
+        for name, fields in fields_by_type.items()
+    }
 
 
 def _without_enum(field: Field, known: Definitions, enums: Collection[str]) -> Field:
@@ -535,7 +542,7 @@ def _field(name: str, description: FieldDesc) -> Field:
     return Field(name, type_name, kind or "scalar", size, longest)
 
 
-def _described(definitions: Definitions, store: Typestore) -> Typesdict:
+def _describe(definitions: Definitions, store: Typestore) -> Typesdict:
     """Describe the types that a store does not know yet, in the form of rosbags."""
     return {
         name: ([], [(field.name, _description(field)) for field in fields])
@@ -622,7 +629,7 @@ def same_definition(one: Topic, other: Topic) -> bool:
     if one.encoding not in ("ros1", "cdr"):
         return False
     try:
-        definitions = [ros_definitions(each.type, each.encoding, each.schema) for each in (one, other)]
+        definitions = [ros_definitions(topic.type, topic.encoding, topic.schema) for topic in (one, other)]
     except LogError:
         return False
     return definitions[0] == definitions[1]
@@ -643,11 +650,11 @@ def _protobuf_decoder(type_name: str, message_class: type[Message]) -> Decoder:
 @lru_cache(64)
 def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
     if schema is None or schema.encoding != "protobuf":
-        given = "missing" if schema is None else f"in {schema.encoding!r:.100}"
-        raise LogError(f"the definition of {type_name!r:.100} is {given}; protobuf needs a descriptor set")
+        place = "missing" if schema is None else f"in {schema.encoding!r:.100}"
+        raise LogError(f"the definition of {type_name!r:.100} is {place}; protobuf needs a descriptor set")
     pool = DescriptorPool()
     try:
-        for file in _in_order(_with_well_known(FileDescriptorSet.FromString(schema.data))):
+        for file in _in_order(_add_well_known_types(FileDescriptorSet.FromString(schema.data))):
             pool.AddSerializedFile(file.SerializeToString())
         return GetMessageClass(pool.FindMessageTypeByName(type_name))
     # descriptors that contradict themselves or each other end in TypeError, and names without one in KeyError
@@ -655,10 +662,10 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
         raise LogError(f"the definition of {type_name!r:.100} cannot be used: {_reason(error)}") from None
 
 
-def _with_well_known(described: FileDescriptorSet) -> FileDescriptorSet:
+def _add_well_known_types(described: FileDescriptorSet) -> FileDescriptorSet:
     """Add the files of well-known types, such as timestamps, that a set imports without having them."""
-    own = {file.name for file in described.file}
-    imported = {name for file in described.file for name in file.dependency} - own
+    file_names = {file.name for file in described.file}
+    imported = {name for file in described.file for name in file.dependency} - file_names
     for module in _WELL_KNOWN:
         if module.DESCRIPTOR.name in imported:
             module.DESCRIPTOR.CopyToProto(described.file.add())
@@ -670,7 +677,9 @@ def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
     if len(described.file) > _MOST_FILES:
         raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
     files = {file.name: file for file in described.file}
-    imports = {name: [each for each in file.dependency if each in files] for name, file in files.items()}
+    imports = {
+        name: [imported for imported in file.dependency if imported in files] for name, file in files.items()
+    }
     try:
         return [files[name] for name in TopologicalSorter(imports).static_order()]
     except CycleError as error:
@@ -693,7 +702,7 @@ def topics_by_name(described: Iterable[Topic], distribution: str | None = None) 
     named: dict[str, Topic] = {}
     for topic in described:
         before = named.get(topic.name)
-        named[topic.name] = topic if before is None else _joined(before, topic)
+        named[topic.name] = topic if before is None else _join(before, topic)
     return tuple(
         topic if topic.unreadable else replace(topic, unreadable=why_unreadable(topic, distribution))
         for _, topic in sorted(named.items())
@@ -733,11 +742,11 @@ def channel_of(topic: Topic, distribution: str | None = None) -> Channel:
     return Channel(topic.name, topic.encoding, schema, topic.metadata)
 
 
-def _joined(one: Topic, other: Topic) -> Topic:
-    known = None not in (one.count, other.count)
+def _join(one: Topic, other: Topic) -> Topic:
+    has_counts = None not in (one.count, other.count)
     joined = replace(
         one,
-        count=(one.count or 0) + (other.count or 0) if known else None,
+        count=(one.count or 0) + (other.count or 0) if has_counts else None,
         latched=one.latched or other.latched,
         schema=one.schema or other.schema,
     )

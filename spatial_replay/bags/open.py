@@ -112,13 +112,13 @@ class McapLog(MessageReader):
         return min((place.start_ns for place in self._directory.chunks), default=None)
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        directory, wanted = self._directory, self._wanted(topics)
+        directory, channel_numbers = self._directory, self._channel_numbers(topics)
         places = [
             (rank, place)
             for rank, place in enumerate(directory.chunks)
             if place.start_ns < last
             and place.end_ns >= first
-            and (place.channels is None or not place.channels.isdisjoint(wanted))
+            and (place.channels is None or not place.channels.isdisjoint(channel_numbers))
         ]
         if not as_recorded:
             places.sort(key=lambda ranked: ranked[1].start_ns)
@@ -129,12 +129,12 @@ class McapLog(MessageReader):
             statistics = directory.statistics
             # where the log counts no channels, all messages are compared with its total
             is_total = statistics is not None and not statistics.channel_message_counts
-            found = walk.iter_messages(
+            messages_of_places = walk.iter_messages(
                 [place for _, place in places], lambda topic: is_total or topic in topics
             )
             contents = (
-                self._columns(rank, place, messages, wanted, first, last)
-                for (rank, _), (place, messages) in zip(places, found, strict=True)
+                self._columns(rank, place, messages, channel_numbers, first, last)
+                for (rank, _), (place, messages) in zip(places, messages_of_places, strict=True)
             )
             if as_recorded:
                 yield from contents
@@ -142,8 +142,8 @@ class McapLog(MessageReader):
             most = most_waiting(place.length for _, place in places)
             yield from in_order([place.start_ns for _, place in places], contents, self.name, most)
 
-    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
-        yield from super()._counted(columns, topics, name)
+    def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+        yield from super()._count(columns, topics, name)
         statistics = self._directory.statistics
         # without counts of channels, the total is all there is to compare
         if statistics and not statistics.channel_message_counts and self._walked_all:
@@ -172,9 +172,9 @@ class McapLog(MessageReader):
             self._faults.add(f"{self.name}: {what} in the index")
         times = messages.log_time_ns
         rows = np.flatnonzero(np.isin(messages.channel, wanted) & (times >= first) & (times < last))
-        chosen = select(messages, rows)
-        both_ns = chosen.log_time_ns, chosen.publish_time_ns
-        return self._made(chosen.channel, both_ns, chosen.sequence, chosen.payloads, places_in(rank, rows))
+        read = select(messages, rows)
+        both_ns = read.log_time_ns, read.publish_time_ns
+        return self._make_columns(read.channel, both_ns, read.sequence, read.payloads, places_in(rank, rows))
 
 
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -192,10 +192,10 @@ def files_of_bag_around(path: Path) -> tuple[str, ...]:
     """Return the names of all files of the bag that a file is in; none where no metadata lists it."""
     try:
         with path.with_name(BAG_METADATA).open("rb") as stream:
-            listed = bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1)).files
+            files = bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1)).files
     except (OSError, LogError):
         return ()
-    return listed if path.name in listed else ()
+    return files if path.name in files else ()
 
 
 class BagFolder(MessageReader):
@@ -221,18 +221,18 @@ class BagFolder(MessageReader):
     @cached_property
     def _files(self) -> tuple[_File, ...]:
         present = sorted(
-            (each.name for each in self._path.iterdir() if each.name.endswith(_ENDINGS)), key=_rank
+            (entry.name for entry in self._path.iterdir() if entry.name.endswith(_ENDINGS)), key=_rank
         )
-        listed = self._metadata.files if self._metadata else tuple(present)
-        for name in listed:
+        names = self._metadata.files if self._metadata else tuple(present)
+        for name in names:
             if not (self._path / name).is_file():
                 self._faults.add(f"{self.name}: its file {name!r} is missing; what it holds is lost")
-        for name in sorted(set(present) - set(listed)):
+        for name in sorted(set(present) - set(names)):
             self._remarks.add(
                 f"{self.name}: the file {name!r} is not listed in {BAG_METADATA}; it was not read"
             )
-        opened = [self._opened(self._path / name) for name in listed if (self._path / name).is_file()]
-        files = tuple(each for each in opened if each is not None)
+        opened = [self._open(self._path / name) for name in names if (self._path / name).is_file()]
+        files = tuple(file for file in opened if file is not None)
         if not files:
             reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap file")
             raise LogError(f"{self.name} is not a ROS 2 bag that can be read: {reason}")
@@ -267,8 +267,8 @@ class BagFolder(MessageReader):
             )
             for name in missing
         ]
-        known = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
-        return tuple(sorted([*known, *absent], key=lambda topic: topic.name))
+        counted_topics = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
+        return tuple(sorted([*counted_topics, *absent], key=lambda topic: topic.name))
 
     @property
     def start_ns(self) -> int | None:
@@ -284,22 +284,27 @@ class BagFolder(MessageReader):
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         def read(number: int, file: _File) -> Columns:
-            for each in file.iter_columns(topics, first, last, as_recorded=as_recorded):
+            for columns_of_file in file.iter_columns(topics, first, last, as_recorded=as_recorded):
                 place, first_channel = np.int64(number) << 48, self._first_channels[number]
-                channel = first_channel + each.channel
-                yield replace(each, channels=self._channels, channel=channel, place=place + each.place)
+                channel = first_channel + columns_of_file.channel
+                yield replace(
+                    columns_of_file,
+                    channels=self._channels,
+                    channel=channel,
+                    place=place + columns_of_file.place,
+                )
 
         reads = [partial(read, number, file) for number, file in enumerate(self._files)]
         if as_recorded or len(reads) == 1:
-            columns: Columns = (each for open_file in reads for each in open_file())
+            columns: Columns = (columns_of_file for open_file in reads for columns_of_file in open_file())
         else:
             pairs = zip(self._files, reads, strict=True)
             columns = merged((file.start_ns or 0, open_file) for file, open_file in pairs)
         if self._metadata and self._metadata.compression == "message":
-            return self._all_unpacked(columns)
+            return self._unpack_all(columns)
         return columns
 
-    def _all_unpacked(self, columns: Columns) -> Columns:
+    def _unpack_all(self, columns: Columns) -> Columns:
         """Decompress messages; a topic with messages that are plain is remarked once."""
         plain = set[str]()
         for packed in columns:
@@ -308,7 +313,7 @@ class BagFolder(MessageReader):
             for number, payload in enumerate(packed.payloads, 1):
                 size += unpacked_size(payload)
                 if size >= _MOST_UNPACKED or number == len(packed):
-                    yield self._unpacked(select(packed, slice(begin, number)), plain)
+                    yield self._unpack(select(packed, slice(begin, number)), plain)
                     begin, size = number, 0
 
     @cached_property
@@ -316,17 +321,17 @@ class BagFolder(MessageReader):
         return dict(enumerate(channel for file in self._files for channel in file._channels.values()))
 
     def attachments(self) -> tuple[Attachment, ...]:
-        return tuple(each for file in self._files for each in file.attachments())
+        return tuple(attachment for file in self._files for attachment in file.attachments())
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        return tuple(each for file in self._files for each in file.metadata())
+        return tuple(record for file in self._files for record in file.metadata())
 
     @cached_property
     def _first_channels(self) -> tuple[int, ...]:
         """The number of the first channel of each file."""
         return tuple(accumulate((len(file._channels) for file in self._files[:-1]), initial=0))
 
-    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+    def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         if self._metadata is None:
             # each file compares its own counts
             return columns
@@ -339,9 +344,9 @@ class BagFolder(MessageReader):
                     f"{name}: it declares messages of {type_name!r:.100} on {topic.name!r}; they are of"
                     f" {topic.type!r}"
                 )
-        return super()._counted(columns, topics, name)
+        return super()._count(columns, topics, name)
 
-    def _opened(self, path: Path) -> _File | None:
+    def _open(self, path: Path) -> _File | None:
         """Open a file by its content; None, and a fault, where nothing in it can be read."""
         try:
             with path.open("rb") as stream:
@@ -350,7 +355,7 @@ class BagFolder(MessageReader):
                 unpacked_file, damage = unpack_file(path, self._unpacked_files)
                 if damage:
                     self._faults.add(f"{self.name}: {damage}")
-                return self._opened(unpacked_file)
+                return self._open(unpacked_file)
         except OSError as error:
             raise MissingFileError.of(path, error) from None
         except LogError as error:
@@ -363,7 +368,7 @@ class BagFolder(MessageReader):
         self._faults.add(f"{self.name}: {path.name!r} is neither SQLite nor MCAP; what it holds is lost")
         return None
 
-    def _unpacked(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
+    def _unpack(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
         payloads: list[bytes] = []
         places: list[int] = []
         lost: dict[str, list[Sentence]] = {}

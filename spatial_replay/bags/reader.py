@@ -82,8 +82,8 @@ class MessageColumns(Messages):
     def messages(self) -> list[Message]:
         """Return the messages one by one."""
         return [
-            Message(topic, each.log_time_ns, each.publish_time_ns, each.sequence, each.payload)
-            for topic, each in zip(self.topics, self.rows(), strict=True)
+            Message(topic, row.log_time_ns, row.publish_time_ns, row.sequence, row.payload)
+            for topic, row in zip(self.topics, self.rows(), strict=True)
         ]
 
 
@@ -92,9 +92,9 @@ Columns: TypeAlias = Iterator[MessageColumns]
 
 def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
     """Yield the same messages, at most `size` at a time."""
-    for each in columns:
-        for begin in range(0, len(each), size):
-            yield select(each, slice(begin, begin + size))
+    for message_columns in columns:
+        for begin in range(0, len(message_columns), size):
+            yield select(message_columns, slice(begin, begin + size))
 
 
 def places_in(part: int, within: Integers) -> Integers:
@@ -155,7 +155,7 @@ def merged(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
         if not active:
             continue
         _, number, columns, following = heapq.heappop(active)
-        limits = [start_ns for start_ns, _ in waiting[-1:]] + [each[0] for each in active[:1]]
+        limits = [start_ns for start_ns, _ in waiting[-1:]] + [entry[0] for entry in active[:1]]
         # equal times come in the order of the files
         ready = columns.count_before(min(limits) + 1) if limits else len(columns)
         yield select(columns, slice(ready))
@@ -197,20 +197,21 @@ def without_jumps(
     first_ns: int | None = None
     # logs put together topic by topic are in order all the same, so each topic counts by itself
     topics = dict[str, _Recorded]()
-    for each in columns:
-        first_ns = int(each.log_time_ns[0]) if first_ns is None and len(each) else first_ns
-        for topic, rows in each.by_topic():
+    for message_columns in columns:
+        if first_ns is None and len(message_columns):
+            first_ns = int(message_columns.log_time_ns[0])
+        for topic, rows in message_columns.by_topic():
             if topic not in checked:
                 continue
             recorded = topics.setdefault(topic, _Recorded(disorder_ns))
-            jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
+            jump = recorded.first_jump(message_columns.log_time_ns[rows], message_columns.place[rows])
             if jump is not None:
-                at = Instant(int(each.log_time_ns[rows][jump]), first_ns or 0)
+                at = Instant(int(message_columns.log_time_ns[rows][jump]), first_ns or 0)
                 raise LogError(
                     f"{name}: time jumps back: the message on {topic!r} logged at {at} was recorded before"
                     f" others that were logged more than {disorder_ns / 1e9:g} s earlier; {JUMP_REMEDY}"
                 )
-        yield each
+        yield message_columns
 
 
 class _Recorded:
@@ -294,11 +295,11 @@ class MessageReader(ABC):
         """The channels, by dense numbers."""
         return {rank: self._declared[number] for rank, number in enumerate(self._numbers.tolist())}
 
-    def _wanted(self, topics: Collection[str]) -> list[int]:
+    def _channel_numbers(self, topics: Collection[str]) -> list[int]:
         """Return the numbers that the log gives the channels of some topics."""
         return [number for number, channel in self._declared.items() if channel.topic in topics]
 
-    def _made(
+    def _make_columns(
         self,
         numbers: Integers,
         times_ns: tuple[Integers, Integers],
@@ -351,7 +352,7 @@ class MessageReader(ABC):
             LogError: the topic's definition is missing or cannot be understood.
         """
         if isinstance(topic, str):
-            topic = next(each for each in self._topics if each.name == topic)
+            topic = next(candidate for candidate in self._topics if candidate.name == topic)
         return decoder_of(topic, self._distribution)
 
     def iter_messages(
@@ -383,7 +384,7 @@ class MessageReader(ABC):
         """
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
         columns = self._read(topics, first, last, as_recorded=as_recorded)
-        yield from self._counted(columns, topics) if (first, last) == (0, LATEST_NS + 1) else columns
+        yield from self._count(columns, topics) if (first, last) == (0, LATEST_NS + 1) else columns
 
     def take_faults(self) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place, on the topics that were read."""
@@ -405,14 +406,14 @@ class MessageReader(ABC):
         for part in self._parts:
             part.move_faults(self._faults)
 
-    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+    def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         """Yield all messages of some topics, then compare their number with what the log declares."""
         read = Counter[str]()
-        for each in columns:
-            read.update(each.topics)
-            yield each
+        for message_columns in columns:
+            read.update(message_columns.topics)
+            yield message_columns
         for topic in self._topics:
-            found = read[topic.name]
-            if topic.name in topics and topic.count not in (None, found):
+            count = read[topic.name]
+            if topic.name in topics and topic.count not in (None, count):
                 declared = f"it declares {topic.count} messages on {topic.name!r}"
-                self._faults.add(f"{name or self.name}: {declared}; {found} could be read")
+                self._faults.add(f"{name or self.name}: {declared}; {count} could be read")

@@ -313,7 +313,9 @@ def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
     declared = number(head.fields, "conn_count"), number(head.fields, "chunk_count")
     if declared != (len(directory.connections), len(directory.chunks)):
         raise DamageError("the index does not hold as many connections and chunks as the bag's header says")
-    unknown = {each for chunk in directory.chunks for each in chunk.counts or {}} - set(directory.connections)
+    unknown = {connection for chunk in directory.chunks for connection in chunk.counts or {}} - set(
+        directory.connections
+    )
     if unknown:
         raise DamageError(f"the index counts messages of a connection {min(unknown)} that it does not have")
     directory.chunks.sort(key=lambda chunk: chunk.offset)
@@ -443,16 +445,16 @@ class _Scan:
         while position < self._size:
             self._stream.seek(position)
             window = self._stream.read(_STRIDE + overlap)
-            found = window.find(_CHUNK_MARK)
-            while found >= 0:
+            mark = window.find(_CHUNK_MARK)
+            while mark >= 0:
                 self._marks += 1
                 if self._marks > _MOST_MARKS:
                     return None
-                for begin in (found - before for before in reversed(_BEFORE_MARK)):
+                for begin in (mark - before for before in reversed(_BEFORE_MARK)):
                     length = int.from_bytes(window[max(0, begin) : max(0, begin) + 4], "little")
                     if begin >= 0 and length in _CHUNK_HEAD_BYTES and self._is_chunk(position + begin):
                         return position + begin
-                found = window.find(_CHUNK_MARK, found + 1)
+                mark = window.find(_CHUNK_MARK, mark + 1)
             position += _STRIDE
         return None
 
@@ -485,7 +487,8 @@ class Ros1Bag(MessageReader):
         for chunk in self._directory.chunks:
             counts.update(chunk.counts or {})
         return topics_by_name(
-            self._topic(each, counts[each.number]) for each in self._directory.connections.values()
+            self._topic(connection, counts[connection.number])
+            for connection in self._directory.connections.values()
         )
 
     @property
@@ -494,20 +497,22 @@ class Ros1Bag(MessageReader):
         return min((chunk.start_ns for chunk in self._directory.chunks), default=None)
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        wanted = {number: self._directory.connections[number] for number in self._wanted(topics)}
+        connections = {
+            number: self._directory.connections[number] for number in self._channel_numbers(topics)
+        }
         chunks = [
             (rank, chunk)
             for rank, chunk in enumerate(self._directory.chunks)
             if chunk.start_ns < last
             and chunk.end_ns >= first
-            and (chunk.counts is None or not wanted.keys().isdisjoint(chunk.counts))
+            and (chunk.counts is None or not connections.keys().isdisjoint(chunk.counts))
         ]
         if not as_recorded:
             chunks.sort(key=lambda ranked: ranked[1].start_ns)
             if self._is_in_parts:
                 chunks = [(rank, chunk) for rank, (_, chunk) in enumerate(chunks)]
         with self._path.open("rb") as stream:
-            contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
+            contents = (self._messages(stream, *ranked, connections, first, last) for ranked in chunks)
             if as_recorded:
                 yield from contents
                 return
@@ -521,12 +526,12 @@ class Ros1Bag(MessageReader):
         Bags are played by their index, and tools that merge or repair them write chunks in any order.
         """
         ordered = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
-        return all(one.end_ns <= other.start_ns for one, other in pairwise(ordered))
+        return all(before.end_ns <= after.start_ns for before, after in pairwise(ordered))
 
     @cached_property
     def _declared(self) -> Mapping[int, Channel]:
         connections = self._directory.connections
-        return {number: channel_of(self._topic(each, 0)) for number, each in connections.items()}
+        return {number: channel_of(self._topic(connection, 0)) for number, connection in connections.items()}
 
     def _messages(
         self,
@@ -562,18 +567,18 @@ class Ros1Bag(MessageReader):
         payloads = [content[begin:end] for begin, end in bounds]
         numbers = table.connection[rows].tolist()
         # a header begins with the number that its publisher has given it; those of two mean nothing together
-        publishers = Counter(each.topic for each in wanted.values())
+        publishers = Counter(connection.topic for connection in wanted.values())
         headed = {
             number
-            for number, each in wanted.items()
-            if publishers[each.topic] == 1 and each.begins_with_header
+            for number, connection in wanted.items()
+            if publishers[connection.topic] == 1 and connection.begins_with_header
         }
         sequence = [
             int.from_bytes(payload[:4], "little") if number in headed else 0
             for number, payload in zip(numbers, payloads, strict=True)
         ]
         times_ns = table.time_ns[rows]
-        return self._made(
+        return self._make_columns(
             table.connection[rows],
             (times_ns, times_ns),
             np.array(sequence, np.int64),

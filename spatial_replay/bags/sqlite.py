@@ -80,11 +80,11 @@ def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
     about = document.get("rosbag2_bagfile_information", document) if isinstance(document, dict) else None
     if not isinstance(about, dict):
         raise LogError("it does not describe a bag; it has no 'rosbag2_bagfile_information'")
-    topics = [_metadata_topic(each) for each in _list(about, "topics_with_message_count")]
-    files = [_text(each, "relative_file_paths") for each in _list(about, "relative_file_paths")]
+    topics = [_metadata_topic(entry) for entry in _list(about, "topics_with_message_count")]
+    files = [_text(entry, "relative_file_paths") for entry in _list(about, "relative_file_paths")]
     distribution = about.get("ros_distro")
     return BagMetadata(
-        files=tuple(dict.fromkeys(_base_name(each) for each in files)),
+        files=tuple(dict.fromkeys(_base_name(file) for file in files)),
         types={name: type_name for name, type_name, _ in topics},
         counts={name: count for name, _, count in topics},
         compression=_compression(about),
@@ -201,17 +201,17 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
     most = packed.stat().st_size * MOST_TIMES_LARGER + ALWAYS_ALLOWED
     free = shutil.disk_usage(folder).free
     room = free - min(_LEFT_FREE, free // 10)
-    written = 0
+    size = 0
     damage = "breaks off"
     try:
         with packed.open("rb") as source, open_output(target) as sink:
-            for piece, is_between in _decompressed(source):
-                written += len(piece)
-                if written > most:
+            for piece, is_between in _decompress(source):
+                size += len(piece)
+                if size > most:
                     raise LogError(
                         f"{packed.name} decompresses to more than {most} bytes; no recorder writes that"
                     )
-                if written > room:
+                if size > room:
                     raise OutputError(
                         f"{packed.name} decompresses to more than fits in {folder.parent};"
                         " set TMPDIR to a folder with more room"
@@ -220,12 +220,12 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
                 damage = "" if is_between else "breaks off"
     except zstandard.ZstdError as error:
         damage = f"does not decompress to its end ({error})"
-    if not written:
+    if not size:
         raise LogError(f"{packed.name} {damage or 'is empty'}; nothing in it can be decompressed")
-    return target, f"{packed.name} {damage}; {written} bytes could be decompressed" if damage else ""
+    return target, f"{packed.name} {damage}; {size} bytes could be decompressed" if damage else ""
 
 
-def _decompressed(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
+def _decompress(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
     """Yield what the frames of a file decompress to, and whether the last frame so far is whole."""
     frame, rest = None, b""
     while piece := rest or source.read(_PACKED_PIECE):
@@ -303,7 +303,7 @@ class SqliteBag(MessageReader):
         if not log.is_file() or not log.stat().st_size:
             return self._path
         folder = temporary_folder(self)
-        copy, _ = (copy_beginning(each, each.stat().st_size, folder) for each in (self._path, log))
+        copy, _ = (copy_beginning(file, file.stat().st_size, folder) for file in (self._path, log))
         most = copy.stat().st_size + log.stat().st_size
         try:
             # in a folder of its own: nothing but the copies is read or written
@@ -363,13 +363,13 @@ class SqliteBag(MessageReader):
 
     @cached_property
     def _declared(self) -> Mapping[int, Channel]:
-        return {number: channel_of(each, self._distribution) for number, each in self._described.items()}
+        return {number: channel_of(topic, self._distribution) for number, topic in self._described.items()}
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        wanted = self._wanted(topics)
+        topic_numbers = self._channel_numbers(topics)
         query = (
             "SELECT rowid, topic_id, timestamp, data FROM messages"
-            f" WHERE topic_id IN ({', '.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
+            f" WHERE topic_id IN ({', '.join('?' * len(topic_numbers))}) AND timestamp BETWEEN ? AND ?"
             f" ORDER BY {'rowid' if as_recorded else 'timestamp, rowid'}"
         )
 
@@ -379,8 +379,8 @@ class SqliteBag(MessageReader):
         after = (-1, -1)
         with _opened(self._whole) as database:
             try:
-                found = database.execute(query, (*sorted(wanted), first, last - 1))
-                for rows in self._sound(_batches(found)):
+                cursor = database.execute(query, (*sorted(topic_numbers), first, last - 1))
+                for rows in self._sound(_batches(cursor)):
                     yield self._columns(rows)
                     after = key(rows[-1])
                 return
@@ -389,14 +389,18 @@ class SqliteBag(MessageReader):
         with _opened(self._whole) as database:
             intact, lost = _intact_rows(database)
             following = sorted(
-                (row for row in intact if row[1] in wanted and first <= row[2] < last and key(row) > after),
+                (
+                    row
+                    for row in intact
+                    if row[1] in topic_numbers and first <= row[2] < last and key(row) > after
+                ),
                 key=key,
             )
             for rows in self._sound(_batches(_contents(database, following, lost))):
                 yield self._columns(rows)
-        self._report_lost(damage, intact, lost)
+        self._report_losses(damage, intact, lost)
 
-    def _report_lost(self, damage: str, intact: Sequence[RowHead], lost: Collection[_Span]) -> None:
+    def _report_losses(self, damage: str, intact: Sequence[RowHead], lost: Collection[_Span]) -> None:
         """Report what a damaged database has lost, with the times of the messages around it."""
         damaged = f"{self.name}: the database is damaged ({damage})"
         spans = _joined_spans(lost)
@@ -427,8 +431,8 @@ class SqliteBag(MessageReader):
 
     def _columns(self, rows: Sequence[Row]) -> MessageColumns:
         *columns, payloads = zip(*rows, strict=True)
-        place, numbers, times_ns = (np.array(each, np.int64) for each in columns)
-        return self._made(numbers, (times_ns, times_ns), np.zeros_like(place), payloads, place)
+        place, numbers, times_ns = (np.array(column, np.int64) for column in columns)
+        return self._make_columns(numbers, (times_ns, times_ns), np.zeros_like(place), payloads, place)
 
 
 @contextmanager
@@ -450,10 +454,10 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             database.execute("PRAGMA writable_schema=ON")
             database.execute("PRAGMA trusted_schema=OFF")
             database.execute("PRAGMA cell_size_check=ON")
-            taken = count(1)
+            steps = count(1)
             most = 1_000 + size * _STEPS_A_BYTE // _STEPS
             # a damaged tree of pages may lead in circles
-            database.set_progress_handler(lambda: next(taken) > most, _STEPS)
+            database.set_progress_handler(lambda: next(steps) > most, _STEPS)
             yield database
     # names of columns come as text, whatever bytes they are
     except (sqlite3.Error, UnicodeDecodeError) as error:
@@ -536,7 +540,7 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
         " WHERE rowid BETWEEN ? AND ? ORDER BY rowid"
     )
     spans = deque([_all_ids(database)])
-    found: dict[int, RowHead] = {}
+    heads: dict[int, RowHead] = {}
     lost: set[_Span] = set()
     for _ in range(_MOST_PROBES):
         if not spans:
@@ -544,8 +548,8 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
         first, last = spans.popleft()
         try:
             for row in database.execute(query, (first, last)):
-                if all(type(each) is int for each in row):
-                    found[row[0]] = row
+                if all(type(cell) is int for cell in row):
+                    heads[row[0]] = row
                     first = max(first, row[0] + 1)
         except sqlite3.Error as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
@@ -556,7 +560,7 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
             spans.extend(halves)
             lost.update([] if halves else [(first, last)])
     lost.update(spans)
-    return sorted(found.values()), lost
+    return sorted(heads.values()), lost
 
 
 def _all_ids(database: sqlite3.Connection) -> _Span:
@@ -586,7 +590,7 @@ def _contents(database: sqlite3.Connection, heads: Sequence[RowHead], lost: set[
             )
         except sqlite3.Error as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
-                lost.update((each, each) for each, *_ in heads[place:])
+                lost.update((row_number, row_number) for row_number, *_ in heads[place:])
                 return
             lost.add((row_id, row_id))
 
