@@ -9,6 +9,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from glob import glob, has_magic
 from math import nan
 from os import PathLike
@@ -37,6 +38,7 @@ from spatial_replay.batch.workers import (
     no_progress,
 )
 from spatial_replay.errors import Diagnosis, SpatialReplayError, SpecificationError, UsageError
+from spatial_replay.logs.formats.datasets import DATA_SET_ENDINGS, data_set_address, open_data_set
 from spatial_replay.logs.remote import (
     BAG_METADATA,
     RemoteFile,
@@ -154,6 +156,8 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
             )
 
 
+_DATA_SET_FOLDERS: Final = frozenset({"meta", "data"})
+"""Folders of which each data set that is a folder has one."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 _TOGETHER: Final = 16
@@ -175,8 +179,8 @@ class FoundLog(NamedTuple):
 def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
     """Return the logs that patterns stand for, in their order, sorted within each; each log once.
 
-    A folder stands for all logs in it and below, a ROS 2 bag for itself; `s3://bucket/folder/` and patterns
-    of addresses for what the bucket lists.
+    A folder stands for all logs in it and below, a ROS 2 bag for itself, a data set for its episodes.
+    `s3://bucket/folder/` and patterns of addresses stand for what the bucket lists.
 
     Args:
         folder: what relative paths are relative to.
@@ -214,12 +218,18 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
             yield from _logs_in(path, folder)
         elif path.exists():
             # opening what is no regular file is the error of its row
+            yield from _episodes_in(path, folder) or [_found(path, folder)]
+        elif (address := data_set_address(path)) is not None:
+            data_set = open_data_set(address[0])
+            if data_set is not None:
+                data_set.episode(address[1])
             yield _found(path, folder)
         elif has_magic(text):
             for name in sorted(glob(text, root_dir=folder, recursive=True)):  # noqa: PTH207 - absolute ones, too
                 log = folder / name
-                if (log.exists() and not log.is_dir()) or (log / BAG_METADATA).is_file():
-                    yield _found(log, folder)
+                episodes = _episodes_in(log, folder)
+                if episodes or (log.exists() and not log.is_dir()) or (log / BAG_METADATA).is_file():
+                    yield from episodes or [_found(log, folder)]
     except (OSError, ValueError):
         # a name that cannot be one, such as one with a null character
         return
@@ -246,12 +256,34 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
             yield FoundLog(address, address)
 
 
+def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
+    """Return the episodes of a data set; none for anything else, and for one that cannot be opened.
+
+    To open that one is the error of its row.
+    """
+    try:
+        data_set = open_data_set(path)
+    except SpatialReplayError:
+        return []
+    whole = _found(path, folder)
+    episodes = () if data_set is None else data_set.episodes
+    return [
+        FoundLog(f"{whole.name}#{episode.number}", f"{whole.path}#{episode.number}") for episode in episodes
+    ]
+
+
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
-    """Yield the logs in a folder: bags, files with the ending of a log, and folders that cannot be read."""
+    """Yield the logs in a folder: bags, episodes of data sets, files with the ending of a log, and folders
+    that cannot be read.
+    """
     closed: list[OSError] = []
     for parent, folders, names in os.walk(path, onerror=closed.append):
         if BAG_METADATA in names:
             yield _found(Path(parent), folder)
+            folders.clear()
+            continue
+        if episodes := _episodes_in(Path(parent), folder) if _DATA_SET_FOLDERS & {*folders} else []:
+            yield from episodes
             folders.clear()
             continue
         # in the order of their names, and without hidden folders
@@ -262,6 +294,8 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
                 # as texts: paths would take most of the time
                 path_name = name if parent_log.name == "." else f"{parent_log.name}/{name}"
                 yield FoundLog(encodable(path_name), f"{parent_log.path}/{name}")
+            elif name.lower().endswith(DATA_SET_ENDINGS) and not name.startswith("."):
+                yield from _episodes_in(Path(parent) / name, folder)
     # to open one is the error of its row: a batch does not pass over logs in silence
     yield from (_found(Path(error.filename), folder) for error in closed)
 
@@ -327,7 +361,11 @@ def _identity(path: str) -> str | None:
 
 
 def _files_of(path: str) -> list[Path]:
-    """Return the files that a log consists of."""
+    """Return the files that a log consists of; of an episode, those with its numbers and its metadata."""
+    address = data_set_address(path)
+    data_set = None if address is None else open_data_set(address[0])
+    if address is not None and data_set is not None:
+        return data_set.files(address[1])
     whole = Path(path)
     return sorted(file for file in whole.iterdir() if file.is_file()) if whole.is_dir() else [whole]
 
@@ -340,29 +378,46 @@ def _state(path: str) -> str | None:
     """
     try:
         # not as paths, which take longer than asking the disk
-        files = map(str, _files_of(path)) if os.path.isdir(path) else [path]  # noqa: PTH112
-        states = [(os.path.realpath(each), os.stat(each)) for each in files]  # noqa: PTH116
-    except (OSError, ValueError):
+        number = _episode_of(path)
+        files = [path] if number is None and not os.path.isdir(path) else map(str, _files_of(path))  # noqa: PTH112
+        states = [(os.path.realpath(file), os.stat(file)) for file in files]  # noqa: PTH116
+    except (OSError, ValueError, SpatialReplayError):
         return None
     text = json.dumps(
         [
-            (name, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
-            for name, state in states
+            *([] if number is None else [number]),
+            *(
+                (name, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+                for name, state in states
+            ),
         ]
     )
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
+def _episode_of(path: str) -> int | None:
+    """Return the number in the address of an episode; None for any other log."""
+    address = data_set_address(path)
+    return None if address is None else address[1]
+
+
 def _hash_of_log(path: str) -> str:
-    files = _files_of(path)
+    files, number = _files_of(path), _episode_of(path)
     if Path(path).is_file():
         return _hash_of(files[0])
-    if not Path(path).is_dir():
+    if number is None and not Path(path).is_dir():
         raise OSError(f"{path} is no regular file")
     total = hashlib.sha256()
     for file in files:
-        total.update(f"{file.name}\0{_hash_of(file)}\0".encode("utf-8", "surrogatepass"))
-    return f"files:{total.hexdigest()}"
+        digest = _hash_of(file) if number is None else _cached_hash(file, file.stat().st_mtime_ns)
+        total.update(f"{file.name}\0{digest}\0".encode("utf-8", "surrogatepass"))
+    return f"files:{total.hexdigest()}" + ("" if number is None else f"#{number}")
+
+
+@lru_cache(maxsize=64)
+def _cached_hash(file: Path, state_ns: int) -> str:
+    """Return the hash of a file with many episodes, read once."""
+    return _hash_of(file)
 
 
 def _version_at(address: str) -> str:

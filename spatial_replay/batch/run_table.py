@@ -208,8 +208,8 @@ class FlakyResult:
         return f"{self.log}: {name} is flaky: {self.failed:,} of {self.runs:,} runs failed"
 
 
-RUN: Final = re.compile(r"#\d+(?=[./]|$)")
-"""The number of a run in the name of its log: "cross#2.mcap"."""
+RUN: Final = re.compile(r"#\d+(?=[./])")
+"""The number of a run in the name of its log: "cross#2.mcap". At the end, it is that of an episode."""
 
 
 def flaky_results(table: pa.Table) -> list[FlakyResult]:

@@ -466,7 +466,7 @@ def detections_from_chunks(
     if layout.solids:
         solids, poses = _listed_solids(list(chain.from_iterable(chunk.solids for chunk in chunks)))
     else:
-        poses = _poses(layout, binding, numbers)
+        poses = poses_from_numbers(layout, binding, numbers)
         if binding.polygon is not None:
             counts = np.concatenate([chunk.corner_counts for chunk in chunks])
             object_frames = None
@@ -476,7 +476,7 @@ def detections_from_chunks(
             outline_counts = np.concatenate([chunk.outline_counts for chunk in chunks])
             solids = _polygons(outline_counts, counts, corners, object_frames)
         else:
-            solids = _shapes(layout, binding, poses, numbers)
+            solids = solids_of_shape(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
     locked = list(chain.from_iterable(chunk.locked for chunk in chunks))
     spreads = [chunk.covariance for chunk in chunks if chunk.covariance is not None]
@@ -488,8 +488,8 @@ def detections_from_chunks(
         stamp_ns=_join_columns(chunk.stamps or () for chunk in chunks) if has_stamps else None,
         poses=poses,
         solids=solids,
-        height=_heights(binding, numbers),
-        uncertainty=_uncertainty(binding, numbers, len(name)),
+        height=heights_from_numbers(binding, numbers),
+        uncertainty=radii_from_numbers(binding, numbers, len(name)),
         covariance=np.concatenate(spreads) if spreads else None,
         lifetime_ns=_join_columns(chunk.lifetimes for chunk in chunks) if layout.stays else None,
         is_locked=np.array(locked, np.bool_) if any(locked) else None,
@@ -511,7 +511,7 @@ def _join_columns(columns: Iterable[Sequence[int]]) -> Integers:
     return np.fromiter(chain.from_iterable(columns), np.int64)
 
 
-def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
+def poses_from_numbers(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
     """Return the poses in the numbers (R, W); objects without an orientation have the frame's axes."""
     count = len(numbers)
     position = np.zeros((count, 3))
@@ -560,7 +560,8 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     return metres
 
 
-def _heights(binding: Binding, numbers: Floats) -> Floats | None:
+def heights_from_numbers(binding: Binding, numbers: Floats) -> Floats | None:
+    """Return the bottom and the top (R, 2) of objects above their origins; None without heights."""
     if not binding.height:
         return None
     count = len(numbers)
@@ -571,7 +572,8 @@ def _heights(binding: Binding, numbers: Floats) -> Floats | None:
     return np.stack(bounds, axis=1)
 
 
-def _uncertainty(binding: Binding, numbers: Floats, count: int) -> Floats:
+def radii_from_numbers(binding: Binding, numbers: Floats, count: int) -> Floats:
+    """Return the radii (R,) of uncertainty."""
     if isinstance(binding.uncertainty, int):
         return numbers[:, binding.uncertainty]
     return np.full(count, binding.uncertainty or 0.0)
@@ -610,7 +612,7 @@ def _listed_solids(listed: list[list[Solid]]) -> tuple[Solids, Poses]:
     return Solids(owner, kind, position, rotation, size, start, points), poses
 
 
-def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
+def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
     """Return one solid each: the shape of the mapping or of the message; a point without either."""
     shape = layout.shape
     position = poses.position if shape is None else _origins_of_shape(shape, poses)

@@ -5,20 +5,25 @@ All frames of an episode become samples at once, by arrays.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, concatenated
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
 from spatial_replay.logs.messages import Block, Source, noting_pauses
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.mapping.detections import Detections
-from spatial_replay.mapping.feature_reader import FeatureReading, bind_features, detections_of_body
+from spatial_replay.mapping.feature_reader import (
+    FeatureReading,
+    bind_features,
+    detections_of_body,
+    join_objects,
+)
 from spatial_replay.mapping.mapping_file import LogMapping
 from spatial_replay.mapping.tracker import ObservationRows, rows_from_detections
 from spatial_replay.mapping.transforms import matrices_from_quaternions
@@ -127,55 +132,81 @@ class EpisodeSource(Source):
         mapping, times_ns = self.mapped_by, columns.times_ns
         features = FeatureReading() if mapping is None else _bind(mapping, self.data_set)
         shapes = {} if mapping is None else mapping.shapes
-        rows_by_name: dict[str, ObservationRows] = {}
-        classes: dict[str, str | None] = {}
-        for thing in features.objects:
-            detections = thing.detections(
+        class_of = {thing.name: thing.class_name for thing in features.objects}
+        detected = {
+            thing.name: thing.detections(
                 columns.features, len(times_ns), mapping.name if mapping else "", self.name
             )
-            rows_by_name[thing.name] = self._rows(thing.name, detections, columns, faults)
-            classes[thing.name] = thing.class_name
+            for thing in features.objects
+        }
+        rows_by_name: dict[str, ObservationRows] = {}
         for body in columns.bodies:
-            if body.name in rows_by_name:
+            if body.name in class_of:
                 raise UsageError(
                     f"{self.data_set.name} has a body {body.name!r}; give the object of the mapping another"
                     " `name`"
                 )
-            shape = shapes.get(body.name)
-            if shape is None:
+            class_of[body.name] = None
+            if (shape := shapes.get(body.name)) is None:
                 rows_by_name[body.name] = _rows_of_body(body, self.axes)
             else:
-                detections = detections_of_body(body, shape)
-                rows_by_name[body.name] = self._rows(body.name, detections, columns, faults)
-            classes[body.name] = None
-        names = sorted(rows_by_name)
-        rows = concatenated([rows_by_name[name] for name in names] or [_NO_ROWS])
+                detected[body.name] = detections_of_body(body, shape)
+        names, rows = self._rows(detected, rows_by_name, times_ns, faults)
+        signals = {
+            signal.name: signal.values(columns.features, len(times_ns), self.name)
+            for signal in features.signals
+        }
+        if not names and not signals:
+            raise UsageError(
+                f"{mapping.name if mapping else self.name} names no objects of {self.data_set.name}; name its"
+                f" `features`: {listed([feature.name for feature in self.data_set.features])}"
+            )
         number = np.arange(len(rows), dtype=np.int64)
-        ordered = class_order(classes.values())
-        codes = np.array([ordered.index(classes[name]) for name in names], np.int64)
-        numbered = np.where(rows.is_valid, number, -2 - number).reshape(len(names), -1).T
+        numbered = np.where(rows.is_valid, number, -2 - number).reshape(len(names), len(times_ns))
+        order = sorted(range(len(names)), key=names.__getitem__)
+        classes = class_order(class_of.values())
+        codes = np.array([classes.index(class_of[name]) for name in names], np.int64)
         return Trace(
             times_ns=times_ns,
-            names=tuple(names),
-            rows=np.ascontiguousarray(numbered).reshape(len(times_ns), len(names)),
+            names=tuple(names[place] for place in order),
+            rows=np.ascontiguousarray(numbered[order].T),
             footprints=rows.shapes,
             yaw=rows.yaw,
             uncertainty=rows.uncertainty,
             class_code=np.repeat(codes, len(times_ns)),
-            classes=ordered,
-            signals={signal.name: signal.values(columns.features, self.name) for signal in features.signals},
+            classes=classes,
+            signals=signals,
         )
 
     def _rows(
-        self, name: str, detections: Detections, columns: EpisodeColumns, faults: FaultList
-    ) -> ObservationRows:
-        """Return the footprints of an object in each frame; frames without a valid one are faults."""
+        self,
+        detected: Mapping[str, Detections],
+        rows_by_name: Mapping[str, ObservationRows],
+        times_ns: Integers,
+        faults: FaultList,
+    ) -> tuple[list[str], ObservationRows]:
+        """Return all names and, for one after the other, the observations of all frames.
 
-        def report(frame: int, what: str) -> None:
-            moment = Instant(int(columns.times_ns[frame]), 0)
-            faults.add(Sentence(f"{self.name} at ", moment, f": object {name!r}{what}"))
+        Objects are checked together, since each check costs as much for few as for many. Frames without a
+        valid footprint are faults.
+        """
+        names, parts = list(rows_by_name), list(rows_by_name.values())
+        for has_height in (False, True):
+            group = [name for name, thing in detected.items() if (thing.height is not None) == has_height]
+            if not group:
+                continue
+            report = partial(self._report, names=group, times_ns=times_ns, faults=faults)
+            together = join_objects([detected[name] for name in group])
+            parts.append(rows_from_detections(together, None, self.axes, self.reading.concave, report))
+            names += group
+        return names, parts[0] if len(parts) == 1 else concatenated([_NO_ROWS, *parts])
 
-        return rows_from_detections(detections, None, self.axes, self.reading.concave, report)
+    def _report(
+        self, index: int, what: str, *, names: Sequence[str], times_ns: Integers, faults: FaultList
+    ) -> None:
+        number, frame = divmod(index, len(times_ns))
+        moment = Instant(int(times_ns[frame]), 0)
+        faults.add(Sentence(f"{self.name} at ", moment, f": object {names[number]!r}{what}"))
 
 
 _NO_ROWS = ObservationRows.blank(np.empty(0, np.int64))

@@ -6,7 +6,7 @@ An entry is bound to the features of a data set once. All frames of an episode a
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
@@ -18,7 +18,15 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.formats.episodes import Body, DataSet, Feature
 from spatial_replay.mapping.binding import Binding
-from spatial_replay.mapping.detections import DetectionChunk, Detections, detections_from_chunks
+from spatial_replay.mapping.detections import (
+    Detections,
+    Poses,
+    Solids,
+    heights_from_numbers,
+    poses_from_numbers,
+    radii_from_numbers,
+    solids_of_shape,
+)
 from spatial_replay.mapping.mapping_file import LogMapping, Measure, ShapeMapping, SignalMapping, TopicMapping
 from spatial_replay.mapping.message_types import MessageLayout, layout_of_topic
 from spatial_replay.mapping.topic_reader import with_single_precision
@@ -67,7 +75,7 @@ class BoundObject:
         """
         numbers = np.empty((times, self.binding.width))
         for column, place in enumerate(self.places):
-            numbers[:, column] = column_of(columns, place, episode)
+            numbers[:, column] = column_of(columns, place, times, episode)
         if self.layout.invalid:
             numbers[np.isin(numbers, with_single_precision(self.layout.invalid))] = nan
         if self.quaternion:
@@ -99,9 +107,9 @@ class BoundSignal(NamedTuple):
     place: NumberPlace
     invalid: tuple[float, ...]
 
-    def values(self, columns: Columns, episode: str) -> Floats:
-        """Return its value in each frame (T,)."""
-        values = column_of(columns, self.place, episode)
+    def values(self, columns: Columns, times: int, episode: str) -> Floats:
+        """Return its value in each of T frames (T,)."""
+        values = column_of(columns, self.place, times, episode)
         if self.invalid:
             return np.where(np.isin(values, with_single_precision(self.invalid)), nan, values)
         return values
@@ -234,7 +242,7 @@ def _binding(
 ) -> Binding:
     return Binding(
         style="keys",
-        numbers=_column_numbers,
+        numbers=None,
         width=0,
         position=position,
         orientation=orientation,
@@ -253,18 +261,52 @@ def _binding(
     )
 
 
-def _column_numbers(row: object) -> object:
-    """Return a row as it is: the numbers of features are columns already."""
-    return row
-
-
 def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> Detections:
     """Return one object in T frames, from its numbers (T, W)."""
     count = len(numbers)
-    frames = np.arange(count, dtype=np.int64)
-    chunk = DetectionChunk(frames, [], frames.tolist(), [0] * count, [0] * count, numbers=numbers)
-    detections = detections_from_chunks(layout, binding, [chunk], np.ones(count, np.bool_))
+    poses, no_codes = poses_from_numbers(layout, binding, numbers), np.zeros(count, np.int64)
+    detections = Detections(
+        message=np.arange(count, dtype=np.int64),
+        name=no_codes,
+        class_code=no_codes,
+        poses=poses,
+        solids=solids_of_shape(layout, binding, poses, numbers),
+        uncertainty=radii_from_numbers(binding, numbers, count),
+        height=heights_from_numbers(binding, numbers),
+        numbers=numbers,
+    )
     return detections if layout.scale == 1.0 else detections.scale(layout.scale)
+
+
+def join_objects(objects: Sequence[Detections]) -> Detections:
+    """Join detections of several objects, each in all frames; either all have a height or none."""
+    if len(objects) == 1:
+        return objects[0]
+    solids, counts = [thing.solids for thing in objects], [len(thing.name) for thing in objects]
+    first, first_point = np.cumsum([0, *counts]), np.cumsum([0, *(len(part.points) for part in solids)])
+    starts = [part.point_start[:-1] + begin for part, begin in zip(solids, first_point[:-1], strict=True)]
+    heights = [thing.height for thing in objects if thing.height is not None]
+    return Detections(
+        message=np.concatenate([thing.message for thing in objects]),
+        name=np.repeat(np.arange(len(objects)), counts),
+        class_code=np.concatenate([thing.class_code for thing in objects]),
+        poses=Poses(
+            np.concatenate([thing.poses.position for thing in objects]),
+            np.concatenate([thing.poses.rotation for thing in objects]),
+            np.concatenate([thing.poses.yaw for thing in objects]),
+        ),
+        solids=Solids(
+            owner=np.concatenate([part.owner + begin for part, begin in zip(solids, first, strict=False)]),
+            kind=np.concatenate([part.kind for part in solids]),
+            position=np.concatenate([part.position for part in solids]),
+            rotation=np.concatenate([part.rotation for part in solids]),
+            size=np.concatenate([part.size for part in solids]),
+            point_start=np.concatenate([*starts, first_point[-1:]]),
+            points=np.concatenate([part.points for part in solids]),
+        ),
+        uncertainty=np.concatenate([thing.uncertainty for thing in objects]),
+        height=np.concatenate(heights) if heights else None,
+    )
 
 
 def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
@@ -289,8 +331,8 @@ def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
     return detections_of(MessageLayout(shape=shape), replace(binding, width=numbers.shape[1]), numbers)
 
 
-def column_of(columns: Columns, place: NumberPlace, episode: str) -> Floats:
-    """Return the numbers at a place in each frame (T,).
+def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) -> Floats:
+    """Return the numbers at a place in each of T frames (T,); NaN where the last state has no action.
 
     Raises:
         LogError: the files of the data set lack the feature, or have fewer numbers of it.
@@ -302,6 +344,10 @@ def column_of(columns: Columns, place: NumberPlace, episode: str) -> Floats:
     if place.number >= rows.shape[1]:
         raise LogError(f"{episode}: {place.feature} has {rows.shape[1]} numbers a frame in its files")
     column: Floats = rows[:, place.number]
+    if len(column) == times - 1:
+        return np.append(column, nan)
+    if len(column) != times:
+        raise LogError(f"{episode}: {place.feature} has {len(column)} rows, and there are {times} frames")
     return column
 
 

@@ -155,8 +155,8 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             # the bag, by one of its files
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
-            _refuse_data_set(file)
             names = sorted(entry.name for entry in file.iterdir())
+            _refuse_data_set(file)
             if {"format.json", "rows"}.issubset(names):
                 remedy = "`results` shows them, and compares two such folders"
                 raise MissingFileError(f"{path}: this folder has results of a batch; {remedy}")

@@ -266,3 +266,34 @@ def test_an_episode_of_two_runs_has_no_samples(tmp_path: Path) -> None:
     columns = {"frame_index": [0, 1, 0, 1], "obs": [[0.0, 0.0]] * 4}
     with pytest.raises(LogError, match="set#0: its frame_index goes from 1 to 0"):
         episode(tmp_path, "features: {obs: {name: a, position: [0, 1]}}", columns)
+
+
+@needs_data
+def test_a_shape_with_the_name_of_a_body_replaces_its_footprint(tmp_path: Path) -> None:
+    address = f"{DATA}/learning/maniskill/PushCube-v1.h5#0"
+    assert sr.read_trace(address).names == ("cube", "goal_region", "table-workspace")
+    (tmp_path / "m.yaml").write_text("shapes: {cube: {box: [0.04, 0.02], height: [-0.5, 0.5]}}\nfps: 10")
+    trace = sr.read_trace(address, mapping=tmp_path / "m.yaml")
+    row = trace.rows[0, 0]
+    assert np.isclose(trace.footprints.top[row] - trace.footprints.bottom[row], 1.0)
+    corners = trace.footprints.vertices[trace.footprints.vertex_start[trace.footprints.part_start[row]] :][:4]
+    sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    assert np.allclose([sides.min(), sides.max()], [0.02, 0.04])
+    assert trace.times_ns[1] == 100_000_000
+
+
+def test_states_without_a_model_get_one_by_the_mapping(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "scene.xml").write_text(
+        '<mujoco><worldbody><body name="cube"><freejoint/><geom type="box" size=".1 .2 .3"/></body>'
+        "</worldbody></mujoco>"
+    )
+    states = np.array([[1.0, 2.0, 3.0, 1, 0, 0, 0], [1.0, 2.0, 4.0, 1, 0, 0, 0]])
+    np.savez(tmp_path / "set.npz", terminals=[False, True], qpos=states)
+    (tmp_path / "m.yaml").write_text("model: scene.xml\nfps: 20\n")
+    trace = sr.read_trace(f"{tmp_path}/set.npz#0", mapping=tmp_path / "m.yaml")
+    assert trace.names == ("cube",) and trace.times_ns.tolist() == [0, 50_000_000]
+    assert np.allclose(positions(trace, "cube"), [[1, 2, 3], [1, 2, 4]])
+    (tmp_path / "bare.yaml").write_text("fps: 20\n")
+    with pytest.raises(UsageError, match="names no objects of set"):
+        sr.read_trace(f"{tmp_path}/set.npz#0", mapping=tmp_path / "bare.yaml")

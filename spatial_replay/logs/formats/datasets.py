@@ -6,9 +6,11 @@ Only files below the folder of a data set are read: templates of paths in its me
 from __future__ import annotations
 
 import json
+import os
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from os import PathLike, fspath
 from pathlib import Path
@@ -35,6 +37,8 @@ from spatial_replay.logs.formats.mujoco import model_from_file
 from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
 from spatial_replay.text import counted, listed, nearest_hint
 
+DATA_SET_ENDINGS: Final = (".hdf5", ".h5", ".npz")
+"""Endings of the names of data sets that are files."""
 _ADDRESS: Final = re.compile(r"(.+)#([0-9]{1,9})", re.DOTALL)
 _MOST_BYTES: Final = 8 * 2**30
 """Bytes of the columns of one file, uncompressed."""
@@ -78,29 +82,33 @@ def open_data_set(path: str | PathLike[str]) -> DataSet | None:
     """
     folder = Path(path)
     try:
-        kind = next((name for name, kind in FORMATS.items() if kind.recognise(folder)), None)
-        return None if kind is None else _open_as(kind, folder, _state(folder))
+        return _open(folder, _state(folder))
     except (OSError, ValueError) as error:
         raise LogError(f"{folder.name} cannot be read: {system_reason(error)}") from error
 
 
 @lru_cache(maxsize=4)
-def _open_as(kind: str, path: Path, state: tuple[object, ...]) -> DataSet:
-    return FORMATS[kind].open(path)
+def _open(path: Path, state: tuple[object, ...]) -> DataSet | None:
+    return next((kind.open(path) for kind in FORMATS.values() if kind.recognise(path)), None)
+
+
+_DESCRIBING: Final = (
+    *("", "/meta", "/meta/info.json", "/meta/episodes", "/meta/episodes.jsonl"),
+    *("/metadata.json", "/data/metadata.json", "/data/main_data.hdf5"),
+)
+"""Files of a data set that say what is in it."""
 
 
 def _state(path: Path) -> tuple[object, ...]:
     """Return what changes with the files that say what is in a data set."""
-    files = [
-        path,
-        *(
-            path / name
-            for name in ("meta", "meta/info.json", "metadata.json", "meta/episodes", "data/metadata.json")
-        ),
-    ]
-    files += [path.with_suffix(".json"), path / "meta/episodes.jsonl", path / "data/main_data.hdf5"]
-    states = [file.stat() for file in files if file.exists()]
-    return tuple((state.st_ino, state.st_size, state.st_mtime_ns) for state in states)
+    # as texts: paths would take most of the time
+    files = [*(f"{path}{name}" for name in _DESCRIBING), f"{path.with_suffix('.json')}"]
+    states = []
+    for file in files:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            state = os.stat(file)  # noqa: PTH116
+            states.append((file, state.st_ino, state.st_size, state.st_mtime_ns))
+    return tuple(states)
 
 
 # ---------------------------------------------------------------------------------------------------- LeRobot
@@ -136,6 +144,9 @@ class _LeRobot(DataSet):
         self.label = Label(_SUCCESS, is_about_next=True, is_stored=False) if has_label else None
         self._file_of, self.episodes, remarks = _episodes(path)
         self._files = sorted((path / "data").rglob("*.parquet"))
+        self._file_by_end = {
+            end: file for file in self._files for end in (file.name, f"{file.parent.name}/{file.name}")
+        }
         self._rows: dict[Path, Mapping[int, tuple[int, int, bool]]] = {}
         total = info.get("total_episodes")
         if isinstance(total, int) and total != len(self.episodes):
@@ -178,6 +189,12 @@ class _LeRobot(DataSet):
             unjudged=unjudged,
         )
 
+    def files(self, number: int) -> list[Path]:
+        """See `DataSet.files`."""
+        meta = [self.path / "meta" / "info.json", self.path / "meta" / "episodes.jsonl"]
+        meta += sorted((self.path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
+        return [file for file in meta if file.exists()] + [file for file, *_ in self._places(number)]
+
     def _label(self, reading: EpisodeReading) -> str | None:
         name = reading.label or (self.label.field if self.label else None)
         if reading.label is not None and self.feature(reading.label) is None:
@@ -193,16 +210,16 @@ class _LeRobot(DataSet):
             LogError: no file has them.
         """
         likely = self._file_of.get(number)
-        files = [file for file in self._files if likely and file.as_posix().endswith(likely)]
-        if (files and number in self._rows_of(files[0])) and "episode_" in files[0].name:
-            places = [(files[0], *self._rows_of(files[0])[number])]
+        named = self._file_by_end.get(likely or "")
+        if named is not None and "episode_" in named.name and number in self._rows_of(named):
+            places = [(named, *self._rows_of(named)[number])]
         else:
             # whatever the metadata says: files that were copied or merged have wrong numbers there
             places = [
                 (file, *self._rows_of(file)[number]) for file in self._files if number in self._rows_of(file)
             ]
         if not places:
-            file = f" ({likely} is missing)" if likely and not files else ""
+            file = f" ({likely} is missing)" if likely and named is None else ""
             raise LogError(
                 f"{self.name}#{number}: no file in data/ has its rows{file}; download the whole data set"
             )

@@ -177,6 +177,17 @@ class DataSet:
         """Read whether an episode is labelled a success; None without a label."""
         return self.columns(number, AS_STORED._replace(fps=self.fps or 1.0), ()).label
 
+    def files(self, number: int) -> list[Path]:
+        """Return the files that an episode depends on: all of the data set, unless its format knows better.
+
+        Raises:
+            LogError: they cannot be found.
+        """
+        if self.path.is_file():
+            about = self.path.with_suffix(".json")
+            return [self.path, *([about] if about.is_file() else [])]
+        return sorted(file for file in self.path.rglob("*") if file.is_file())
+
     def episode(self, number: int) -> Episode:
         """Return the episode of a number.
 
