@@ -42,7 +42,7 @@ def document_from_replay(
             **json_fields(replayed, "samples", "start_ns", "end_ns", "faults", "remarks"),
             "damaged": bool(replayed.faults),
             "doubts": [json_doubt(doubt) for doubt in replayed.doubts],
-            "missing": [each.message for each in replayed.missing],
+            "missing": [name.message for name in replayed.missing],
             "left": [
                 json_fields(departure, "name", "start_ns", "end_ns", "distance", "message")
                 for departure in replayed.left
@@ -55,7 +55,7 @@ def document_from_replay(
         "specifications": [
             _result(result, replayed.first_ns, signal, window_ns) for result in replayed.results
         ],
-        "vacuous": [_untested(each, replayed.first_ns) for each in replayed.vacuous],
+        "vacuous": [_untested_part(part, replayed.first_ns) for part in replayed.vacuous],
     }
 
 
@@ -66,11 +66,11 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         "title": result.spec.title,
         # what headline, arrow and event name
         "worst": None if result.worst is None else witness_document(result.worst, first_ns),
-        "causes": [_cause(each, first_ns) for each in result.causes],
+        "causes": [_cause(cause, first_ns) for cause in result.causes],
         "violations": [_invariant(invariant) for invariant in result.violated_invariants],
         "tested": result.tested,
-        "untested": [_untested(each, first_ns) for each in result.untested],
-        "vacuous": [_untested(each, first_ns) for each in result.vacuous],
+        "untested": [_untested_part(part, first_ns) for part in result.untested],
+        "vacuous": [_untested_part(part, first_ns) for part in result.vacuous],
         "doubts": [doubt.assumption for doubt in result.doubts],
         "remarks": list(counted_from(result.remarks, first_ns)),
         "nodes": [
@@ -108,7 +108,7 @@ def _cause(cause: Cause, first_ns: int) -> dict[str, Any]:
     }
 
 
-def _untested(part: UntestedPart, first_ns: int) -> dict[str, Any]:
+def _untested_part(part: UntestedPart, first_ns: int) -> dict[str, Any]:
     (message,) = counted_from([part.message], first_ns)
     return {**json_fields(part), "message": message}
 
@@ -135,7 +135,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
         "explanation": list(sentences_of(witness, first_ns=first_ns)),
     }
     if witness.missed is not None:
-        value["missed"] = _missed(witness, witness.missed)
+        value["missed"] = _missed_response(witness, witness.missed)
     if deciding is not None:
         value["atom"] = _atom(deciding)
     if threshold is not None:
@@ -143,7 +143,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
     return value
 
 
-def _missed(witness: Witness, missed: MissedResponse) -> dict[str, Any]:
+def _missed_response(witness: Witness, missed: MissedResponse) -> dict[str, Any]:
     """Return a response that was missed, with what came closest to it, if that is not what decides."""
     atom, time_ns = witness.closest or (None, None)
     threshold = witness.closest_threshold
@@ -163,7 +163,7 @@ def _atom(deciding: DecidingAtom) -> dict[str, Any]:
     return {
         **json_fields(deciding, "text", "objects", "value", "lower", "upper", "unknown"),
         "relation": deciding.atom.relation,
-        "measured": [_measured(number) for number in deciding.measured],
+        "measured": [_measurement(number) for number in deciding.measured],
     }
 
 
@@ -187,7 +187,7 @@ def _invariant(invariant: ViolatedInvariant) -> dict[str, Any]:
     }
 
 
-def _measured(measured: Measured) -> dict[str, Any]:
+def _measurement(measured: Measured) -> dict[str, Any]:
     contact = measured.contact
     return {
         **json_fields(measured, "quantity", "names", "value", "spread"),
@@ -208,8 +208,8 @@ def idle_document(template: UntestedPart) -> dict[str, Any]:
         "node": None,
         "verdict": None,
         "tested": "nothing",
-        "untested": [_untested(template, 0)],
-        "vacuous": [_untested(template, 0)],
+        "untested": [_untested_part(template, 0)],
+        "vacuous": [_untested_part(template, 0)],
         "explanation": [template.message],
     }
 
@@ -250,37 +250,39 @@ def explain_results(
     if not results and node is None and object is None:
         return []
     if not results:
-        known = ", ".join(sorted({result.object for result in replayed.results if result.object})) or "none"
+        objects = ", ".join(sorted({result.object for result in replayed.results if result.object})) or "none"
         if object is None:
-            raise UsageError(f"there is no result; objects with a result of their own: {known}")
-        raise UsageError(f"no result is about object {object!r}; objects with a result of their own: {known}")
+            raise UsageError(f"there is no result; objects with a result of their own: {objects}")
+        raise UsageError(
+            f"no result is about object {object!r}; objects with a result of their own: {objects}"
+        )
     explanations = [
         explain_node(result, identifier, first_ns=replayed.first_ns, goes_on=goes_on)
         for result in results
-        for identifier in _nodes_named(result, node)
+        for identifier in _find_nodes(result, node)
     ]
     if not explanations:
-        names = {each.name for result in results for _, _, each in iter_nodes(result.formula)}
+        names = {named_node.name for result in results for _, _, named_node in iter_nodes(result.formula)}
         names.update(result.spec.id for result in results)
         raise UsageError(no_such_node(node or "", sorted(name for name in names if name)))
     return explanations
 
 
-def _nodes_named(result: SpecResult, name: str | None) -> Iterator[int]:
-    own = result.spec.id
-    if name is None or name in (*names_of(result.name, own), *names_of(result.title, own)):
+def _find_nodes(result: SpecResult, name: str | None) -> Iterator[int]:
+    spec_id = result.spec.id
+    if name is None or name in (*names_of(result.name, spec_id), *names_of(result.title, spec_id)):
         yield 0
         return
-    for identifier, _, each in iter_nodes(result.formula):
-        spec = result.evidence.instance.named.get(each.name or "")
-        if each.name and name in names_of(each.name, None if spec is None else spec.id):
+    for identifier, _, named_node in iter_nodes(result.formula):
+        spec = result.evidence.instance.named.get(named_node.name or "")
+        if named_node.name and name in names_of(named_node.name, None if spec is None else spec.id):
             yield identifier
             return
 
 
 def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdict | None:
     """Return the verdict that `explain_results` explains, without the reasons; None without such a node."""
-    for identifier in _nodes_named(result, node):
+    for identifier in _find_nodes(result, node):
         is_open = _is_open(result, identifier, goes_on=goes_on)
         return Verdict.PENDING if is_open else result.nodes[identifier].verdict
     return None
@@ -299,7 +301,7 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     about = result.nodes[node]
     is_open = _is_open(result, node, goes_on=goes_on)
     # a goal that later samples may still reach is no cause
-    causes = [each for each in result.causes_of(node) if not goes_on or each.settled_ns is not None]
+    causes = [cause for cause in result.causes_of(node) if not goes_on or cause.settled_ns is not None]
     if is_open:
         witness = result.witness(node)
         sentences = sentences_of(witness, first_ns=first_ns, is_open=True)
@@ -324,14 +326,14 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
         "may_change": is_open,
         **{key: decided[key] for key in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")},
         "worst": decided,
-        "causes": [] if is_open else [_cause(each, first_ns) for each in causes],
+        "causes": [] if is_open else [_cause(cause, first_ns) for cause in causes],
         "violations": [
             _invariant(invariant)
             for invariant in (() if is_open else result.violated_invariants_of(node, goes_on=goes_on))
         ],
         "tested": result.tested if is_whole else None,
-        "untested": [_untested(each, first_ns) for each in result.untested] if is_whole else [],
-        "vacuous": [_untested(each, first_ns) for each in result.vacuous] if is_whole else [],
+        "untested": [_untested_part(part, first_ns) for part in result.untested] if is_whole else [],
+        "vacuous": [_untested_part(part, first_ns) for part in result.vacuous] if is_whole else [],
         "explanation": list(sentences),
     }
     return Explanation(verdict, witness.time_ns, sentences, document)

@@ -247,27 +247,27 @@ class Replay:
         self._is_beside = layer
         needs_messages = write is not None or self._hashes is not None
         # the next block is evaluated while messages of this one are made, if a core is free for that
-        for block, trace, stretches in read_ahead(self._evaluated(messages=needs_messages)):
+        for block, trace, stretches in read_ahead(self._evaluate(messages=needs_messages)):
             self._traces.add(trace)
             inside = self._selection.inside(trace)
-            own = Messages()
+            messages = Messages()
             if needs_messages:
-                own = self._selection.own_messages(block, self._encoded)
+                messages = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
             self._remarks += block.remarks
             self._doubts += block.doubts
             if not layer:
-                self._topics.update(channel.topic for channel in own.channels.values())
-                self._images |= image_topics(own.channels.values())
-            self._add(inside, own, stretches)
+                self._topics.update(channel.topic for channel in messages.channels.values())
+                self._images |= image_topics(messages.channels.values())
+            self._add(inside, messages, stretches)
             if self._zero_ns is None:
                 self._zero_ns = log_zero_ns(self._source, self._selection.window, self._ends)
                 begin(self._zero_ns)
             if write is not None:
                 self._evaluation.annotator.count_from(self._zero_ns)
-                self._annotate(write, inside, stretches, Messages() if layer else own)
+                self._annotate(write, inside, stretches, Messages() if layer else messages)
             advance(len(inside))
-        replayed = self._replayed()
+        replayed = self._results()
         if write is not None:
             annotator, finals = self._evaluation.annotator, self._evaluation.finals
             write(merge(annotator.end(self._end_ns, finals, replayed.results)))
@@ -343,7 +343,7 @@ class Replay:
         start_ns = first_message_ns(self._source) if self._is_beside or is_bag else None
         return (self._start_ns, "this log") if start_ns is None else (start_ns, self._source.name)
 
-    def _evaluated(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
+    def _evaluate(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
         """Yield each block with its samples and their evaluation."""
         with closing(self._selection.read_blocks(messages=messages, ends=self._ends)) as blocks:
             for block, trace in blocks:
@@ -356,9 +356,9 @@ class Replay:
         self._heights.add(trace)
         for departures in self._departures:
             departures.add(trace)
-        own = trace.without_filling()
-        self._samples += len(own)
-        self._unreadable += own.unreadable_count
+        samples = trace.without_filling()
+        self._samples += len(samples)
+        self._unreadable += samples.unreadable_count
         if len(trace):
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
         if len(messages):
@@ -368,11 +368,11 @@ class Replay:
             self._hashes.add_results(stretches)
         for index, stretch in enumerate(stretches):
             if self._keep_series or self._keep_leaves:
-                kept = self._kept[index]
-                kept.append(self._kept_part(stretch))
+                blocks = self._kept[index]
+                blocks.append(self._kept_part(stretch))
                 # a few large arrays lie in files, many small ones would stay in memory
-                while len(kept) > 1 and len(kept[-2].times_ns) <= len(kept[-1].times_ns):
-                    kept[-2:] = [join_blocks(kept[-2:])]
+                while len(blocks) > 1 and len(blocks[-2].times_ns) <= len(blocks[-1].times_ns):
+                    blocks[-2:] = [join_blocks(blocks[-2:])]
 
     def _kept_part(self, stretch: SeriesBlock) -> SeriesBlock:
         """Return a stretch without what is not to stay in memory."""
@@ -380,14 +380,14 @@ class Replay:
         leaves = stretch.leaves if self._keep_leaves else np.empty((1, stretch.leaves.shape[1], 0))
         return SeriesBlock(stretch.times_ns, series, leaves)
 
-    def _replayed(self) -> Replayed:
+    def _results(self) -> Replayed:
         if not self._samples:
             raise self._selection.nothing_to_evaluate(self._faults)
         missing = self._selection.missing_names(self._names)
         dropped = dropped_samples(self._source)
         options = self._selection.options
         first_ns = self._zero_ns or 0
-        left = self._left(first_ns)
+        left = self._departures_by_time(first_ns)
         doubts = distinct_doubts(self._doubts, first_ns)
         return Replayed(
             log=self._source.name,
@@ -411,7 +411,7 @@ class Replay:
             results=replayed_specs(
                 self._evaluation,
                 self.files,
-                [join_blocks(kept) if kept else None for kept in self._kept],
+                [join_blocks(blocks) if blocks else None for blocks in self._kept],
                 self._traces.read,
                 first_ns,
                 has_series=self._keep_series,
@@ -436,7 +436,7 @@ class Replay:
             doubts=doubts,
         )
 
-    def _left(self, first_ns: int) -> tuple[Departure, ...]:
+    def _departures_by_time(self, first_ns: int) -> tuple[Departure, ...]:
         """Return each departure once, whichever specifications it is of, by time."""
         by_start = {
             (departure.start_ns, departure.name): departure
@@ -493,11 +493,11 @@ def dropped_samples(source: Source) -> Dropped:
     """Return what the recorder of a log dropped, and how it ended, as the log says."""
     ending = dict(source.metadata()).get(ENDING, {})
     texts = [ending.get(name, "0") for name in ("samples", "dropped")]
-    kept, count = (
+    written_count, count = (
         int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else 0
         for text in texts
     )
-    return Dropped(count, kept + count, ending.get("interrupted") == "true")
+    return Dropped(count, written_count + count, ending.get("interrupted") == "true")
 
 
 def replayed_specs(
@@ -544,10 +544,12 @@ _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
 def planned_for(source: Source, files: Sequence[Specification]) -> str:
     """Return the name of the file that decisions were made for, if none of these says the same; else ""."""
     name = dict(source.metadata()).get(PLAN_METADATA, {}).get("file", "")
-    recorded = {each.name: each.data.decode("utf-8", "replace") for each in source.attachments()}
+    recorded = {
+        attachment.name: attachment.data.decode("utf-8", "replace") for attachment in source.attachments()
+    }
     text = recorded.get(RECORDED_PREFIX + name)
     with suppress(SpecificationError):
-        evaluated = [format_specification(each) for each in files]
+        evaluated = [format_specification(file) for file in files]
         if text is not None and format_specification(parse_specification(text)) not in evaluated:
             return name
     return ""
@@ -611,14 +613,14 @@ def run_replay(
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
-            each.title: verdict_text(
-                each.verdict,
-                (each.robustness, each.lower, each.upper),
-                each.unit,
-                each.tested,
-                is_doubtful=bool(each.doubts),
+            result.title: verdict_text(
+                result.verdict,
+                (result.robustness, result.lower, result.upper),
+                result.unit,
+                result.tested,
+                is_doubtful=bool(result.doubts),
             )
-            for each in (replayed.results[place] for place in worst_first(replayed.results))
+            for result in (replayed.results[place] for place in worst_first(replayed.results))
         }
         sink.add_metadata(VERDICTS, texts)
         if replayed.doubts:
@@ -658,9 +660,11 @@ def recorded_texts(source: Source) -> list[SpecificationText]:
     attachments = source.attachments()
     for prefix in (REPLAYED_PREFIX, RECORDED_PREFIX):
         texts = [
-            SpecificationText(each.data.decode("utf-8", "replace"), each.name.removeprefix(prefix))
-            for each in attachments
-            if each.name.startswith(prefix)
+            SpecificationText(
+                attachment.data.decode("utf-8", "replace"), attachment.name.removeprefix(prefix)
+            )
+            for attachment in attachments
+            if attachment.name.startswith(prefix)
         ]
         if texts:
             return texts
@@ -688,14 +692,14 @@ def _begin(
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]
     sink.add_metadata(METADATA, {**about, **recorded})
-    sink.add_metadata(AUTOMATA, {each.name: each.summary for each in replay.automata})
+    sink.add_metadata(AUTOMATA, {automaton.name: automaton.summary for automaton in replay.automata})
     if not layer:
-        _copy_attached(sink, source)
+        _copy_metadata(sink, source)
     for attachment in replay.attachments():
         sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
 
-def _copy_attached(sink: Sink, source: Source) -> None:
+def _copy_metadata(sink: Sink, source: Source) -> None:
     """Copy the source's metadata and attachments, except those that a replay replaces."""
     for name, data in source.metadata():
         if name not in (METADATA, AUTOMATA, VERDICTS, DOUBTS, CERTIFICATE):

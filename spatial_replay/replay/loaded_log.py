@@ -157,14 +157,14 @@ class OwnMessages:
 
     def _count(self, messages: Messages) -> None:
         """Count messages in the window; topics that turn out to have many leave the memory."""
-        for channel, chosen in messages.by_channel():
+        for channel, rows in messages.by_channel():
             if channel not in self._counts:
                 self._few[channel] = []
-            self._counts[channel] = self._counts.get(channel, 0) + len(chosen)
+            self._counts[channel] = self._counts.get(channel, 0) + len(rows)
             if channel in self._few:
-                own = select(messages, chosen)
-                self._few[channel].append(own)
-                self._bytes += _size(own)
+                channel_messages = select(messages, rows)
+                self._few[channel].append(channel_messages)
+                self._bytes += _size(channel_messages)
                 if self._counts[channel] > _FEW or self._bytes > _FEW_BYTES:
                     self._bytes -= sum(map(_size, self._few.pop(channel)))
 
@@ -199,9 +199,9 @@ class MessageCursor:
 def latest_messages(messages: Messages, time_ns: int) -> Messages:
     """Return of each channel the messages from a time on or, if it has none, the last one before."""
     _, last = np.unique(messages.channel[::-1], return_index=True)
-    chosen = messages.log_time_ns >= time_ns
-    chosen[len(messages) - 1 - last] = True
-    return select(messages, np.flatnonzero(chosen))
+    is_shown = messages.log_time_ns >= time_ns
+    is_shown[len(messages) - 1 - last] = True
+    return select(messages, np.flatnonzero(is_shown))
 
 
 def _reaches(messages: Messages, end_ns: int) -> bool:
@@ -318,13 +318,13 @@ class LoadedLog:
         if looks_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
             options = replace(self.options, keep=self._keep)
             return LoadedLog(self._source, files, options, saved=self._saved)
-        other = copy(self)
-        other._files, other._kept = tuple(files), logged_specifications(files, self.trace.units)
+        log = copy(self)
+        log._files, log._kept = tuple(files), logged_specifications(files, self.trace.units)
         selection = Selection(self._source, tuple(files), self.options)
-        other.missing = selection.missing_names(LogNames.of(self.trace))
-        other._places = _places(other._files)
-        other.constants = other._constants(other._files)
-        return other
+        log.missing = selection.missing_names(LogNames.of(self.trace))
+        log._places = _places(log._files)
+        log.constants = log._constants(log._files)
+        return log
 
     def write_constants(self, values: Mapping[str, float | str]) -> Mapping[str, float | str]:
         """Write values of constants into the files that the specifications are from; only numbers change.
@@ -349,8 +349,8 @@ class LoadedLog:
     def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
         edits = [dict[str, float | str]() for _ in self._files]
         for name, value in values.items():
-            index, own = self._place(name, value)
-            edits[index][own] = value
+            index, constant_name = self._place(name, value)
+            edits[index][constant_name] = value
         return edits
 
     def edit(self, values: Mapping[str, float | str]) -> EditedFiles:
@@ -364,10 +364,12 @@ class LoadedLog:
             SpecificationError: a specification that is invalid with these values.
         """
         edits = self._by_file(values)
-        edited = [_edited(file, own) for file, own in zip(self._files, edits, strict=True)]
+        edited = [_edit_file(file, edit) for file, edit in zip(self._files, edits, strict=True)]
         stored = [
-            kept if file is written else with_numbers(_stored(file, written, kept), self.trace.units)
-            for file, written, kept in zip(edited, self._files, self._kept, strict=True)
+            logged
+            if file is file_as_written
+            else with_numbers(_as_stored(file, file_as_written, logged), self.trace.units)
+            for file, file_as_written, logged in zip(edited, self._files, self._kept, strict=True)
         ]
         return EditedFiles(self, tuple(stored), MappingProxyType(dict(values)), self._constants(edited))
 
@@ -395,20 +397,26 @@ class LoadedLog:
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
         return MappingProxyType(
-            {name: files[file].constants[own] for name, (file, own) in self._places.items()}
+            {
+                name: files[file].constants[constant_name]
+                for name, (file, constant_name) in self._places.items()
+            }
         )
 
     def _place(self, name: str, value: object) -> tuple[int, str]:
         """Return the file of a constant and its name there, if a value is of its kind."""
         if name not in self._places:
-            known = tuple(self._places)
-            hint = nearest_hint(name, known) or f"the constants are: {', '.join(known) or 'none'}"
+            constant_names = tuple(self._places)
+            hint = (
+                nearest_hint(name, constant_names)
+                or f"the constants are: {', '.join(constant_names) or 'none'}"
+            )
             raise UsageError(f"there is no constant {name!r} to change; {hint}")
-        written = self.constants[name]
-        if isinstance(value, str) != (written.duration_ns is not None):
-            kind = "a number" if written.duration_ns is None else "a duration, given as a text such as '2s'"
+        constant = self.constants[name]
+        if isinstance(value, str) != (constant.duration_ns is not None):
+            kind = "a number" if constant.duration_ns is None else "a duration, given as a text such as '2s'"
             raise UsageError(
-                f"{name} cannot be {value!r}: it is {kind} ({constant_text(written)} as written)"
+                f"{name} cannot be {value!r}: it is {kind} ({constant_text(constant)} as written)"
             )
         return self._places[name]
 
@@ -481,7 +489,7 @@ class Evaluated:
                 (spec for file in self.edited.files for spec in file.results),
                 (tree.formula for tree in self.evaluation.trees),
                 loaded.options.each,
-                [each for each in loaded.inside.classes if each],
+                [class_name for class_name in loaded.inside.classes if class_name],
             ),
             certificate=MappingProxyType({}),
             semantics=loaded.options.semantics,
@@ -501,18 +509,18 @@ class Evaluated:
         text = "; ".join(map(_result_text, results[:_MOST_NAMED])) or "the template matched no objects"
         if len(results) > _MOST_NAMED:
             text += f"; and {len(results) - _MOST_NAMED} more, none worse"
-        written = self.loaded.constants
+        written_constants = self.loaded.constants
         changed = [
             f"{name} = {constant_text(constant)}"
             for name, constant in self.edited.constants.items()
-            if constant != written[name]
+            if constant != written_constants[name]
         ]
         return text + (f" ({listed(changed, _MOST_NAMED)})" if changed else "")
 
     @cached_property
     def layout(self) -> Attachment:
         """The viewer layout for a server of this log."""
-        topics = {each.topic for each in self.loaded.own.channels}
+        topics = {channel.topic for channel in self.loaded.own.channels}
         contents = self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics)
         order = worst_first(self.replayed.results)
         zero = TextZero(self.loaded.first_ns, int(self.loaded.inside.times_ns[0]), "this playback")
@@ -537,7 +545,7 @@ def constant_text(constant: Constant) -> str:
 
 def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]:
     """Return constants as `LoadedLog.edit` takes them."""
-    return {name: constant_value(each) for name, each in constants.items()}
+    return {name: constant_value(constant) for name, constant in constants.items()}
 
 
 def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
@@ -550,13 +558,13 @@ def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
     }
 
 
-def _edited(file: Specification, values: Mapping[str, float | str]) -> Specification:
+def _edit_file(file: Specification, values: Mapping[str, float | str]) -> Specification:
     if all(value == constant_value(file.constants[name]) for name, value in values.items()):
         return file
     return parse_specification(file.source, filename=file.filename, profile=file.profile, constants=values)
 
 
-def _stored(edited: Specification, written: Specification, kept: Specification) -> Specification:
+def _as_stored(edited: Specification, written: Specification, kept: Specification) -> Specification:
     """Return an edited specification as a log stores it: its text says the new values.
 
     Messages refer to nodes by their place in the text. If a log stores a canonical text of the written one,
@@ -597,26 +605,26 @@ class Playback:
 
     def __init__(self, evaluated: Evaluated) -> None:
         """Begin before the first message; `seek` first."""
-        own = evaluated.loaded.own
+        log_messages = evaluated.loaded.own
         self._times_ns = evaluated.loaded.inside.times_ns
-        self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
+        self.start_ns, self.end_ns = int(self._times_ns[0]), log_messages.end_ns
         self.time_ns = self.start_ns
         self.evaluated = evaluated
         self.arrow = ""
         self._regions = shown_regions(evaluated.edited.files)
         self._start = scene_start(evaluated.loaded.inside, self._regions, evaluated.loaded.first_ns)
         self._annotator = evaluated.evaluation.new_annotator(self._start)
-        self._own = MessageCursor(own, self.start_ns)
+        self._own = MessageCursor(log_messages, self.start_ns)
         self._next = 0
         self._has_ended = False
 
     @property
     def channels(self) -> tuple[Channel, ...]:
         """All channels that may have messages."""
-        own = self.evaluated.loaded.own
-        first = MessageCursor(own, self.start_ns).take_before(self.start_ns + 1)
+        log_messages = self.evaluated.loaded.own
+        first = MessageCursor(log_messages, self.start_ns).take_before(self.start_ns + 1)
         derived = Messages(channels=dict(enumerate(self.evaluated.evaluation.channels)))
-        return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *own.channels)))
+        return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *log_messages.channels)))
 
     def seek(self, time_ns: int) -> Messages:
         """Go to a time, and return what a viewer shows there.
@@ -629,7 +637,7 @@ class Playback:
         """
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        shown = max(self._next - 1, 0)
+        sample = max(self._next - 1, 0)
         regions = shown_regions(self.evaluated.edited.files)
         if regions != self._regions:
             loaded = self.evaluated.loaded
@@ -637,9 +645,9 @@ class Playback:
         scene = replace(self._annotator.scene, written_ns=None, last={}, place=self._start.place)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
-        events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))
-        derived = self._annotator.messages(*self.evaluated.part(shown, self._next))
-        shown_there = merge([events, *derived, self._seek_own(int(self._times_ns[shown]))])
+        events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, sample))))
+        derived = self._annotator.messages(*self.evaluated.part(sample, self._next))
+        shown_there = merge([events, *derived, self._seek_own(int(self._times_ns[sample]))])
         return join([shown_there, _last(self._end())])
 
     def advance_to(self, time_ns: int) -> Messages:
@@ -669,15 +677,16 @@ class Playback:
 
     def _seek_own(self, sample_ns: int) -> Messages:
         """Return the latest of the log's own messages of each topic, and all those at the present time."""
-        own = self.evaluated.loaded.own
-        since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), own.start_ns)
-        self._own = MessageCursor(own, since_ns)
-        messages = merge([own.few_before(since_ns), self._own.take_before(self.time_ns + 1)])
+        log_messages = self.evaluated.loaded.own
+        since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), log_messages.start_ns)
+        self._own = MessageCursor(log_messages, since_ns)
+        messages = merge([log_messages.few_before(since_ns), self._own.take_before(self.time_ns + 1)])
         return latest_messages(messages, self.time_ns)
 
 
 def _last(events: Messages) -> Messages:
     places = [
-        own[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :] for channel, own in events.by_channel()
+        rows[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :]
+        for channel, rows in events.by_channel()
     ]
     return select(events, np.sort(np.concatenate([np.empty(0, np.int64), *places])))

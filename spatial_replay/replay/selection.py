@@ -86,7 +86,7 @@ def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
     """
     if keep is None:
         return source
-    patterns = [each for each in keep if each not in (ALL, MAPPED)]
+    patterns = [pattern for pattern in keep if pattern not in (ALL, MAPPED)]
     if patterns:
         _check_patterns(source, patterns)
     return source.keeping(tuple(keep))
@@ -366,17 +366,17 @@ class Selection:
         """
         ends = ends or self.run_ends()
         waiting: deque[Block] = deque()
-        for block, trace in self._read_strided(messages=messages):
+        for block, trace in self._read_samples(messages=messages):
             waiting.append(block)
             for counting in ends.add(trace):
-                yield _trimmed(waiting.popleft(), ends), counting
+                yield _trim(waiting.popleft(), ends), counting
         for counting in ends.finish():
-            yield _trimmed(waiting.popleft(), ends), counting
+            yield _trim(waiting.popleft(), ends), counting
         if ends.remarks:
             remarks = tuple(Sentence(f"{self.source.name}: ", remark) for remark in ends.remarks)
             yield Block(Trace.empty(), remarks=remarks), Trace.empty()
 
-    def _read_strided(self, *, messages: bool) -> Iterator[tuple[Block, Trace]]:
+    def _read_samples(self, *, messages: bool) -> Iterator[tuple[Block, Trace]]:
         """Read each block, with every Nth of its samples."""
         window = self.window
         # every Nth sample is counted from the log's first, wherever the window starts
@@ -386,9 +386,9 @@ class Selection:
         for block in read_blocks(source, None if from_start else window.start_ns, window.end_ns):
             trace = block.trace
             if window.every > 1:
-                chosen = np.arange(-read % window.every, len(trace), window.every, dtype=np.int64)
+                samples = np.arange(-read % window.every, len(trace), window.every, dtype=np.int64)
                 read += len(trace)
-                trace = trace.take(chosen)
+                trace = trace.take(samples)
             yield block, trace
 
     def iter_traces(self, ends: RunEnds | None = None) -> Iterator[Trace]:
@@ -440,12 +440,12 @@ class Selection:
             first: the number of the block's first sample in the window.
         """
         messages = block.messages
-        chosen = messages.within(self.window.start_ns, self.window.end_ns)
+        inside = messages.within(self.window.start_ns, self.window.end_ns)
         if any(channel.topic == OBJECTS for channel in messages.channels.values()):
             # in the source, messages of one time come in the order of its numbers of channels
-            return merge([chosen])
+            return merge([inside])
         trace = self.inside(block.trace)
-        return merge([chosen, sample_messages(trace, first)])
+        return merge([inside, sample_messages(trace, first)])
 
     def instances(self, file: Specification) -> list[Instance]:
         """Return what is to be evaluated of a specification; for templates, the source is read for objects.
@@ -454,10 +454,10 @@ class Selection:
             UsageError: a template without its objects.
         """
         parameters = {spec.parameter for spec in file.results}
-        own = {
+        choices = {
             parameter: choice for parameter, choice in self.options.each.items() if parameter in parameters
         }
-        return find_instances(file, own, self.iter_traces(), self.window.start_ns, self.window.end_ns)
+        return find_instances(file, choices, self.iter_traces(), self.window.start_ns, self.window.end_ns)
 
     def missing_names(self, names: LogNames) -> tuple[Diagnostic, ...]:
         """Return a warning for each object, signal and class that is asked for and that the log never has.
@@ -477,7 +477,7 @@ class Selection:
             missing = self._missing_names(whole)
         if missing and self.options.strict_names:
             raise SpecificationError(missing)
-        return tuple(replace(each, severity="warning") for each in missing)
+        return tuple(replace(diagnostic, severity="warning") for diagnostic in missing)
 
     def nothing_to_evaluate(self, faults: Sequence[str]) -> LogError | UsageError:
         """Return the error for a window without any sample.
@@ -508,7 +508,7 @@ class Selection:
         return [remark for remark in remarks if remark.severity == "error"]
 
 
-def _trimmed(block: Block, ends: RunEnds) -> Block:
+def _trim(block: Block, ends: RunEnds) -> Block:
     """Return a block whose samples count, with all of its messages."""
     return replace(block, trace=ends.trim(block.trace))
 
@@ -548,7 +548,7 @@ class _ClippedSource(SourceOf):
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""
-        records = tuple(each for each in self.source.metadata() if each[0] != CLIP_METADATA)
+        records = tuple(record for record in self.source.metadata() if record[0] != CLIP_METADATA)
         return (*records, (CLIP_METADATA, self.about))
 
 
@@ -564,24 +564,24 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
     try:
         start_ns, end_ns = int(about["start_ns"]), int(about["end_ns"])
         keep = json.loads(about.get("keep", json.dumps(KEEP_ALL)))
-        kept = source_keeping(source, tuple(map(str, keep)))
+        kept_source = source_keeping(source, tuple(map(str, keep)))
     except (LookupError, TypeError, ValueError) as error:
         raise LogError(f"the metadata {CLIP_METADATA} of the clip cannot be read: {error}") from error
-    return _ClippedSource(kept, start_ns, end_ns + 1, _latched(kept, start_ns), about)
+    return _ClippedSource(kept_source, start_ns, end_ns + 1, _last_before(kept_source, start_ns), about)
 
 
-def _latched(source: Source, start_ns: int) -> Messages:
+def _last_before(source: Source, start_ns: int) -> Messages:
     """Return the last message before a time of each topic but the samples, and of each frame's transform."""
     latest: dict[tuple[Channel, str], Messages] = {}
     frames: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
     for messages in _messages_before(source, start_ns):
-        for channel, own in messages.by_channel():
+        for channel, rows in messages.by_channel():
             if channel.topic == OBJECTS:
                 continue
             if channel not in frames:
                 frames[channel] = _frame_names(channel)
             kind = short_type(channel.schema.name) if channel.schema is not None else ""
-            for index in own.tolist() if kind in TRANSFORM_TYPES else own[-1:].tolist():
+            for index in rows.tolist() if kind in TRANSFORM_TYPES else rows[-1:].tolist():
                 message = select(messages, np.array([index]))
                 for frame in frames[channel](message.payloads[0]):
                     latest[channel, frame] = message
@@ -625,4 +625,4 @@ def _children(message: Any) -> list[str]:
         transforms: Any = get_field(message, "transforms")
     except (LookupError, AttributeError, TypeError):
         transforms = [message]
-    return [str(get_field(each, "child_frame_id")) for each in transforms] or [""]
+    return [str(get_field(transform, "child_frame_id")) for transform in transforms] or [""]

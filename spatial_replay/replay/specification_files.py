@@ -128,20 +128,20 @@ class SpecificationFiles:
             files = load_specifications(self.paths, constants=self._constants)
             plain = load_specifications(self.paths)
             changed: dict[str, float | str] = {}
-            for index, (path, own, with_given, written) in enumerate(
+            for index, (path, new_values, with_given, file_as_written) in enumerate(
                 zip(self.paths, values or [{}] * len(self.paths), files, plain, strict=True)
             ):
-                given = {
+                given_values = {
                     name: value
                     for name, value in plain_values(with_given).items()
-                    if with_given.constants[name] != written.constants[name]
+                    if with_given.constants[name] != file_as_written.constants[name]
                 }
                 if loaded:
-                    self._check_saves(index, own, loaded[index].constants, with_given.constants)
-                new = {**given, **own}
+                    self._check_saves(index, new_values, loaded[index].constants, with_given.constants)
+                new = {**given_values, **new_values}
                 names = write_constants(path, new)
                 changed |= {name: new[name] for name in names}
-                after = load_specification(path) if names else written
+                after = load_specification(path) if names else file_as_written
                 self._written |= {(index, name): after.constants[name] for name in names}
             self._constants = {}
             return changed
@@ -188,11 +188,11 @@ class SpecificationFiles:
         states: list[_State | None] = []
         for path in self.paths:
             try:
-                found = path.stat()
+                status = path.stat()
             except (OSError, ValueError):
                 states.append(None)
             else:
-                states.append((found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns))
+                states.append((status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
         return states
 
 
@@ -230,17 +230,21 @@ def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str,
             f"{path.name} computes {', '.join(computed)} from other constants; "
             "change those, or write a number there"
         )
-    written = parse_specification(text, filename=path.name, constants=changed)
+    changed_file = parse_specification(text, filename=path.name, constants=changed)
     mark = _MARK if content.startswith(_MARK) else b""
     with replacing(path) as stream:
-        stream.write(mark + written.source.encode("utf-8"))
+        stream.write(mark + changed_file.source.encode("utf-8"))
     path.chmod(mode)
     return tuple(changed)
 
 
 def plain_values(file: Specification) -> dict[str, float | str]:
     """Return the constants of a specification that follow from no others, as they are given."""
-    return {name: constant_value(each) for name, each in file.constants.items() if not each.is_computed}
+    return {
+        name: constant_value(constant)
+        for name, constant in file.constants.items()
+        if not constant.is_computed
+    }
 
 
 def constant_value(constant: Constant) -> float | str:

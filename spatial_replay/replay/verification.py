@@ -92,38 +92,38 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
         MissingFileError: one of the files is missing.
         UsageError: the signers are none, or ssh-keygen is missing.
     """
-    for each in (signature, signers):
-        _require(each)
+    for file in (signature, signers):
+        _require(file)
     if signature.stat().st_size > LARGEST_SIGNATURE:
         return None
-    allowed, names = _allowed(signers)
+    allowed, names = _allowed_signers(signers)
     with TemporaryDirectory(prefix="spatial-replay-") as folder:
-        (listed := Path(folder) / "allowed_signers").write_text(allowed)
-        files = ["-f", str(listed), "-s", str(signature.resolve())]
-        found = _ssh_keygen(["find-principals", *files], b"")
-        for principal in found.stdout.decode("utf-8", "replace").splitlines():
+        (signers_file := Path(folder) / "allowed_signers").write_text(allowed)
+        files = ["-f", str(signers_file), "-s", str(signature.resolve())]
+        principals = _ssh_keygen(["find-principals", *files], b"")
+        for principal in principals.stdout.decode("utf-8", "replace").splitlines():
             arguments = ["verify", *files, "-n", NAMESPACE, "-I", principal]
             if _ssh_keygen(arguments, statement(certificate)).returncode == 0:
                 return names.get(principal, principal)
     return None
 
 
-def _allowed(signers: Path) -> tuple[str, dict[str, str]]:
+def _allowed_signers(signers: Path) -> tuple[str, dict[str, str]]:
     """Return an allowed_signers file, and names for the principals that bare keys get in it."""
     try:
         lines = [line.strip() for line in signers.read_text().splitlines()]
     except UnicodeDecodeError:
         raise UsageError(f"{signers} is not text; give public keys or an allowed_signers file") from None
-    listed, names = [], {}
+    allowed_lines, names = [], {}
     for number, line in enumerate((line for line in lines if line and not line.startswith("#")), 1):
         if bare := _PUBLIC_KEY.match(line):
             names[f"key{number}"] = bare["comment"] or f"key {number} of {signers.name}"
-            listed.append(f"key{number} {line}")
+            allowed_lines.append(f"key{number} {line}")
         else:
-            listed.append(line)
-    if not listed:
+            allowed_lines.append(line)
+    if not allowed_lines:
         raise UsageError(f"{signers} has no public key; give an id_ed25519.pub or an allowed_signers file")
-    return "\n".join([*listed, ""]), names
+    return "\n".join([*allowed_lines, ""]), names
 
 
 def _require(path: Path) -> None:
@@ -175,7 +175,7 @@ class FirstDifferences:
 
     def finish(self) -> dict[str, Sentence]:
         """Compare what the log has beyond the evaluation; return the first difference of each topic."""
-        for topic in (each.name for each in self._reader.topics()):
+        for topic in (topic_of_log.name for topic_of_log in self._reader.topics()):
             is_compared = topic in self._recorded or topic not in DERIVED
             if topic not in self._found and is_compared:
                 extra = next(self._messages(topic), None)
@@ -264,7 +264,7 @@ def _difference(topic: str, now: bytes, then: bytes) -> str | None:
 
 
 def _of_samples(now: ObjectStates, then: ObjectStates) -> str | None:
-    objects, before = ({each.name: each for each in sample.objects} for sample in (now, then))
+    objects, before = ({tracked.name: tracked for tracked in sample.objects} for sample in (now, then))
     for name in sorted(objects.keys() | before.keys()):
         if name not in objects or name not in before:
             return f"`{name}` is {'only in the log' if name in before else 'not in the log'}"
@@ -272,7 +272,7 @@ def _of_samples(now: ObjectStates, then: ObjectStates) -> str | None:
             if getattr(objects[name], field) != getattr(before[name], field):
                 what = {"class_name": "class", "parts": "footprint"}.get(field, field)
                 return f"`{name}` has another {what}"
-    signals, old = ({each.name: each.value for each in sample.signals} for sample in (now, then))
+    signals, old = ({signal.name: signal.value for signal in sample.signals} for sample in (now, then))
     for name in sorted(signals.keys() | old.keys()):
         if signals.get(name) != old.get(name):
             values = [side.get(name, "missing") for side in (signals, old)]
@@ -283,26 +283,27 @@ def _of_samples(now: ObjectStates, then: ObjectStates) -> str | None:
 def _of_results(now: Robustness, then: Robustness) -> str | None:
     if (now.specification, now.object) != (then.specification, then.object):
         return f"`{now.specification}` now, `{then.specification}` recorded"
-    for one, other in zip_longest(now.nodes, then.nodes):
-        if one is None or other is None:
+    for node_now, node_then in zip_longest(now.nodes, then.nodes):
+        if node_now is None or node_then is None:
             return f"`{now.specification}` has {len(now.nodes)} nodes now, {len(then.nodes)} recorded"
         for name in _QUANTITIES:
-            values = getattr(one, name), getattr(other, name)
+            values = getattr(node_now, name), getattr(node_then, name)
             if not np.array_equal(*values, equal_nan=True):
-                node = f"`{one.name or f'node {one.id}'}` in `{now.specification}`"
+                node = f"`{node_now.name or f'node {node_now.id}'}` in `{now.specification}`"
                 return f"{name} of {node} is {values[0]!r} now, {values[1]!r} recorded"
     return None
 
 
 def _of_specifications(now: SpecificationMessage, then: SpecificationMessage) -> str | None:
-    for one, other in zip_longest(now.files, then.files):
-        if one is None or other is None:
+    for file_now, file_then in zip_longest(now.files, then.files):
+        if file_now is None or file_then is None:
             return f"{len(now.files)} files now, {len(then.files)} recorded"
-        lines = zip_longest(one.canonical.splitlines(), other.canonical.splitlines(), fillvalue="")
+        lines = zip_longest(file_now.canonical.splitlines(), file_then.canonical.splitlines(), fillvalue="")
         for number, (line, before) in enumerate(lines, 1):
             if line != before:
-                shown = [printable(each, _LONGEST_LINE) for each in (line, before)]
-                return f"{one.name}, line {number} as formatted: `{shown[0]}` now, `{shown[1]}` recorded"
+                texts = [printable(text, _LONGEST_LINE) for text in (line, before)]
+                place = f"{file_now.name}, line {number} as formatted"
+                return f"{place}: `{texts[0]}` now, `{texts[1]}` recorded"
     return None
 
 
@@ -353,14 +354,14 @@ class Verified:
         """The differences in words; none if everything is equal."""
         if not self.recorded:
             return ("the log has no certificate: it is not annotated, or was not written to its end",)
-        found = [
+        differences = [
             f"{what}: {self.computed.get(key, 'nothing')} now, {self.recorded.get(key, 'nothing')} recorded"
             for key, what in _HASHES.items()
             if self.recorded.get(key) != self.computed.get(key)
             # certificates of before have no hash of the settings
             and not (key == PLAN_SHA256 and key not in self.recorded)
         ]
-        return (*found, *([_NO_PLAN] if self.lacks_plan else []))
+        return (*differences, *([_NO_PLAN] if self.lacks_plan else []))
 
 
 def verify_certificate(
@@ -389,20 +390,20 @@ def verify_certificate(
         raise UsageError(
             f"{log.name} is a layer without samples; give the log that it was made from: --source SOURCE"
         )
-    keep = None if source is None else _kept(about, options)
+    keep = None if source is None else _topics_of_copy(about, options)
     clip = metadata.get(CLIP_METADATA, {})
     # a replay of a clip has its record, too: where the source is that clip, all of it counts
     if source is not None and clip and dict(source.metadata()).get(CLIP_METADATA) != clip:
         source, keep = clipped_source(source, clip), None
     evaluated = log if source is None else source
-    chosen = ReplayOptions(
+    replay_options = ReplayOptions(
         Window(**{name: options[name] for name in _WINDOW if name in options}),
         options.get("each", {}),
         _semantics(about),
         keep=keep,
         arrow=str(options.get("arrow", "")),
     )
-    replayed = run_replay(evaluated, _files(log), chosen, advance=advance)
+    replayed = run_replay(evaluated, _files(log), replay_options, advance=advance)
     computed = dict(replayed.certificate)
     plan = metadata.get(PLAN_METADATA)
     if not options.get("layer") and recorded.get(PLAN_SHA256) == computed.get(PLAN_SHA256):
@@ -417,14 +418,14 @@ def verify_certificate(
     verified = Verified(dict(recorded), computed, replayed.faults, lacks_plan=lacks_plan, notes=notes)
     if not explain:
         return verified
-    found: Mapping[str, Sentence] = {}
+    first_differences: Mapping[str, Sentence] = {}
     if verified.differences and isinstance(log, McapSource):
         compared = FirstDifferences(log.path)
-        Replay(evaluated, _files(log), chosen, certify=False).run(
+        Replay(evaluated, _files(log), replay_options, certify=False).run(
             compared.add, layer=bool(options.get("layer")), advance=advance
         )
-        found = compared.finish()
-    explanation = explain_differences(verified.recorded, verified.computed, found)
+        first_differences = compared.finish()
+    explanation = explain_differences(verified.recorded, verified.computed, first_differences)
     return replace(verified, explanation=counted_from(explanation, replayed.first_ns))
 
 
@@ -463,7 +464,7 @@ def _options(about: Mapping[str, str]) -> dict[str, Any]:
     return options if isinstance(options, dict) else {}
 
 
-def _kept(about: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
+def _topics_of_copy(about: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
     """Return which messages of its source a log kept: none in a recording, all in a copy by default."""
     if about.get("written_by") != "replay":
         return ()
