@@ -194,7 +194,7 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
     from spatial_replay.sources.overview import messages_in, overview_of, overview_of_survey, survey
 
     reader = messages_in(log)
-    surveyed, about = None, {}
+    surveyed, about, episode = None, {}, {}
     if reader is not None:
         with progress("messages") as advance:
             surveyed = survey(reader, advance)
@@ -205,16 +205,30 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
         with progress("samples") as advance:
             source = open_source(log, **reading)
             overview = overview_of(source, advance)
-        about = _requirements(source)
+        about, episode = _requirements(source), _episode_facts(source)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
     remarks = (*(surveyed.remarks if surveyed else ()), *overview.remarks)
     faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, remarks))
     warn(*dict.fromkeys((*faults, *remarks)))
     if as_json:
-        show_json(_document(overview, surveyed, faults, about))
+        show_json({**_document(overview, surveyed, faults, about), **episode})
     else:
-        show(*_lines(overview, surveyed, bool(faults), about))
+        lines = _lines(overview, surveyed, bool(faults), about)
+        show(
+            next(lines), *(f"{name:<8} {fact}" for name, fact in episode.items() if fact is not None), *lines
+        )
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
+
+
+def _episode_facts(source: Source) -> dict[str, str | None]:
+    """Return the task and the label of an episode of a data set; nothing for other logs."""
+    from spatial_replay.mapping.episode_source import EpisodeSource
+
+    if not isinstance(source, EpisodeSource):
+        return {}
+    label = source.columns().label
+    task = source.data_set.episode(source.number).task
+    return {"task": task, "label": None if label is None else "success" if label else "failure"}
 
 
 def _print_decisions(log: LogFile, as_json: bool) -> int:

@@ -50,6 +50,7 @@ _HANDS: Final = re.compile(r"eef|\bee\b|tcp|hand|grip|tool|robot|flange", re.IGN
 _LENGTH_ERROR: Final = 0.01
 _EXACT: Final = 1e-4
 """A quaternion of a simulator is so close to length 1."""
+_IN_PLANE: Final = ("[0:2]", "x", "y")
 _MOST_SIGNALS: Final = 20
 _MOST_EPISODES: Final = 8
 """Episodes whose numbers are looked at."""
@@ -72,6 +73,11 @@ class Suggestion(NamedTuple):
     order: str = ""
     signals: tuple[str, ...] = ()
     remark: str = ""
+
+    @property
+    def is_in_space(self) -> bool:
+        """Whether the position has three numbers."""
+        return len(self.position) == 3 or self.position[0] not in _IN_PLANE
 
 
 def mappable_features(data_set: DataSet) -> list[Feature]:
@@ -329,6 +335,8 @@ def _entry_lines(suggestion: Suggestion) -> Iterator[str]:
     fields = [f"name: {yaml_text(suggestion.name)}", f"position: {_places(suggestion.position)}"]
     if suggestion.orientation:
         fields += [f"orientation: {_places(suggestion.orientation)}", f"order: {suggestion.order}"]
+    if suggestion.is_in_space:
+        fields.append("height: [0, 0]")
     if suggestion.signals:
         names = ", ".join(
             f"{yaml_text(_signal_name(place))}: {yaml_text(place)}" for place in suggestion.signals

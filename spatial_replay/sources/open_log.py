@@ -42,7 +42,7 @@ from spatial_replay.logs.remote import (
     is_web,
     log_file,
 )
-from spatial_replay.text import counted, counted_from, listed, printable
+from spatial_replay.text import counted, counted_from, printable
 from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
@@ -204,12 +204,10 @@ def _open_episode(path: str, number: int, options: ReadOptions) -> Source:
     data_set.episode(number)
     options.refuse_except(frozenset({"mapping", "max_gap"}), data_set.kind, data_set.name)
     if options.mapping is None and not data_set.names_bodies:
-        if not any(feature.width for feature in data_set.features):
-            names = listed([feature.name for feature in data_set.features])
-            raise UsageError(
-                "no poses in this data set; what would be needed: a feature with the positions of objects in"
-                f" each frame, and {data_set.name} has {names}"
-            )
+        from spatial_replay.mapping.suggest_features import why_poseless
+
+        if reason := why_poseless(data_set):
+            raise UsageError(reason)
         raise UsageError(
             f"{data_set.name} is a {data_set.kind} data set, which does not say what its objects are; give a"
             " mapping file that does, with --mapping FILE or mapping=FILE; for a first one, see:"

@@ -161,3 +161,17 @@ def test_a_mapped_episode_is_shown_as_a_log(tmp_path: Path, capsys: pytest.Captu
     assert (document["name"], document["samples"]) == ("fill#1", 3)
     assert run(["info", f"{tmp_path}/fill#1", "--mapping", str(mapping), "--fit"]) == 0
     assert "    hand: 1" in capsys.readouterr().out.replace('"', "")
+
+
+def test_an_episode_with_a_mapping_has_its_task_and_label(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lerobot(tmp_path / "fill", {"observation.state": (STATE, [0.0] * 4)})
+    mapping = tmp_path / "fill.yaml"
+    assert run(["info", str(folder), "--suggest-mapping", "-o", str(mapping)]) == 0
+    assert run(["info", f"{folder}#0", "--mapping", str(mapping)]) == 0
+    assert capsys.readouterr().out.splitlines()[:3] == [
+        "fill#0: LeRobot v2.1 episode, 3 samples",
+        "task     fill the cup",
+        "label    success",
+    ]
