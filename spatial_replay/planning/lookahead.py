@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -69,7 +70,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 # ----------------------------------------------------------------------------------------------- arrangements
 
-_MOST_SETS: Final = 24
+_MOST_SETS: Final = 200
 """The most sets of objects that are tried for one conjunction."""
 _MOST_VISITS: Final = 200
 """The most cells tried for one set of objects."""
@@ -223,7 +224,7 @@ class Arranger:
             self._slack = 0.0
 
     def _over_cells(self, most: int) -> Iterator[dict[str, Pose]]:
-        queue = [(len(group), number, group) for number, group in enumerate(self._bases(most))]
+        queue = [(self._hubs_in(group), len(group), n, group) for n, group in enumerate(self._bases(most))]
         heapq.heapify(queue)
         seen = {group for *_, group in queue}
         count = len(queue)
@@ -254,7 +255,7 @@ class Arranger:
                     if wider not in seen:
                         seen.add(wider)
                         count += 1
-                        heapq.heappush(queue, (len(wider), count, wider))
+                        heapq.heappush(queue, (self._hubs_in(wider), len(wider), count, wider))
 
     def _bases(self, most: int) -> list[tuple[str, ...]]:
         """Return the least sets of objects that matter to every unmet demand."""
@@ -269,8 +270,22 @@ class Arranger:
                     both = tuple(movable for movable in self._movable if movable in group or movable == name)
                     if len(both) <= most:
                         wider[both] = None
-            sets = dict(list(wider.items())[:_MOST_SETS])
+            # a hub alone seldom meets all the demands about it, and its sets would crowd out the others
+            least = sorted(wider, key=self._hubs_in)
+            sets = dict.fromkeys(least[:_MOST_SETS])
         return list(sets)
+
+    def _hubs_in(self, group: Iterable[str]) -> int:
+        """Return how many objects of a set more than one unmet demand is about."""
+        return sum(name in self._hubs for name in group)
+
+    @cached_property
+    def _hubs(self) -> frozenset[str]:
+        counts = Counter(name for demand in self._unmet for name in self._about[demand])
+        pairs = {frozenset(self._about[demand]) for demand in self._unmet}
+        # several demands about the same pair make neither of it a hub
+        partners = Counter(name for pair in pairs for name in pair if len(pair) > 1)
+        return frozenset(name for name in counts if partners[name] > 1)
 
     def _in_the_way(self, chosen: tuple[str, ...]) -> list[str]:
         """Return other objects, those first that stand where the chosen ones could go."""

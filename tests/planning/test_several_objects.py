@@ -476,3 +476,24 @@ def test_a_recorder_takes_one_planner_before_its_first_sample(tmp_path):
             recorder.attach(Planner(specification, TABLE))
     with pytest.raises(sr.UsageError, match="block=True"):
         sr.Recorder(tmp_path / "third.mcap", planner=Planner(specification, TABLE), block=False)
+
+
+@pytest.mark.parametrize(("count", "seed"), [(5, 1), (6, 2), (7, 4), (7, 5)])
+def test_objects_find_their_places_around_a_plate_that_can_be_moved_too(count, seed):
+    random = np.random.default_rng(seed)
+    things, places = {}, []
+    for name, radius in [("plate", 0.09), *((f"o{number}", 0.03) for number in range(count - 1))]:
+        place = random.uniform(0.12, 0.88, 2)
+        while any(math.dist(place, before) <= radius + apart + 0.06 for before, apart in places):
+            place = random.uniform(0.12, 0.88, 2)
+        places.append((place, radius))
+        things[name] = sr.TrackedObject(sr.Footprint.disc(*place, radius))
+    sides = ("leftof", "rightof", "above", "below")
+    goals = (
+        f"{name} {sides[number % 4]} plate and {name} dist plate <= 0.25 and {name} dist plate >= 0.04"
+        for number, name in enumerate(list(things)[1:])
+    )
+    workspace = Workspace(Grid.over(0, 0, 1, 1, 0.02), clearance=0.005)
+    settings = Settings(workspace, "place", margin=0.01, constraint_margin=0.01)
+    steps, _ = run(Planner(sr.parse_specification(f"spec t = F ({' and '.join(goals)})"), settings), things)
+    assert steps[-1].kind == "hold", steps[-1].reason
