@@ -54,6 +54,7 @@ from spatial_replay.planning.targets import (
     begins_as,
     can_turn_in,
     find_target,
+    is_clear_leg,
     is_repeated,
     nearest_target,
     refine_target,
@@ -196,6 +197,8 @@ class Movables:
         size = gradient.grid.cell_size
         last = (gradient.grid.cell(*point) for point in points_along(target.waypoints[-2:], size / 2))
         if any(gradient.blocked[0][cell] != FREE for cell in last):
+            return False
+        if not is_clear_leg(gradient, target.waypoints[-2:], self.settings):
             return False
         spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
         return bool(can_turn_in(spot, gradient, target.turn, self.settings).all())

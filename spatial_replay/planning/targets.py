@@ -46,6 +46,8 @@ _BETTER: Final = 1e-9
 
 _ASIDE: Final = math.radians(35.0)
 """How far aside another push begins from a direction in which one failed at once."""
+_PLACES_IN_CELL: Final = 4
+"""How many places are looked at for each cell that a leg of a way crosses."""
 _SWEPT: Final = math.radians(10.0)
 """The widest angle between orientations that are looked at while an object turns on the spot."""
 
@@ -157,7 +159,9 @@ def _nearest_cell(
     _, turned, path = min(routes, key=lambda route: route[0])
     cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
     # an object off the middle of its cell need not visit that middle first
-    first = 1 if cells[0] == cell and len(cells) > 1 else 0
+    first = 0
+    if cells[0] == cell and len(cells) > 1:
+        first = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
     turns = [gradient.grid.centre(*corner) for corner in cells[first:]]
     return _target(gradient, tracked, (turned, *cells[-1]), (start, *turns))
 
@@ -194,6 +198,29 @@ def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settin
 
 def _but_for(failures: Sequence[Target]) -> str:
     return ", other than by motions that failed" if failures else ""
+
+
+def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], settings: Settings) -> bool:
+    """Return whether a map's object is clear of everything between two points, not only in cells' middles."""
+    grid, workspace = gradient.grid, settings.workspace
+    points = list(points_along(leg, grid.cell_size / _PLACES_IN_CELL))
+    # no point of a cell is nearer to anything than its middle by more than half its diagonal
+    least = workspace.clearance + grid.cell_size / math.sqrt(2.0)
+    if all(gradient.clearance[0][grid.cell(*point)] > least for point in points):
+        return True
+    about = gradient.made_of.now.about
+    return all(
+        proposition_maps(
+            (), about.regions, about.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
+        ).clearance[0, 0, 0]
+        > workspace.clearance
+        for x, y in points[1:]
+    )
+
+
+def _spot(x: float, y: float, size: float) -> Grid:
+    """Return a grid of one cell with a point in its middle."""
+    return Grid(x - size / 2, y - size / 2, size, 1, 1)
 
 
 def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
