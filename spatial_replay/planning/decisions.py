@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from spatial_replay.planning.maps import Cubes, GradientMap
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
-"""The kind of a step: move an object, hold because the specification is satisfied, wait for an observation or
-for time to pass, or stop because no path to acceptance is left."""
+"""The kind of a step: move an object, hold because the specification is satisfied, wait for an observation,
+for time to pass or for others that move, or stop because no path to acceptance is left."""
 
 Stage: TypeAlias = Literal["pick", "way", "place"]
 """Stages of a motion: picking the object, moving it, placing it at the target."""
@@ -186,7 +186,7 @@ class Step(Displayed):
         target: what to move where, if anything.
         pruned: all edges pruned so far, each with its reason.
         reason: the decision as a sentence.
-        ahead: the states that a wait expects from time alone; empty if it waits for an observation.
+        ahead: the states that a wait expects from time alone; empty if it waits for something else.
         lost: when and by what acceptance was lost; None while the specification can be satisfied.
     """
 
@@ -249,7 +249,9 @@ class Outcome:
 def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
     """Return the outcome of a wait that ended with the automaton in these states."""
     if not step.ahead:
-        return Outcome(succeeded=True, reason="enough is seen")
+        # only a wait for others is for an edge
+        reason = "enough is seen" if step.aim is None else "nothing is in the way any more"
+        return Outcome(succeeded=True, reason=reason)
     if states == step.ahead[-1:]:
         return Outcome(succeeded=True, reason="the time has passed")
     return Outcome(succeeded=False, reason="what is seen has changed")

@@ -498,16 +498,27 @@ class Attempts:
         self._begin = sample, settings
 
     def conclude(
-        self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int], sample: Sample
+        self,
+        aim: Consideration,
+        target: Target,
+        outcome: Outcome,
+        states: Sequence[int],
+        sample: Sample,
+        *,
+        is_stopped: bool = False,
     ) -> None:
-        """Take the outcome of a motion, and the automaton's states and the newest sample after it."""
+        """Take the outcome of a motion, and the automaton's states and the newest sample after it.
+
+        Args:
+            is_stopped: whether it was stopped because of where it led, and not by how it began.
+        """
         before, settings = self._begin
         refused = before is sample and not outcome.succeeded
         self.motions += not refused
         if not outcome.succeeded:
             said = (outcome.reason, "no sample came during the motion" if refused else "")
             self._last[aim.edge] = "; ".join(filter(None, said))
-            stayed = _stands(target.name, before, sample, settings)
+            stayed = not is_stopped and _stands(target.name, before, sample, settings)
             self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
             # a motion that failed at its place may succeed at another one
             if outcome.at in (None, "place") and not (settings.skill == "push" and stayed):
@@ -518,6 +529,11 @@ class Attempts:
             # one of several motions, and fewer are left than ever before
             self._left[aim.edge] = len(aim.motions)
             self._failed[aim.edge] -= 1
+
+    def withdraw(self, edge: Edge) -> None:
+        """Count the motion that begins, or began last, as no attempt."""
+        self._failed[edge] -= 1
+        self._total[edge] -= 1
 
     def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
         """Return the places (x, y) where moving an object failed, whatever it was for."""

@@ -17,7 +17,6 @@ from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.automata.guards import Transition
 from spatial_replay.automata.ltlf import bounds_in_samples, counts_seconds
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.geometry.footprint import centre_of, moved_object
 from spatial_replay.planning.decisions import (
     Consideration,
     Edge,
@@ -34,6 +33,7 @@ from spatial_replay.planning.edges import (
     Attempts,
     Budget,
     Observer,
+    Pose,
     Symbol,
     absence_text,
     consideration_of,
@@ -51,6 +51,12 @@ from spatial_replay.planning.edges import (
 from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
 from spatial_replay.planning.maps import concerns, refuse_delays, refuse_unknown
 from spatial_replay.planning.motions import Expectations, Movables, with_choice
+from spatial_replay.planning.movers import (
+    Evasion,
+    Lookout,
+    motions_between,
+    next_sample,
+)
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Group, Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
@@ -152,6 +158,15 @@ class Planner:
         self._passed: set[Edge] = set()
         self._attempts = Attempts()
         self._running: Step | None = None
+        # of the objects, between the newest two samples
+        self._motions: dict[str, Pose] = {}
+        self._pace = 0.0
+        self._decided: Sample | None = None
+        # whether the motion has to stop because of objects that move by themselves
+        self._is_evaded = False
+        # the motion that is put off until others have passed
+        self._delayed: Target | None = None
+        self._yielded = 0
         self._waiting: Step | None = None
         self._ahead: tuple[int, ...] = ()
         self._steps = 0
@@ -191,9 +206,11 @@ class Planner:
     def stop_reason(self) -> str:
         """Why a motion has to stop now; empty while it may go on.
 
-        A motion has to stop when one more sample would lose acceptance. In that sample the object moves, and
-        turns if it is to be turned, by as much as between the newest two. A robot that asks after each sample
-        can end the motion with `Outcome(False, planner.stop_reason)`.
+        A motion has to stop when one more sample would lose acceptance. In that sample every object moves by
+        as much as between the newest two, and the moved one no farther than its way leads. It also has to
+        stop when another object that moves may come too near within `AHEAD` samples, if waiting or going
+        aside is better. A robot that asks after each sample ends the motion with
+        `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 
@@ -225,6 +242,11 @@ class Planner:
         if self._sample is None:
             refuse_unknown(self._settings.movable or (), sample, self._formulas)
         before, self._sample = self._sample, sample
+        self._motions = {} if before is None else motions_between(before, sample)
+        running = None if self._running is None else self._running.target
+        if running is not None and running.name in self._motions:
+            self._pace = math.hypot(*self._motions[running.name][:2]) or self._pace
+        self._is_evaded = False
         states, symbol = self._states, self._symbol
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(states, self._symbol)
@@ -260,24 +282,32 @@ class Planner:
         was, now = before.objects.get(target.name), sample.objects.get(target.name)
         if was is None or now is None:
             return ""
-        (u, v), (x, y) = centre_of(was.footprint), centre_of(now.footprint)
-        turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau) if target.turn else 0.0
-        if math.hypot(x - u, y - v) <= was.uncertainty + now.uncertainty:
-            if not turned:
-                return ""
-            u, v = x, y
-        moved = moved_object(now, 2.0 * x - u, 2.0 * y - v, turned)
-        objects = {**sample.objects, target.name: moved}
-        symbol = self._observer.symbol(Sample(sample.time_ns, objects, sample.signals, sample.unknown))
+        symbol = self._observer.symbol(next_sample(before, sample, target, self.settings.skill))
         if not self.automaton.step_set(self._states, symbol).isdisjoint(self.automaton.can_accept):
-            return ""
-        labels = zip(self._words.propositions, self._symbol, symbol, strict=True)
+            evasion = self._evasion(target)
+            self._is_evaded = evasion is not None
+            return "" if evasion is None else f"stopped: {evasion.reason}"
+        changes = zip(self._words.propositions, self._symbol, symbol, strict=True)
         changed = [
-            proposition.literal(bool(after)) for proposition, value, after in labels if after is not value
+            proposition.literal(bool(after)) for proposition, value, after in changes if after is not value
         ]
+        numbers = [number for number, value in enumerate(self._symbol) if symbol[number] is not value]
+        self._is_evaded = self._is_about_movers(numbers, target.name)
         return (
             f"stopped: with the next sample, {' and '.join(changed) or 'the specification would be violated'}"
         )
+
+    def _is_about_movers(self, numbers: Iterable[int], name: str) -> bool:
+        """Return whether some propositions are about another object that has moved since the decision."""
+        moved = {} if self._decided is None else motions_between(self._decided, self._newest())
+        formulas = [self._formulas[number] for number in numbers]
+        return any(concerns(formula, mover) for mover in moved.keys() - {name} for formula in formulas)
+
+    def _evasion(self, target: Target) -> Evasion | None:
+        """Return how to keep out of the way of others that move; None if a motion to a target may go on."""
+        lookout = Lookout(self.automaton, self._formulas, self._regions, self.settings)
+        pace = self._pace or self.settings.workspace.grid.cell_size
+        return lookout.evasion(self._newest(), self._states, self._motions, target, pace)
 
     def next_step(self) -> Step:
         """Return the next decision (Algorithm 1).
@@ -296,7 +326,11 @@ class Planner:
         if self._waiting is not None and self._waits_on(self._waiting):
             return self._waiting
         step = self._next_step()
+        self._delayed = None
+        if step.target is not None and self._yielded < MOST_YIELDED:
+            step = self._yielding(step, step.target)
         self._running = step if step.kind == "execute" else None
+        self._decided = self._newest()
         self._waiting = step if step.kind == "wait" else None
         self._ahead = step.ahead
         return step
@@ -315,9 +349,41 @@ class Planner:
         if step is None or step.target is None or step.aim is None:
             raise UsageError("no step is being executed; call next_step() first")
         self._running = None
-        self._attempts.conclude(step.aim, step.target, outcome, self.states, self._newest())
+        # it stands from here on
+        self._motions.pop(step.target.name, None)
+        is_stopped = not outcome.succeeded and outcome.reason == self._stop_reason
+        if self._delayed is not None:
+            # a motion aside is for no edge
+            self._attempts.motions += 1
+        elif is_stopped and self._is_evaded and self._yielded < MOST_YIELDED:
+            # another object is in the way: the motion did not fail
+            self._attempts.motions += 1
+            self._attempts.withdraw(step.aim.edge)
+        else:
+            about = step.aim, step.target, outcome, self.states, self._newest()
+            self._attempts.conclude(*about, is_stopped=is_stopped)
+            self._yielded = 0 if outcome.succeeded else self._yielded
+
+    def _yielding(self, step: Step, target: Target) -> Step:
+        """Return the step of a motion, or the one that keeps out of the way of others before it."""
+        evasion = self._evasion(target)
+        if evasion is None or step.aim is None:
+            return step
+        self._attempts.withdraw(step.aim.edge)
+        self._delayed = target
+        self._yielded += 1
+        aside = evasion.aside
+        if aside is None:
+            return replace(step, kind="wait", target=None, reason=f"wait: {evasion.reason}")
+        place = f"({aside.x:.4g}, {aside.y:.4g})"
+        reason = f"{aside.name} goes aside to {place}: {evasion.reason}"
+        return replace(step, target=aside, reason=reason)
 
     def _waits_on(self, step: Step) -> bool:
+        if self._delayed is not None:
+            self._yielded += 1
+            evasion = self._evasion(self._delayed) if self._yielded < MOST_YIELDED else None
+            return evasion is not None and evasion.aside is None
         return bool(self._ahead) if step.ahead else self._is_blind() or self._lacks_members
 
     def _is_blind(self) -> bool:
@@ -491,6 +557,8 @@ def _cost(target: Target, pushes: bool) -> float:
     return target.length if pushes else -target.robustness
 
 
+MOST_YIELDED: Final = 300
+"""The most samples for which motions wait for others to pass, until one succeeds."""
 HOLDING_SAMPLES: Final = 30
 """How many samples the specification has to stay satisfied before a run ends."""
 MOST_WAITING_SAMPLES: Final = 150
