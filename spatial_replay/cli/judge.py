@@ -176,8 +176,8 @@ def judge(
     if json_file is not None:
         write_json_lines([judgement.document], json_file, inputs)
     if json_file != "-":
-        written = [str(file) for file in (write_labels, annotate) if file is not None]
-        _print(judgement, [folder, *written], conditions)
+        outputs_of_labels = [str(file) for file in (write_labels, annotate) if file is not None]
+        _print(judgement, [folder, *outputs_of_labels], conditions)
     warn(*judgement.remarks, *judgement.batch.remarks)
     warn_of_names(judgement.batch.table)
     warn_of_damage(judgement.batch.table)

@@ -19,7 +19,10 @@ from spatial_replay.batch.workers import Progress, no_progress
 from spatial_replay.errors import UsageError
 from spatial_replay.judging.labels import Labels, SuccessLabel, read_labels
 from spatial_replay.judging.statistics import Rate, pass_hat_k
+from spatial_replay.logs.formats.datasets import data_set_address
+from spatial_replay.logs.formats.episodes import AS_STORED
 from spatial_replay.logs.remote import is_address
+from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.sources.open_log import LOG_ENDINGS
 from spatial_replay.spec.format import format_formula
 from spatial_replay.text import json_value, listed, nearest_hint, printable, with_unit
@@ -105,6 +108,11 @@ class JudgedEpisode:
         """Whether the verdict counts a success; None if it is undecided."""
         return None if self.kind == "undecided" else self.verdict == "satisfied"
 
+    @property
+    def stored_success(self) -> bool | None:
+        """Whether the episode is a success; None if it is undecided, or if its success is unstored."""
+        return None if self.kind == "unstored" else self.is_success
+
 
 _COLUMNS: Final = ("episode", "label", "verdict", "margin", "success_at", "tested", "reason", "task", "seed")
 
@@ -169,9 +177,10 @@ class Judgement:
         """
         outcomes = defaultdict[object, list[bool]](list)
         for row in self.rows:
-            start = RUN.sub("", row.log) if row.seed is None else (row.task, row.seed)
-            if row.is_success is not None and (row.seed is not None or start != row.log):
-                outcomes[start].append(row.is_success)
+            name = row.log if data_set_address(row.log) else RUN.sub("", row.log)
+            is_repeated = row.seed is not None or name != row.log
+            if row.is_success is not None and is_repeated:
+                outcomes[name if row.seed is None else (row.task, row.seed)].append(row.is_success)
         most = min(map(len, outcomes.values()), default=0)
         return {
             k: fmean(pass_hat_k(sum(runs), len(runs), k) for runs in outcomes.values())
@@ -285,9 +294,10 @@ def prepare_judgement(
         UsageError, SpecificationError: see `batch.run.prepare` and `read_labels`.
     """
     (case,) = prepare(suite, progress)
-    return PreparedJudgement(
-        _name_of(case), case, _judging_spec(case, result), read_labels(case.logs, labels)
-    )
+    mapping = case.case.conditions.mapping
+    reading = AS_STORED if mapping is None else load_mapping(mapping).episodes
+    spec = _judging_spec(case, result)
+    return PreparedJudgement(_name_of(case), case, spec, read_labels(case.logs, labels, reading))
 
 
 def _judging_spec(case: PreparedCase, result: str | None) -> _Spec:

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from spatial_replay.batch.run import FoundLog
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
-from spatial_replay.logs.formats.episodes import DataSet, EpisodeReading
+from spatial_replay.logs.formats.episodes import AS_STORED, DataSet, EpisodeReading
 from spatial_replay.logs.remote import is_address
 from spatial_replay.sources.open_log import LOG_ENDINGS
 from spatial_replay.text import counted, first_lines, listed, nearest_hint
@@ -52,12 +52,15 @@ class Labels(NamedTuple):
     files: tuple[Path, ...] = ()
 
 
-def read_labels(logs: Sequence[FoundLog], labels: str | None = None) -> Labels:
+def read_labels(
+    logs: Sequence[FoundLog], labels: str | None = None, reading: EpisodeReading = AS_STORED
+) -> Labels:
     """Read the labels of episodes.
 
     Args:
         labels: a JSON or CSV file, or the name of a field of the data set. Without it, labels are in
             `labels.json` or `labels.csv` next to the logs, or in the data set.
+        reading: what a mapping says about data sets.
 
     Raises:
         MissingFileError: there is no such file.
@@ -65,13 +68,15 @@ def read_labels(logs: Sequence[FoundLog], labels: str | None = None) -> Labels:
             that the data set does not have.
     """
     is_file = labels is not None and (labels.lower().endswith((".json", ".csv")) or Path(labels).is_file())
+    if labels is not None and not is_file:
+        reading = reading._replace(label=labels)
     by_path: dict[str, SuccessLabel] = {}
     folders: dict[Path, None] = {}
     for log in logs:
         address = data_set_address(log.path)
         data_set = None if address is None else open_data_set(address[0])
         if address is not None and data_set is not None:
-            by_path[log.path] = _stored_label(data_set, address[1], None if is_file else labels)
+            by_path[log.path] = _stored_label(data_set, address[1], reading)
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
         elif not is_address(log.path):
@@ -84,14 +89,14 @@ def read_labels(logs: Sequence[FoundLog], labels: str | None = None) -> Labels:
     return Labels(by_path, tuple(files))
 
 
-def _stored_label(data_set: DataSet, number: int, field: str | None) -> SuccessLabel:
+def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> SuccessLabel:
     """Return the label of an episode by its data set; its row reports data that cannot be read."""
     episode, label = data_set.episode(number), data_set.label
     about = SuccessLabel(None, task=episode.task, seed=episode.seed)
-    # labels need no times
-    reading = EpisodeReading(fps=data_set.fps or 1.0, label=field)
+    field = reading.label
     try:
-        columns = data_set.columns(number, reading, ())
+        # labels need no times
+        columns = data_set.columns(number, reading._replace(fps=reading.fps or data_set.fps or 1.0), ())
     except LogError:
         return about
     if columns.success is None or not columns.success.size:

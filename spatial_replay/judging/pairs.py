@@ -122,7 +122,7 @@ def compare_judgements(
         partner = partners.pop(key, None)
         if partner is None:
             counts["alone"] += 1
-        elif None in (row.is_success, partner.is_success) or "unstored" in (row.kind, partner.kind):
+        elif None in (row.stored_success, partner.stored_success):
             counts["undecided"] += 1
         elif not _start_alike(row, partner, conditions, same_start):
             counts["elsewhere"] += 1

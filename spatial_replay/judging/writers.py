@@ -63,7 +63,7 @@ def label_table(judgement: Judgement) -> pa.Table:
 
     # names that read as numbers would become one: 0.10 and 0.1
     name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
-    rows = [(index, row) for index, row in enumerate(judgement.rows) if row.is_success is not None]
+    rows = [(index, row) for index, row in enumerate(judgement.rows) if row.stored_success is not None]
     columns: dict[str, tuple[pa.DataType, list[Any]]] = {
         "run_id": (pa.string(), [name for _ in rows]),
         "policy_id": (pa.string(), [name for _ in rows]),
@@ -86,7 +86,7 @@ def _judged_column(name: str, rows: Sequence[JudgedEpisode | None]) -> tuple[pa.
     import pyarrow as pa
 
     kinds = {"success": pa.bool_(), "margin": pa.float64(), "success_at": pa.float64()}
-    attribute = "is_success" if name == "success" else name
+    attribute = "stored_success" if name == "success" else name
     return kinds.get(name, pa.string()), [None if row is None else getattr(row, attribute) for row in rows]
 
 
@@ -168,16 +168,20 @@ def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
     partial = Path(tempfile.mkdtemp(prefix=f".{new.name}.", dir=new.absolute().parent))
     try:
         for part in folder.iterdir():
-            if part.is_dir():
-                copy = shutil.copy2 if part.name == "meta" else _link
-                shutil.copytree(part, partial / part.name, copy_function=copy)
-            else:
-                shutil.copy2(part, partial / part.name)
+            for parent, _, names in os.walk(part) if part.is_dir() else [(folder, (), [part.name])]:
+                place = partial / Path(parent).relative_to(folder)
+                place.mkdir(parents=True, exist_ok=True)
+                for name in names:
+                    source = Path(parent, name).resolve()
+                    if part.name in ("data", "videos"):
+                        (place / name).symlink_to(source)
+                    else:
+                        shutil.copyfile(source, place / name)
         for file in sorted((partial / "meta/episodes").glob("chunk-*/file-*.parquet")):
             table = parquet.read_table(file)
             rows = [numbered.get(number) for number in table["episode_index"].to_pylist()]
-            parquet.write_table(_annotated_episodes(table, rows, spec), file)
-        partial.chmod(folder.stat().st_mode & 0o777)
+            parquet.write_table(_with_labels(table, rows, spec), file)
+        partial.chmod(0o755)
         partial.rename(new)
     except OSError as error:
         raise output_error(new, error) from error
@@ -186,16 +190,7 @@ def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
             shutil.rmtree(partial)
 
 
-def _link(source: str, target: str) -> None:
-    """Link a file; on another disk by its path."""
-    source = os.path.realpath(source)
-    try:
-        os.link(source, target)
-    except OSError:
-        os.symlink(source, target)  # noqa: PTH211 - as texts, which copytree gives
-
-
-def _annotated_episodes(table: pa.Table, rows: Sequence[JudgedEpisode | None], spec: str) -> pa.Table:
+def _with_labels(table: pa.Table, rows: Sequence[JudgedEpisode | None], spec: str) -> pa.Table:
     import pyarrow as pa
 
     # columns of an earlier judgement, and descriptions of the old columns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -213,6 +214,96 @@ def test_a_table_of_labels_has_true_and_false_and_leaves_undecided_episodes_out(
     assert "ends in .parquet or .csv" in judge("--write-labels", "labels.txt", code=2)
     Path("all.csv").write_text("log,success\nlogs/run-0,true\n")
     assert "is an input" in judge("--labels", "all.csv", "--write-labels", "all.csv", code=2)
+
+
+PUSH = """\
+unit: m
+features:
+  observation.environment_state:
+    - {name: puck, position: [puck_x, puck_y, puck_z], shape: puck}
+    - {name: goal, position: [goal_x, goal_y, goal_z], shape: puck}
+shapes: {puck: {disc: 0.02, height: [-0.02, 0.02]}}
+"""
+
+
+@pytest.fixture
+def push(data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the LeRobot data sets of a pushed puck, a mapping and a specification."""
+    for folder in (data_folder / "learning/lerobot").iterdir():
+        if folder.is_dir():
+            shutil.copytree(folder, tmp_path / folder.name, copy_function=shutil.copyfile)
+    for folder in tmp_path.rglob(""):
+        folder.chmod(0o755)
+    (tmp_path / "push.yaml").write_text(PUSH)
+    (tmp_path / "push.spatial").write_text("spec reached = F (center(puck) dist center(goal) <= 0.05)\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def judge_set(name: str, *arguments: str, code: int = 0) -> str:
+    options = ("--mapping", "push.yaml", "--spec", "push.spatial", "--jobs", "1", *arguments)
+    ended = command("judge", name, *options)
+    assert ended.code == code, ended.out + ended.err
+    return ended.out + ended.err
+
+
+@pytest.mark.parametrize("name", ["push_v3", "push_v21", "push_v3_thirdparty"])
+@pytest.mark.usefixtures("push")
+def test_labels_of_a_data_set_are_its_own(name: str) -> None:
+    document = json.loads(judge_set(name, "--json", "-"))
+    assert (document["agreement"]["both"], document["agreement"]["neither"]) == (2, 2)
+    assert [row["episode"] for row in document["rows"]] == [f"{name}#{number}" for number in range(4)]
+    assert document["rows"][1]["task"] == ("push" if "third" in name else "slide the puck onto the red mark")
+    assert document["pass_k"] == {}
+
+
+@pytest.mark.usefixtures("push")
+def test_successes_after_the_last_frame_are_unstored_and_no_disagreements() -> None:
+    text = judge_set("push_v3_stopped")
+    assert "ours      0 of 4" in text
+    assert "2 of 4  50 %   15 to 85   if the unstored 2 count" in text
+    assert re.search(r"agreement 2 of 2 .*neither 2, unstored 2\n", text)
+    assert "which is not in the data; 3.8 mm were missing" in text
+    judge_set("push_v3_stopped", "--at-least", "0.1", code=4)
+    judge_set("push_v3_stopped", "--at-least", "0.2", code=1)
+
+
+@pytest.mark.usefixtures("push")
+def test_a_field_or_a_file_gives_the_labels_instead() -> None:
+    assert "label     4 of 4" in judge_set("push_v3", "--labels", "next.done")
+    assert "did you mean 'next.success'?" in judge_set("push_v3", "--labels", "next.succes", code=2)
+    Path("push.yaml").write_text(f"label: next.done\n{PUSH}")
+    assert "label     4 of 4" in judge_set("push_v3")
+    Path("mine.csv").write_text("episode,success\n0,0\n1,0\n2,1\n3,0\n")
+    assert "agreement 3 of 4" in judge_set("push_v3", "--labels", "mine.csv")
+
+
+@pytest.mark.usefixtures("push")
+def test_a_data_set_is_copied_with_its_verdicts_for_training() -> None:
+    files = {path: path.read_bytes() for path in Path("push_v3").rglob("*") if path.is_file()}
+    judge_set("push_v3", "--annotate", "new")
+    assert all(path.read_bytes() == data for path, data in files.items())
+    table = pq.read_table("new/meta/episodes/chunk-000/file-000.parquet")
+    assert table["judge/success"].to_pylist() == [True, False, True, False]
+    assert table["judge/success_at"].null_count == 2
+    assert "reached = F (" in table["judge/spec"][0].as_py()
+    old = pq.read_table("push_v3/meta/episodes/chunk-000/file-000.parquet")
+    assert table.select(old.column_names).equals(old)
+    # the copy is a data set, which is judged as the original
+    assert "agreement 4 of 4" in judge_set("new")
+    assert "it exists" in judge_set("push_v3", "--annotate", "new", code=2)
+    judge_set("new", "--result", "reached", "--annotate", "newer")
+    assert pq.read_schema("newer/meta/episodes/chunk-000/file-000.parquet").names == table.column_names
+    judge_set("push_v3_stopped", "--annotate", "stopped")
+    table = pq.read_table("stopped/meta/episodes/chunk-000/file-000.parquet")
+    assert table["judge/success"].to_pylist() == [None, False, None, False]
+
+
+@pytest.mark.usefixtures("push")
+def test_episodes_of_two_data_sets_are_pairs_by_their_numbers() -> None:
+    comparison = sr.judge("push_v3", "push.spatial", against="push_v21", mapping="push.yaml").comparison
+    assert comparison is not None
+    assert (len(comparison.pairs), comparison.elsewhere, comparison.decision) == (4, 0, "undecided")
 
 
 def test_only_a_data_set_is_annotated(fleet: Path) -> None:
