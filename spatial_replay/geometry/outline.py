@@ -63,6 +63,8 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     """
     tidy = np.array(vertices, dtype=np.float64, order="C")
     counts = np.empty(len(vertex_start) - 1, dtype=np.int64)
+    if len(counts) <= _FEW_OUTLINES and _are_normal(np.diff(vertex_start), tidy):
+        return Outlines(np.array(vertex_start, dtype=np.int64), tidy, np.full(len(counts), SOUND, np.int8))
     fault = np.empty(len(counts), dtype=np.int8)
     raw_start = np.array(vertex_start, dtype=np.int64)
     used = _normalise_all(raw_start, tidy, counts, fault)
@@ -70,6 +72,37 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     start = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=start[1:])
     return Outlines(start, tidy[:used], fault)
+
+
+def _are_normal(counts: Integers, vertices: Floats) -> bool:
+    """Return whether all outlines are points, or convex and counter-clockwise with equal numbers of corners.
+
+    Few outlines are tested by arrays much sooner than one by one in an interpreted kernel.
+    """
+    most = int(counts.max(initial=0))
+    is_point = counts == 1
+    if most > _MOST_TESTED_CORNERS or not (is_point | (counts == most)).all():
+        return False
+    if not (np.abs(vertices) <= LARGEST_COORDINATE).all():
+        return False
+    if most <= 1:
+        return True
+    corners = vertices if not is_point.any() else vertices[np.repeat(~is_point, counts)]
+    x, y = corners.reshape(-1, most, 2).transpose(2, 1, 0)
+    extent = np.maximum(np.ptp(x, axis=0), np.ptp(y, axis=0))
+    magnitude = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
+    tolerance = np.maximum(_FLATNESS * extent, np.maximum(_ROUNDING * magnitude, _SMALLEST))
+    # the test of `_winding`, of all corners at once
+    next_x, next_y = np.roll(x, -1, axis=0), np.roll(y, -1, axis=0)
+    along_x, along_y = next_x - x, next_y - y
+    before_x, before_y = np.roll(along_x, 1, axis=0), np.roll(along_y, 1, axis=0)
+    chord_x, chord_y = next_x - np.roll(x, 1, axis=0), next_y - np.roll(y, 1, axis=0)
+    cross = before_x * along_y - before_y * along_x
+    is_left = (cross > 0.0) & (cross * cross > tolerance * tolerance * (chord_x**2 + chord_y**2))
+    if not is_left.all():
+        return False
+    is_upper = (next_y > y) | ((next_y == y) & (next_x > x))
+    return bool((np.count_nonzero(is_upper != np.roll(is_upper, 1, axis=0), axis=0) == 2).all())
 
 
 def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
@@ -82,6 +115,10 @@ def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
 
 def _limit_corners(counts: Integers, fault: NDArray[np.int8]) -> None:
     fault[(counts > MOST_CONVEX_CORNERS) & (fault == SOUND)] = TOO_MANY_CORNERS
+
+
+_FEW_OUTLINES = 4_096
+_MOST_TESTED_CORNERS = 16
 
 
 @elementwise

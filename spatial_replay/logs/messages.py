@@ -281,13 +281,14 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
 
     @wraps(iter_blocks)
     def wrapped(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        pauses, reports, before = Pauses(), ReportsBack(), Trace.empty()
+        pauses, reports = Pauses(), ReportsBack()
+        before: Trace | None = None
         for block in iter_blocks(self, start_ns, end_ns):
             trace = block.trace
             pauses.add(trace.times_ns, trace.is_unknown)
             reports.add(trace)
             if self.max_gap_ns is not None and len(trace):
-                block = replace(block, trace=_without_gaps(before, trace, self.max_gap_ns))
+                block = replace(block, trace=_without_gaps(before or Trace.empty(), trace, self.max_gap_ns))
                 before = trace.slice(len(trace) - 1, len(trace))
             yield block
         pause = pauses.remark("samples", self.max_gap_ns)

@@ -107,9 +107,11 @@ class EpisodeSource(Source):
                 f"{self.name}: it has no feature {feature!r}, which {self.mapped_by.name} marks as optional"
                 for feature in _bind(self.mapped_by, self.data_set).absent
             ]
-        yield Block(
-            replace(within(trace, start_ns, end_ns), faults=faults.take(last=True)), remarks=tuple(remarks)
-        )
+        if start_ns is not None or end_ns is not None:
+            trace = within(trace, start_ns, end_ns)
+        if len(faults):
+            trace = replace(trace, faults=faults.take(last=True))
+        yield Block(trace, remarks=tuple(remarks))
 
     def _point_remarks(self, columns: EpisodeColumns) -> Iterator[str]:
         """Yield a remark on bodies of which neither the data set nor the mapping says the shape."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from examples import examples
@@ -24,7 +24,7 @@ from laws.strategies_geometry import (
 from spatial_replay import ConvexPart, Footprint
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
-from spatial_replay.geometry.outline import SOUND, normalise_polygons
+from spatial_replay.geometry.outline import SOUND, normalise_polygon, normalise_polygons
 
 TOLERANCE = 1e-6
 """Loose enough for the other library; slivers within a billionth of a shape's extent are flattened."""
@@ -270,6 +270,25 @@ def test_outlines_normalise_alike_alone_and_together_and_idempotently(outlines):
             assert ConvexPart(np.array(corners)).vertices.tobytes() == mine.tobytes()
     again = normalise_polygons(together.vertex_start, together.vertices)
     assert again.vertices.tobytes() == together.vertices.tobytes()
+
+
+_NEARLY = st.sampled_from([0.0, -0.0, 1e-8, 1e-9, 2e-9, -1e-9, 1e-10, 1e-16, -1e-16, 1e-100])
+_NEAR_CORNERS = st.tuples(st.integers(0, 2), _NEARLY, st.integers(0, 2), _NEARLY)
+
+
+@given(st.lists(st.lists(_NEAR_CORNERS, min_size=4, max_size=4), min_size=1, max_size=4), st.booleans())
+@example([[(0, 0.0, 0, 0.0), (2, 0.0, 0, 0.0), (2, 0.0, 1, 0.0), (0, 0.0, 1, 0.0)]], False)
+@example([[(0, 0.0, 0, 0.0), (1, 0.0, 0, -1e-9), (2, 0.0, 0, 0.0), (0, 0.0, 1, 0.0)]], False)
+@example([[(0, 0.0, 0, 0.0), (2, 0.0, 1, 0.0), (0, 0.0, 1, 0.0), (2, 0.0, 0, 0.0)]], True)
+def test_outlines_that_are_tested_together_are_those_that_are_tidied_one_by_one(corners, has_point):
+    outlines = [np.array([(x + small_x, y + small_y) for x, small_x, y, small_y in part]) for part in corners]
+    outlines += [np.array([[0.5, 0.5]])] if has_point else []
+    start = np.concatenate([[0], np.cumsum([len(outline) for outline in outlines])])
+    together = normalise_polygons(start, np.concatenate(outlines))
+    for number, outline in enumerate(outlines):
+        vertices, fault = normalise_polygon(outline.copy())
+        begin, end = together.vertex_start[number : number + 2]
+        assert (together.vertices[begin:end].tobytes(), together.fault[number]) == (vertices.tobytes(), fault)
 
 
 @given(convex_vertices(min_size=3))

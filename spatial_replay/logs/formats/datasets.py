@@ -65,7 +65,8 @@ def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
     if match is None or "://" in match[1]:
         return None
     try:
-        is_address = Path(match[1]).exists() and not Path(fspath(text)).exists()
+        # as texts: paths would take most of the time
+        is_address = os.path.exists(match[1]) and not os.path.exists(match[0])  # noqa: PTH110
     except (OSError, ValueError):
         return None
     return (match[1], int(match[2])) if is_address else None
@@ -154,7 +155,8 @@ class _LeRobot(DataSet):
                 f"meta/info.json says {counted(total, 'episode')}, and meta has {len(self.episodes)}"
             )
         self.remarks = tuple(remarks)
-        self._loaded: tuple[object, Mapping[str, Floats]] = (None, {})
+        # a file, the columns that were looked for in it, and those that it has
+        self._loaded: tuple[object, frozenset[str], Mapping[str, Floats]] = (None, frozenset(), {})
 
     def columns(
         self, number: int, reading: EpisodeReading = AS_STORED, features: Sequence[str] | None = None
@@ -246,11 +248,11 @@ class _LeRobot(DataSet):
     def _table(self, file: Path, wanted: set[str]) -> Mapping[str, Floats]:
         """Return columns of a file; those of the last file stay in memory."""
         key = (file, file.stat().st_mtime_ns)
-        table = self._loaded[1] if self._loaded[0] == key else {}
-        absent = wanted - table.keys()
-        if absent:
-            self._loaded = (key, {**table, **_read_columns(file, absent)})
-        return self._loaded[1]
+        names, table = self._loaded[1:] if self._loaded[0] == key else (frozenset[str](), {})
+        unread = wanted - names
+        if unread:
+            self._loaded = (key, names | wanted, {**table, **_read_columns(file, unread)})
+        return self._loaded[2]
 
 
 def _features(features: Mapping[str, Any]) -> Iterator[Feature]:
