@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from spatial_replay.batch.outputs import AGREEMENT, LABEL
 from spatial_replay.batch.run import BatchResult
@@ -60,39 +60,29 @@ def label_table(judgement: Judgement) -> pa.Table:
     where the data set has none.
     """
     import pyarrow as pa
+    import pyarrow.compute as pc
 
+    table = _table_with_success(judgement)
     # names that read as numbers would become one: 0.10 and 0.1
     name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
-    rows = [(index, row) for index, row in enumerate(judgement.rows) if row.stored_success is not None]
-    columns: dict[str, tuple[pa.DataType, list[Any]]] = {
-        "run_id": (pa.string(), [name for _ in rows]),
-        "policy_id": (pa.string(), [name for _ in rows]),
-        "task": (pa.string(), [row.task for _, row in rows]),
-        "episode": (pa.string(), [row.episode for _, row in rows]),
-        "episode_idx": (pa.int64(), [_number(row, index) for index, row in rows]),
-        "seed": (pa.int64(), [row.seed for _, row in rows]),
-        **{column: _judged_column(column, [row for _, row in rows]) for column in _JUDGED},
-    }
-    optional = {name for name in ("task", "seed") if not any(value is not None for value in columns[name][1])}
-    present = {name: column for name, column in columns.items() if name not in optional}
-    return pa.table({name: pa.array(values, kind) for name, (kind, values) in present.items()})
+    numbers = pa.array(_episode_numbers(judgement), pa.int64())
+    names = pa.array([name] * len(table), pa.string())
+    for column, values in {"run_id": names, "policy_id": names, "episode_idx": numbers}.items():
+        table = table.append_column(column, values)
+    absent = [column for column in ("task", "seed") if table[column].null_count == len(table)]
+    return table.drop_columns(absent).filter(pc.is_valid(table["success"]))
 
 
-_JUDGED: Final = ("success", "margin", "success_at", "tested", "reason")
-"""Columns of labels that are written."""
-
-
-def _judged_column(name: str, rows: Sequence[JudgedEpisode | None]) -> tuple[pa.DataType, list[Any]]:
+def _table_with_success(judgement: Judgement) -> pa.Table:
     import pyarrow as pa
 
-    kinds = {"success": pa.bool_(), "margin": pa.float64(), "success_at": pa.float64()}
-    attribute = "stored_success" if name == "success" else name
-    return kinds.get(name, pa.string()), [None if row is None else getattr(row, attribute) for row in rows]
+    successes = pa.array([row.stored_success for row in judgement.rows], pa.bool_())
+    return judgement.table.append_column("success", successes)
 
 
-def _number(row: JudgedEpisode, index: int) -> int:
-    address = data_set_address(row.log)
-    return index if address is None else address[1]
+def _episode_numbers(judgement: Judgement) -> list[int]:
+    addresses = (data_set_address(row.log) for row in judgement.rows)
+    return [index if address is None else address[1] for index, address in enumerate(addresses)]
 
 
 def _is_number(name: str) -> bool:
@@ -163,8 +153,6 @@ def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
     """
     from pyarrow import parquet
 
-    numbered = {_number(row, index): row for index, row in enumerate(judgement.rows)}
-    spec = f"{judgement.file}: {judgement.result} = {judgement.formula}"
     partial = Path(tempfile.mkdtemp(prefix=f".{new.name}.", dir=new.absolute().parent))
     try:
         for part in folder.iterdir():
@@ -178,9 +166,7 @@ def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
                     else:
                         shutil.copyfile(source, place / name)
         for file in sorted((partial / "meta/episodes").glob("chunk-*/file-*.parquet")):
-            table = parquet.read_table(file)
-            rows = [numbered.get(number) for number in table["episode_index"].to_pylist()]
-            parquet.write_table(_with_labels(table, rows, spec), file)
+            parquet.write_table(_with_labels(parquet.read_table(file), judgement), file)
         partial.chmod(0o755)
         partial.rename(new)
     except OSError as error:
@@ -190,14 +176,18 @@ def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
             shutil.rmtree(partial)
 
 
-def _with_labels(table: pa.Table, rows: Sequence[JudgedEpisode | None], spec: str) -> pa.Table:
+def _with_labels(table: pa.Table, judgement: Judgement) -> pa.Table:
+    """Return a table of episodes with the columns of a judgement; null for episodes that are not judged."""
     import pyarrow as pa
 
-    # columns of an earlier judgement, and descriptions of the old columns
+    places = {number: place for place, number in enumerate(_episode_numbers(judgement))}
+    order = [places.get(number) for number in table["episode_index"].to_pylist()]
+    labels = _table_with_success(judgement).take(pa.array(order, pa.int64()))
+    # without columns of an earlier judgement, and descriptions of the old columns
     names = [name for name in table.column_names if not name.startswith("judge/")]
     table = table.select(names).replace_schema_metadata(None)
-    for name in _JUDGED:
-        kind, values = _judged_column(name, rows)
-        table = table.append_column(f"judge/{name}", pa.array(values, kind))
-    specs = [None if row is None else spec for row in rows]
+    for name in ("success", "margin", "success_at", "tested", "reason"):
+        table = table.append_column(f"judge/{name}", labels[name])
+    spec = f"{judgement.file}: {judgement.result} = {judgement.formula}"
+    specs = [None if place is None else spec for place in order]
     return table.append_column("judge/spec", pa.array(specs, pa.string()))

@@ -7,6 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
+import pandas
 import pyarrow.parquet as pq
 import pytest
 
@@ -210,7 +211,9 @@ def test_a_table_of_labels_has_true_and_false_and_leaves_undecided_episodes_out(
     assert rows[0]["policy_id"] == "logs"
     assert not {"seed", "task"} & rows[0].keys()
     judge("--write-labels", "labels.csv")
-    assert Path("labels.csv").read_text().splitlines()[1].startswith('"logs","logs","run-0",0,true,0.2')
+    frame = pandas.read_csv("labels.csv")
+    assert frame["success"].tolist() == [True, True, False]
+    assert frame["margin"].tolist() == pytest.approx([0.2, 0.1, -0.1])
     assert "ends in .parquet or .csv" in judge("--write-labels", "labels.txt", code=2)
     Path("all.csv").write_text("log,success\nlogs/run-0,true\n")
     assert "is an input" in judge("--labels", "all.csv", "--write-labels", "all.csv", code=2)
@@ -297,6 +300,11 @@ def test_a_data_set_is_copied_with_its_verdicts_for_training() -> None:
     judge_set("push_v3_stopped", "--annotate", "stopped")
     table = pq.read_table("stopped/meta/episodes/chunk-000/file-000.parquet")
     assert table["judge/success"].to_pylist() == [None, False, None, False]
+    # an episode that is not judged has no label
+    judge_set("push_v3#2", "--annotate", "one")
+    table = pq.read_table("one/meta/episodes/chunk-000/file-000.parquet")
+    assert table["judge/success"].to_pylist() == [None, None, True, None]
+    assert table["judge/spec"].null_count == 3
 
 
 @pytest.mark.usefixtures("push")
