@@ -18,6 +18,7 @@ from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
 from spatial_replay.logs.messages import Block, Source, noting_pauses
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
 from spatial_replay.mapping.detections import Detections
+from spatial_replay.mapping.episode_evidence import jump_remark, order_remarks
 from spatial_replay.mapping.feature_reader import (
     FeatureReading,
     bind_features,
@@ -101,12 +102,18 @@ class EpisodeSource(Source):
             trace = self._trace(columns, faults)
         if not len(trace):
             raise LogError(f"{self.name} has no frame")
-        remarks = [f"{self.name}: {remark}" for remark in (*columns.remarks, *self._point_remarks(columns))]
+        remarks: list[str] = [
+            f"{self.name}: {remark}" for remark in (*columns.remarks, *self._point_remarks(columns))
+        ]
         if self.mapped_by is not None:
             remarks += [
                 f"{self.name}: it has no feature {feature!r}, which {self.mapped_by.name} marks as optional"
                 for feature in _bind(self.mapped_by, self.data_set).absent
             ]
+            objects = _bind(self.mapped_by, self.data_set).objects
+            remarks += [f"{self.name}: {remark}" for remark in order_remarks(objects, columns.features)]
+        if (jump := jump_remark(trace, self.name)) is not None:
+            remarks.append(jump)
         if start_ns is not None or end_ns is not None:
             trace = within(trace, start_ns, end_ns)
         if len(faults):
@@ -234,8 +241,8 @@ def _rows_of_body(body: Body, axes: Axes) -> ObservationRows:
             vertex_start=np.arange(count + 1, dtype=np.int64),
             vertices=np.ascontiguousarray(body.positions[:, :2]),
             radius=np.zeros(count),
-            bottom=np.full(count, np.nan),
-            top=np.full(count, np.nan),
+            bottom=body.positions[:, 2].copy(),
+            top=body.positions[:, 2].copy(),
         )
     no_class = np.zeros(count, np.int64)
     return ObservationRows(

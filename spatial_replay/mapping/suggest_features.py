@@ -45,7 +45,7 @@ _PART: Final = re.compile(
 )
 _POINT: Final = re.compile(r"(?P<stem>.*?)_?(?P<what>pos|position|xyz|xpos|goal)", re.IGNORECASE)
 _POSE: Final = re.compile(r"(?P<stem>.*?)_?pose", re.IGNORECASE)
-_HANDS: Final = re.compile(r"eef|\bee\b|tcp|hand|grip|tool|robot|flange", re.IGNORECASE)
+HANDS: Final = re.compile(r"eef|\bee\b|tcp|hand|grip|tool|robot|flange", re.IGNORECASE)
 """Names of parts of robots, which need not stand upright."""
 _LENGTH_ERROR: Final = 0.01
 _EXACT: Final = 1e-4
@@ -299,7 +299,7 @@ def _with_orientation(
         )
     if order:
         return suggestion._replace(orientation=places, order=order)
-    upright = None if _HANDS.search(suggestion.name) else quaternion_order([quaternions])
+    upright = None if HANDS.search(suggestion.name) else quaternion_order([quaternions])
     if upright is None:
         return suggestion._replace(remark=undecided)
     return suggestion._replace(

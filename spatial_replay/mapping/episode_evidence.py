@@ -1,0 +1,76 @@
+"""Evidence against an episode of a data set: jumps of its objects, and the order of its quaternions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.logs.formats.hdf5 import quaternion_order
+from spatial_replay.mapping.evidence import extents
+from spatial_replay.mapping.feature_reader import BoundObject, Columns
+from spatial_replay.mapping.suggest_features import HANDS
+from spatial_replay.text import Instant, Sentence, number_text
+from spatial_replay.trace.trace import Trace
+
+_FAR: Final = 0.05
+"""Share of the scene's extent that an object crosses in a jump, at least."""
+_SUDDEN: Final = 20.0
+"""How many times longer a jump is than the steps before and after it."""
+_GRAVITY: Final = 9.81
+"""Metres a second squared."""
+
+
+def jump_remark(trace: Trace, episode: str) -> Sentence | None:
+    """Return a remark on the farthest jump of an object from one frame to the next; None without one.
+
+    An object that is thrown or pushed moves for several frames; one that jumps is at rest around its jump, or
+    moves much slower. Exchanged ranges of frames, and frames from before a reset, look like this.
+    """
+    if len(trace) < 3 or not len(trace.footprints.radius):
+        return None
+    shapes, rows = trace.footprints, trace.rows.T
+    is_points = len(shapes.vertices) == len(shapes.part_start) - 1
+    centres = shapes.vertices if is_points else extents(shapes)[0]
+    places = np.column_stack([centres, shapes.bottom])
+    # (N, T, 3): the centre of each object, and its bottom
+    places = np.where((rows >= 0)[:, :, None], places[np.maximum(rows, 0)], np.nan)
+    places[:, :, 2][np.isnan(places[:, :, 2])] = 0.0
+    moves = np.diff(places, axis=1)
+    steps = np.sqrt(np.einsum("ijk,ijk->ij", moves, moves))
+    around = np.zeros_like(steps)
+    around[:, 1:] = steps[:, :-1]
+    around[:, :-1] = np.fmax(around[:, :-1], steps[:, 1:])
+    # a body falls by half of this in one frame
+    fall = _GRAVITY * (np.diff(trace.times_ns) / 1e9) ** 2
+    with np.errstate(invalid="ignore"):
+        is_jump = (steps > _SUDDEN * around) & (steps > fall)
+    if not is_jump.any():
+        return None
+    extent = np.nan_to_num(np.fmax.reduce(places, axis=(0, 1)) - np.fmin.reduce(places, axis=(0, 1))).max()
+    is_jump &= steps > _FAR * extent
+    if not is_jump.any():
+        return None
+    number, frame = np.unravel_index(int(np.where(is_jump, steps, 0.0).argmax()), steps.shape)
+    count = int(np.count_nonzero(is_jump))
+    return Sentence(
+        f"{episode} at ",
+        Instant(int(trace.times_ns[frame + 1]), 0),
+        f": {trace.names[number]} jumps by {number_text(float(steps[number, frame]))}, and moves at most"
+        f" {number_text(float(around[number, frame]))} in the frames next to it"
+        f"{f' ({count} jumps in all)' if count > 1 else ''}; frames may be missing, exchanged, or from"
+        " another run",
+    )
+
+
+def order_remarks(objects: Iterable[BoundObject], columns: Columns) -> Iterator[str]:
+    """Yield remarks on quaternions without names that are upright only in the other order."""
+    for thing in objects:
+        places = thing.quaternion
+        if not places or HANDS.search(thing.name) or not all(place.name.endswith("]") for place in places):
+            continue
+        rows = [columns[place.feature].reshape(len(columns[place.feature]), -1) for place in places]
+        quaternions = np.column_stack([row[:, place.number] for row, place in zip(rows, places, strict=True)])
+        if quaternion_order([quaternions]) == "wxyz":
+            yield f"{thing.name} stands upright only if its orientation has the other order; check `order`"
