@@ -18,9 +18,12 @@ from __future__ import annotations
 import atexit
 import errno
 import fcntl
+import gc
 import hashlib
 import os
+import platform
 import shutil
+import subprocess
 import sys
 import tempfile
 import threading
@@ -41,6 +44,9 @@ from spatial_replay.errors import UsageError
 
 _WAIT_S: Final = 1.0
 """Compiling that takes less is not announced."""
+_SLICE_S: Final = 2e-4
+"""How long the thread that loads code may keep the interpreter from a control loop."""
+_REMEDY: Final = "`spatial-replay warmup` does it beforehand"
 
 
 class Compiler:
@@ -54,21 +60,30 @@ class Compiler:
             )
         self.interprets = True
         self.spent_s = 0.0
+        # tasks that a child process compiles, with the runs that load their code afterwards
+        self.trials: list[tuple[str, Callable[[], object]]] = []
+        self.loader: threading.Thread | None = None
+        self._loading = set[int]()
         self.listeners: list[Callable[[], None]] = []
         self._is_announced = False
         # a module that another thread is still importing is in `sys.modules`, too
         self._compiler: Any = None
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
 
     @cached_property
-    def _folder(self) -> Path | None:
+    def folder(self) -> Path | None:
         return cache_folder()
+
+    @property
+    def is_awaiting(self) -> bool:
+        """Whether this thread interprets what a child process compiles."""
+        return bool(self.trials) and threading.get_ident() not in self._loading
 
     @cached_property
     def _cached(self) -> frozenset[str]:
         """The kernels whose machine code earlier processes have left in the cache."""
         # a file is named after module, function and line: kernels.measure_rows-335.py311.nbi
-        files = () if self._folder is None else self._folder.rglob("*.nbi")
+        files = () if self.folder is None else self.folder.rglob("*.nbi")
         return frozenset(path.name.partition("-")[0] for path in files)
 
     def holds(self, function: Any) -> bool:
@@ -77,21 +92,21 @@ class Compiler:
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
         """Return a function that is compiled for the types of its arguments when it is called."""
-        with self._lock:
+        with self.lock:
             if self._compiler is None:
                 import numba
 
-                if self._folder is not None:
-                    remove_damaged(self._folder)
+                if self.folder is not None:
+                    remove_damaged(self.folder)
                     # and of what kernels that the cache holds are compiled for later
-                    atexit.register(seal, self._folder)
+                    atexit.register(seal, self.folder)
                 self._compiler = numba
-            compiler, is_cached = self._compiler, self._folder is not None
+            compiler, is_cached = self._compiler, self.folder is not None
             # the folder is read from the compiler's settings when a function is decorated; they belong to
             # the user's own functions, too, and are put back
             before = compiler.config.CACHE_DIR
             if is_cached:
-                compiler.config.CACHE_DIR = str(self._folder)
+                compiler.config.CACHE_DIR = str(self.folder)
             try:
                 available = compiler.njit(function).targetdescr.options
                 # an option that another version of the compiler does not have changes speed only
@@ -112,18 +127,62 @@ class Compiler:
         timer.daemon = True
         timer.start()
         try:
-            with turn(self._folder, _name(function)):
+            with turn(self.folder, _name(function)):
                 yield
-                if self._folder is not None:
-                    seal(self._folder)
+                if self.folder is not None:
+                    seal(self.folder)
         finally:
             timer.cancel()
+
+    @contextmanager
+    def loading(self) -> Iterator[None]:
+        """Load machine code in this thread, while others interpret."""
+        # of the files that a child has written
+        self.__dict__.pop("_cached", None)
+        before, thread = sys.getswitchinterval(), threading.get_ident()
+        sys.setswitchinterval(_SLICE_S)
+        self._loading.add(thread)
+        try:
+            yield
+        finally:
+            self._loading.discard(thread)
+            sys.setswitchinterval(before)
+
+    def await_code(self) -> bool:
+        """Begin a thread that loads the code of all trials, unless one runs; say whether it was begun."""
+        with self.lock:
+            if self.loader is not None or self.folder is None:
+                return False
+            self.loader = threading.Thread(target=_load_code, args=(self.folder,), daemon=True)
+            self.loader.start()
+            return True
+
+    def finish(self, count: int) -> bool:
+        """End the thread that loads code, unless more than so many trials wait; say whether it ends."""
+        with self.lock:
+            if len(self.trials) > count:
+                return False
+            self.trials.clear()
+            self.loader = None
+            return True
+
+    def renew(self) -> None:
+        """Begin the thread again in a forked process, which has none of its parent's."""
+        self.lock = threading.RLock()
+        self._loading.clear()
+        if self.loader is not None:
+            self.loader = None
+            self.await_code()
+
+    def say(self, text: str) -> None:
+        """Write a line on standard error, unless a listener shows that kernels are compiled."""
+        if not self.listeners:
+            sys.stderr.write(f"spatial-replay: {text}\n")
 
     def _announce(self) -> None:
         if not self.listeners and not self._is_announced:
             self._is_announced = True
-            remedy = "`spatial-replay warmup` does it beforehand"
-            sys.stderr.write(f"spatial-replay: compiling, once on this machine; {remedy}\n")
+            self.say(f"compiling, once on this machine; {_REMEDY}")
 
 
 def _name(function: Any) -> str:
@@ -188,11 +247,146 @@ def inlined(function: Callable[_Arguments, _Result], **options: bool) -> Callabl
 
 
 def compile_ahead() -> None:
-    """Interpret no kernel in this process from now on.
-
-    For control loops and servers: a call that is compiled late would keep them waiting in the middle.
-    """
+    """Interpret no kernel in this process from now on."""
     _process.interprets = False
+
+
+def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None:
+    """Make kernels ready for a control loop, which a call that is compiled late would keep waiting.
+
+    A trial run loads machine code that the cache holds. Otherwise a child process compiles it, and all
+    kernels that are not loaded are interpreted until a thread has loaded it.
+
+    Args:
+        task: the one of `spatial-replay warmup` that compiles all kernels of the trial.
+        wait: compile in this process instead, before this returns.
+    """
+    compile_ahead()
+    if _process.only is not None or wait or _is_compiled(task):
+        with _process.loading():
+            trial()
+        return
+    if _process.folder is None:
+        _process.folder = _passing_folder()
+    _process.trials.append((task, trial))
+    try:
+        # interpreted: it imports and keeps all that the first sample would wait for
+        trial()
+    except BaseException:
+        _process.trials.remove((task, trial))
+        raise
+    if _process.await_code():
+        _process.say(
+            f"code is interpreted while a child process compiles it, once on this machine; {_REMEDY}"
+        )
+
+
+def _passing_folder() -> Path | None:
+    """Return a folder for machine code of this process alone; None if none can be written."""
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="spatial-replay-"), f"kernels-{source_digest()}")
+        folder.mkdir()
+    except OSError:
+        _process.say("code is interpreted: no folder can be written; name one with SPATIAL_REPLAY_CACHE")
+        return None
+    atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
+    return folder
+
+
+def write_note(task: str) -> None:
+    """Note that the cache holds all kernels of a task of `spatial-replay warmup`."""
+    if _process.folder is not None:
+        seal(_process.folder)
+        _note_of(task, _process.folder).touch()
+
+
+def _is_compiled(task: str) -> bool:
+    return _process.folder is not None and _note_of(task, _process.folder).exists()
+
+
+def _note_of(task: str, folder: Path) -> Path:
+    """Return the file that says that the code of a task is there."""
+    return folder / f"{task}-{_target()}.compiled"
+
+
+@cache
+def _target() -> str:
+    """Return a digest of what machine code depends on besides the sources: Python, compiler, processor."""
+    # imported now: while a loop runs, that would keep it waiting
+    import numba
+
+    target = [sys.version, numba.__version__, platform.machine(), platform.processor()]
+    with suppress(OSError):  # not Linux
+        # of the first core
+        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
+        target += [line for line in lines if line.startswith(("model name", "flags", "Features"))]
+    return hashlib.sha256("\n".join(target).encode()).hexdigest()[:16]
+
+
+def _load_code(folder: Path) -> None:
+    """Load the code of all trials, each compiled by a child process: one at a time on a machine."""
+    count = 0
+    try:
+        while not _process.finish(count):
+            task, trial = _process.trials[count]
+            note = _note_of(task, folder)
+            # waits for the child of another process; the lock is also the child's, and ends with both
+            with turn(folder, "warmup") as lock:
+                status = 0 if note.exists() else _compile_in_child(task, folder, lock)
+            if not note.exists():
+                raise OSError(f"the child process that compiles it has ended with status {status}")
+            with _process.loading(), _no_collection():
+                trial()
+            count += 1
+    except Exception as error:
+        # interpreted from now on: a loop must not wait for the compiler
+        _process.loader = None
+        _process.say(f"code stays interpreted: {error!s:.200}; {_REMEDY}")
+    else:
+        _process.say("compiled code is loaded")
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Keep new objects out of garbage collections: each keeps all threads waiting for 50 ms."""
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+_CHILD: Final = """
+import sys
+sys.path[:] = sys.argv[2:]
+from spatial_replay.cli.warmup import compile_task
+compile_task(sys.argv[1])
+"""
+
+
+def _compile_in_child(task: str, folder: Path, lock: int) -> int:
+    """Compile a task in a child, which goes on if this process ends; return its status."""
+    if not sys.executable or getattr(sys, "frozen", False):
+        raise OSError("this program has no interpreter of its own to begin a child process with")
+    # a child that compiles starts none itself
+    environment = {
+        **os.environ,
+        "SPATIAL_REPLAY_KERNELS": "compiled",
+        "SPATIAL_REPLAY_CACHE": str(folder.parent),
+    }
+    return subprocess.call(
+        [sys.executable, "-P", "-c", _CHILD, task, *sys.path],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        pass_fds=(lock,),
+    )
 
 
 def kernels() -> Iterator[_Kernel[..., Any]]:
@@ -282,7 +476,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         if _process.only is not None:
             return _process.only == "interpreted"
         if not _process.interprets:
-            return False
+            return _process.is_awaiting
         guess = _GUESS_S * self.times if self._element_s is None else self._element_s
         cost = elements * guess
         if _process.spent_s + cost <= _PATIENCE_S or self._spent_s + cost <= _WARM_S:
@@ -349,6 +543,7 @@ def _view(value: Any) -> object:
 
 
 _process: Final = Compiler()
+os.register_at_fork(after_in_child=_process.renew)
 
 
 def cores() -> int:
@@ -434,16 +629,20 @@ def remove_damaged(folder: Path) -> None:
 
 
 @contextmanager
-def turn(folder: Path | None, kernel: str) -> Iterator[None]:
-    """Wait for other processes that compile the same kernel: what they wrote is then loaded."""
+def turn(folder: Path | None, kernel: str) -> Iterator[int]:
+    """Wait for other processes that compile the same kernel: what they wrote is then loaded.
+
+    Yields:
+        The descriptor of the lock, which a child process may inherit; -1 without a folder.
+    """
     if folder is None:
-        yield
+        yield -1
         return
     descriptor = _opened_lock(folder, f"{kernel}.lock")
     try:
         with suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
+        yield descriptor
     finally:
         os.close(descriptor)
 

@@ -19,7 +19,7 @@ import click
 from spatial_replay.bags.ros1 import record_table
 from spatial_replay.cli.terminal import progress, show
 from spatial_replay.compare.runs import diff_sources
-from spatial_replay.compiled import cache_folder, compilations, compile_ahead
+from spatial_replay.compiled import cache_folder, compilations, only, write_note
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.messages import MemorySource
@@ -53,7 +53,7 @@ def warm_up_kernels(workers: int, advance: Callable[[int], None] = lambda steps:
         workers: number of processes.
         advance: called with 1 after each of the `len(TASKS)` tasks.
     """
-    with ProcessPoolExecutor(workers, get_context("spawn"), compile_ahead) as pool:
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         for task in as_completed([pool.submit(_run, name) for name in TASKS]):
             task.result()
             advance(1)
@@ -61,8 +61,15 @@ def warm_up_kernels(workers: int, advance: Callable[[int], None] = lambda steps:
 
 
 def _run(name: str) -> None:
-    with compilations(lambda: None):
+    with compilations(lambda: None), only("compiled"):
         TASKS[name]()
+    write_note(name)
+
+
+def compile_task(name: str) -> None:
+    """Compile the kernels of one of `TASKS` in this process, beside a program that uses them."""
+    os.nice(10)
+    _run(name)
 
 
 def _samples() -> list[Sample]:

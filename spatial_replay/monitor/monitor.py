@@ -11,7 +11,7 @@ from reprlib import repr as shortened
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
-from spatial_replay.compiled import compile_ahead
+from spatial_replay import compiled
 from spatial_replay.errors import SpecificationError, TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
@@ -31,7 +31,7 @@ from spatial_replay.monitor.sentences import (
     without_residue,
 )
 from spatial_replay.monitor.stream import Instance, LiveStream
-from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
+from spatial_replay.monitor.verdict import Semantics, Verdict, final_verdict, online_verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import DecidingAtom, End
 from spatial_replay.monitor.witness.threshold import Threshold
@@ -232,9 +232,11 @@ class Monitor:
         strict_names: bool = False,
         wait_for: Collection[str] = (),
         start_within: str | None = "1s",
+        wait: bool = False,
     ) -> None:
-        """Start before the first sample, with everything compiled: the first time on a machine, that takes
-        many seconds.
+        """Start before the first sample.
+
+        The first time on a machine, updates are interpreted while a child process compiles their code.
 
         Args:
             start_ns: samples before this time are only there to be looked back at (`a[-3]`).
@@ -246,6 +248,8 @@ class Monitor:
                 them has come. Samples before it are not evaluated.
             start_within: a time ("1s") after the first sample; evaluation begins then without those that are
                 missing (`late`). None to wait for them as long as it takes.
+            wait: compile in this process before the first sample, for loops above 500 Hz. The first time on a
+                machine, that takes many seconds.
 
         Raises:
             UsageError: not a specification, unknown semantics, an invalid start, units that are not texts,
@@ -266,13 +270,8 @@ class Monitor:
         self._monitored = Monitored(
             tuple(zip(self._specs, node_names, self._units, strict=True)), _places_of_names(node_names)
         )
-        compile_ahead()
-        # a trial run loads every kernel now, so that no sample has to wait for one
-        trial = LiveStream(specification, checked, 0)
-        for time_ns in range(2):
-            trial.extend(Sample(time_ns))
-        if checked == "ltlf":
-            rehearse(specification)
+        task = "paper" if checked == "paper" else "monitor"
+        compiled.start(task, partial(_run_trial, specification, checked), wait=wait)
         first_ns = start_ns or 0
         self._begin = partial(LiveStream, specification, checked, first_ns)
         self._remember: Callable[[], ViolationLog | None] = lambda: None
@@ -701,6 +700,15 @@ def rehearse(specification: Specification) -> None:
                 spec, program, specification, conjunct, Verdict.VIOLATED, 0.0, (sample,), 0, True, 0, {}
             )
             _ = trial.violation.sentences, trial.reason
+
+
+def _run_trial(specification: Specification, semantics: Semantics) -> None:
+    """Load every kernel, so that no sample has to wait for one."""
+    trial = LiveStream(specification, semantics, 0)
+    for time_ns in range(2):
+        trial.extend(Sample(time_ns))
+    if semantics == "ltlf":
+        rehearse(specification)
 
 
 class ViolationLog:

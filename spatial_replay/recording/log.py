@@ -7,13 +7,14 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay import __version__
+from spatial_replay import __version__, compiled
 from spatial_replay.annotate.automaton_state import SpecAutomaton, automata_attachments
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
@@ -28,7 +29,6 @@ from spatial_replay.annotate.events import (
     track,
 )
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
-from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.geometry.measure import Operand, contacts
@@ -460,14 +460,17 @@ def encodable(samples: Sequence[Sample]) -> list[Sample]:
 
 
 def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
-    """Record some samples into memory, so that the code for the specifications is compiled and loaded.
+    """Record some samples into memory, so that the code for the specifications is loaded.
 
-    With an empty compiler cache this takes many seconds, otherwise a fraction of one.
+    With an empty compiler cache, code is interpreted until a child process has compiled it.
 
     Args:
         automata: those of the specifications, which are not compiled again.
     """
-    compile_ahead()
+    compiled.start("record and replay", partial(_record_trial, files, automata))
+
+
+def _record_trial(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
     writer = LogWriter(BytesIO())
     recording = Recording(writer, files, known=automata)
     objects = ["object", *(name for file in files for name in object_names(file))]

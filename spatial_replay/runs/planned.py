@@ -14,10 +14,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Unpack
 
+from spatial_replay import compiled
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.automata.compile import chosen_spec
-from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.messages import BEHAVIOUR_TREE, PLAN_METADATA, protobuf_channel
@@ -253,11 +253,14 @@ def record_plan(
 
 
 def warm_up_planner() -> None:
-    """Plan a push that is not executed, so that the first decision does not wait for the compiler.
+    """Plan a push that is not executed, so that the first decision does not wait for code to be loaded.
 
-    With an empty compiler cache this takes many seconds, otherwise a fraction of one.
+    With an empty compiler cache, code is interpreted until a child process has compiled it.
     """
-    compile_ahead()
+    compiled.start("plan", _plan_trial)
+
+
+def _plan_trial() -> None:
     task = parse_specification("F (cup leftof jug and cup dist jug >= 1)")
     workspace = Workspace(Grid(0.0, 0.0, 1.0, 8, 8), obstacles=(Footprint.box(0, 0, 1, 1),))
     box = BlackBox(Planner(task, Settings(workspace, "push")))

@@ -6,6 +6,8 @@ import importlib.util
 import json
 import os
 import random
+import subprocess
+import sys
 import tempfile
 import time
 from array import array
@@ -92,6 +94,28 @@ _CROWD = """\
 group people = class "person"
 spec apart = G (forall p in people: p dist robot >= 0.5)
 """
+
+
+_FIRST_START = """
+import time
+import spatial_replay as sr
+begin = time.process_time()
+monitor = sr.Monitor(sr.parse_specification("G (a dist b >= 0.1 -> F[0, 50] p >= 0)"))
+print(time.process_time() - begin)
+"""
+
+
+def bench_first_start(bench: Any) -> None:
+    """The first `Monitor` on a machine: processor time of its process before it takes a sample."""
+    # a child process may still write there
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as cache:
+        spent_s = subprocess.run(
+            [sys.executable, "-c", _FIRST_START],
+            env=os.environ | {"SPATIAL_REPLAY_CACHE": cache},
+            stdout=subprocess.PIPE,
+            check=True,
+        ).stdout
+    bench.quantile("ready", [float(spent_s)], 0.5, unit="start", limit_s=0.7)
 
 
 def bench_monitor_shapes(bench: Any) -> None:
