@@ -406,6 +406,8 @@ def judge(
     result: str | None = None,
     against: PathName | Sequence[PathName] | None = None,
     same_start: float | None = None,
+    failures: PathName | None = None,
+    stages: bool = False,
     output: PathName | None = None,
     jobs: int = 1,
     allow: Sequence[str] = (),
@@ -424,6 +426,8 @@ def judge(
         result: the name of the spec that judges; by default the last one that no other spec uses.
         against: earlier episodes to compare with.
         same_start: how far the objects of a pair may be apart in the first sample; 0.001 unless given.
+        failures: a specification file, whose specs are failures; each failed episode has the first of them.
+        stages: whether each episode has its stage of the task at the end.
         output: the folder of results; without one, results are not stored.
 
     The other arguments and errors are those of `evaluate_logs`.
@@ -436,20 +440,25 @@ def judge(
     from spatial_replay.batch.suite import Conditions
     from spatial_replay.judging.judgement import prepare_judgement
     from spatial_replay.judging.pairs import SAME_START, compare_judgements
+    from spatial_replay.judging.stages import episode_stages, with_stages
 
     refuse_unknown(reading, Reading.__annotations__)
     allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
     conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
+    files = [specifications] if isinstance(specifications, str | PathLike) else list(specifications)
+    specifications = files if failures is None else [failures, *files]
     suites = [_suite(episodes, specifications, conditions) for episodes in (logs, against) if episodes]
-    files = (None if labels is None else fspath(labels), None)
+    label_files = (None if labels is None else fspath(labels), None)
     prepared = [
-        prepare_judgement(suite.allowing(allowed), file, result)
-        for suite, file in zip(suites, files, strict=False)
+        prepare_judgement(suite.allowing(allowed), file, result, has_failures=failures is not None)
+        for suite, file in zip(suites, label_files, strict=False)
     ]
     with TemporaryDirectory() as folder:
         cases = [part.case for part in prepared]
         batch = run_batch(cases, folder if output is None else output, workers_of(jobs))
     judgement, *earlier = (part.judgement(batch, allowed) for part in prepared)
+    if stages:
+        judgement = with_stages(judgement, episode_stages(judgement, cases[0]))
     if not earlier:
         return judgement
     distance = SAME_START if same_start is None else same_start

@@ -221,7 +221,7 @@ class _Episodes:
         for name, value, values in (("until", until, _UNTIL), ("reward", reward, _REWARDS)):
             if value is not None and value not in values:
                 raise UsageError(f"{name} is {value!r}; give {listed(values)}, or None")
-        self._specification = _judging(specification, result)
+        self._specification = _with_only_result(specification, result)
         self._spec = self._specification.results[-1].name
         self._monitor = Monitor(self._specification, missing_after=1)
         self._stages = _stages(self._specification, rate_hz, is_needed=reward == "progress")
@@ -314,7 +314,7 @@ class _Episodes:
         return judged
 
 
-def _judging(specification: Specification, result: str | None) -> Specification:
+def _with_only_result(specification: Specification, result: str | None) -> Specification:
     """Return a specification with the only result that judges."""
     require_specification(specification)
     names = [spec.name for spec in specification.results]

@@ -88,6 +88,13 @@ if TYPE_CHECKING:
     help="With --against: how far objects of a pair may start apart, in units of length.  [default: 0.001]",
 )
 @click.option(
+    "--failures",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Specs that are failures: the first that is satisfied is named for each failed episode.",
+)
+@click.option("--stages", is_flag=True, help="Print at which stage of the task the episodes end.")
+@click.option(
     "--at-least",
     metavar="RATE",
     type=click.FloatRange(0.0, 1.0),
@@ -110,6 +117,8 @@ def judge(
     annotate: Path | None,
     against: tuple[str, ...],
     same_start: float | None,
+    failures: Path | None,
+    stages: bool,
     at_least: float | None,
     jobs: int | None,
     allow: frozenset[str],
@@ -132,16 +141,22 @@ def judge(
     from spatial_replay.batch.run import workers_of
     from spatial_replay.judging.judgement import prepare_judgement
     from spatial_replay.judging.pairs import SAME_START, compare_judgements
+    from spatial_replay.judging.stages import episode_stages, with_stages
     from spatial_replay.judging.writers import annotate_data_set, check_annotation, ending_of_labels
     from spatial_replay.judging.writers import write_labels as write_label_table
 
     if same_start is not None and not against:
         raise UsageError("--same-start is about pairs; add --against LOG")
-    suite = suite_of_logs(logs, conditions, semantics).allowing(allow)
-    prepared = [prepare_judgement(suite, labels, result, progress)]
+    if failures is not None and (not conditions.specs or failures in conditions.specs):
+        raise UsageError("--failures has no spec that judges; give that with --spec")
+    has_failures = failures is not None
+    specs = conditions.specs if failures is None else (failures, *conditions.specs)
+    evaluated = replace(conditions, specs=specs)
+    suite = suite_of_logs(logs, evaluated, semantics).allowing(allow)
+    prepared = [prepare_judgement(suite, labels, result, progress, has_failures=has_failures)]
     if against:
-        earlier = suite_of_logs(against, conditions, semantics).allowing(allow)
-        prepared.append(prepare_judgement(earlier, None, result, progress))
+        earlier = suite_of_logs(against, evaluated, semantics).allowing(allow)
+        prepared.append(prepare_judgement(earlier, None, result, progress, has_failures=has_failures))
     cases = [part.case for part in prepared]
     warnings = [warning for file in cases[0].files for warning in file.warnings]
     show_diagnostics({str(warning): warning for warning in warnings}.values())
@@ -164,6 +179,8 @@ def judge(
             SAME_START if same_start is None else same_start,
         )
         judgement = replace(judgement, comparison=comparison)
+    if stages:
+        judgement = with_stages(judgement, episode_stages(judgement, cases[0], progress))
     if write_labels is not None:
         write_label_table(judgement, write_labels, inputs)
     if annotate is not None and data_set is not None:
@@ -186,9 +203,18 @@ def judge(
 
 def _print(judgement: Judgement, outputs: Sequence[str], conditions: ConditionArguments) -> None:
     from spatial_replay.judging.pairs import comparison_lines
-    from spatial_replay.judging.sentences import difference_lines, summary_lines
+    from spatial_replay.judging.sentences import (
+        difference_lines,
+        failure_lines,
+        stage_lines,
+        summary_lines,
+    )
 
     show(*summary_lines(judgement), *difference_lines(judgement), "")
+    if judgement.failure_file:
+        show(*failure_lines(judgement), "")
+    if judgement.stages:
+        show(*stage_lines(judgement), "")
     if judgement.comparison is not None:
         show(*comparison_lines(judgement.comparison), "")
     rows = [[row for row in judgement.rows if row.kind == kind] for kind in ("only_theirs", "only_ours")]

@@ -17,6 +17,7 @@ from spatial_replay.batch.run_table import RUN, Values, worst_rows
 from spatial_replay.batch.suite import Suite
 from spatial_replay.batch.workers import Progress, no_progress
 from spatial_replay.errors import UsageError
+from spatial_replay.judging.failures import Failure, first_failures
 from spatial_replay.judging.labels import Labels, SuccessLabel, read_labels
 from spatial_replay.judging.statistics import Rate, pass_hat_k
 from spatial_replay.logs.formats.datasets import data_set_address
@@ -89,6 +90,9 @@ class JudgedEpisode:
         reason: a sentence on what decided.
         task, seed: where the data set has them.
         log: its path or address.
+        failure, failure_at: the first failure that happened in it, see `first_failures`; only of a failed
+            episode that is judged with a file of failures.
+        stage, progress: those at its end, if stages are wanted; see `annotate.stages`.
     """
 
     episode: str
@@ -102,6 +106,10 @@ class JudgedEpisode:
     task: str | None
     seed: int | None
     log: str
+    failure: str | None = None
+    failure_at: float | None = None
+    stage: str | None = None
+    progress: float | None = None
 
     @property
     def is_success(self) -> bool | None:
@@ -127,6 +135,8 @@ class Judgement:
         rows: one for each episode, in their order.
         batch: the results of all specs.
         comparison: with earlier episodes, if there are any.
+        failure_file: the name of the file of failures, or "".
+        stages: names of the stages of the task, the farthest from success first; none unless they are wanted.
     """
 
     name: str
@@ -136,6 +146,22 @@ class Judgement:
     rows: tuple[JudgedEpisode, ...]
     batch: BatchResult
     comparison: Comparison | None = None
+    failure_file: str = ""
+    stages: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of its rows."""
+        failures = ("failure", "failure_at") if self.failure_file else ()
+        return (*_COLUMNS, *failures, *(("stage", "progress") if self.stages else ()))
+
+    @cached_property
+    def failures(self) -> dict[str | None, tuple[JudgedEpisode, ...]]:
+        """The failed episodes by their first failure, the most frequent first; None is none of the file."""
+        failed = [row for row in self.rows if row.is_success is False]
+        counts = Counter(row.failure for row in failed)
+        names = sorted(counts, key=lambda name: (name is None, -counts[name]))
+        return {name: tuple(row for row in failed if row.failure == name) for name in names}
 
     @cached_property
     def agreement(self) -> Agreement:
@@ -208,13 +234,19 @@ class Judgement:
             numbers[f"{name}rate"] = rate.value
             numbers[f"{name}interval"] = None if rate.interval is None else list(rate.interval)
         rows = [
-            {**{name: getattr(row, name) for name in _COLUMNS}, "agreement": row.kind} for row in self.rows
+            {**{name: getattr(row, name) for name in self.columns}, "agreement": row.kind}
+            for row in self.rows
         ]
         document = {"name": self.name, "episodes": len(self.rows), "decided": self.rate.episodes}
         document |= {"file": self.file, "result": self.result, "formula": self.formula}
         document |= {"agreement": asdict(self.agreement), **numbers, "pass_k": self.pass_k}
         if self.comparison is not None:
             document["comparison"] = self.comparison.document
+        if self.failure_file:
+            document["failures"] = {name or "other": len(failed) for name, failed in self.failures.items()}
+        if self.stages:
+            counts = Counter(row.stage for row in self.rows)
+            document["stages"] = {name: counts[name] for name in self.stages}
         document |= {"remarks": self.remarks, "rows": rows}
         return {name: json_value(value) for name, value in document.items()}
 
@@ -224,10 +256,10 @@ class Judgement:
         import pyarrow as pa
 
         types = {"label": pa.bool_(), "seed": pa.int64()}
-        types |= dict.fromkeys(("margin", "success_at"), pa.float64())
-        schema = pa.schema([(name, types.get(name, pa.string())) for name in (*_COLUMNS, "kind")])
+        types |= dict.fromkeys(("margin", "success_at", "failure_at", "progress"), pa.float64())
+        schema = pa.schema([(name, types.get(name, pa.string())) for name in (*self.columns, "kind")])
         columns = [[getattr(row, name) for row in self.rows] for name in schema.names]
-        return pa.table(columns, schema=schema).rename_columns([*_COLUMNS, "agreement"])
+        return pa.table(columns, schema=schema).rename_columns([*self.columns, "agreement"])
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the rows as a data frame, see `table`."""
@@ -248,12 +280,14 @@ class PreparedJudgement:
 
     Attributes:
         case: for `run_batch`.
+        failure_file: the name of the file of failures among its files, or "".
     """
 
     name: str
     case: PreparedCase
     spec: _Spec
     labels: Labels
+    failure_file: str = ""
 
     def judgement(self, batch: BatchResult, allow: AbstractSet[str] = frozenset()) -> Judgement:
         """Return the judgement, given the results of a batch with the case.
@@ -278,17 +312,26 @@ class PreparedJudgement:
             )
             for log, path in paths.items()
         )
-        return Judgement(self.name, *self.spec, rows, batch)
+        if self.failure_file:
+            failures = first_failures(batch.table, self.failure_file)
+            rows = tuple(_with_failure(row, failures.get(log)) for row, log in zip(rows, paths, strict=True))
+        return Judgement(self.name, *self.spec, rows, batch, failure_file=self.failure_file)
 
 
 def prepare_judgement(
-    suite: Suite, labels: str | None = None, result: str | None = None, progress: Progress = no_progress
+    suite: Suite,
+    labels: str | None = None,
+    result: str | None = None,
+    progress: Progress = no_progress,
+    *,
+    has_failures: bool = False,
 ) -> PreparedJudgement:
     """Find the episodes of a suite of one case, their labels, and the result that judges them.
 
     Args:
         labels: see `read_labels`.
         result: the name of a spec; by default the last one that no other spec uses.
+        has_failures: whether the first file of the suite has failures, see `first_failures`.
 
     Raises:
         UsageError, SpecificationError: see `batch.run.prepare` and `read_labels`.
@@ -296,16 +339,22 @@ def prepare_judgement(
     (case,) = prepare(suite, progress)
     mapping = case.case.conditions.mapping
     reading = AS_STORED if mapping is None else load_mapping(mapping).episodes
-    spec = _judging_spec(case, result)
-    return PreparedJudgement(_name_of(case), case, spec, read_labels(case.logs, labels, reading))
+    return PreparedJudgement(
+        _name_of(case),
+        case,
+        _judging_spec(case, result, int(has_failures)),
+        read_labels(case.logs, labels, reading),
+        case.files[0].name if has_failures else "",
+    )
 
 
-def _judging_spec(case: PreparedCase, result: str | None) -> _Spec:
+def _judging_spec(case: PreparedCase, result: str | None, first: int) -> _Spec:
+    """Return the spec that judges, of the files from the first one on that may."""
     texts = tuple(file.text for file in case.files)
     files = parsed_specifications(texts, case.case.conditions)
     specs = [
         _Spec(named.name, spec.name, printable(format_formula(spec.formula), 200))
-        for named, file in zip(case.files, files, strict=True)
+        for named, file in zip(case.files[first:], files[first:], strict=True)
         for spec in file.results
     ]
     if result is None:
@@ -319,7 +368,7 @@ def _judging_spec(case: PreparedCase, result: str | None) -> _Spec:
         )
     names = [spec.name for spec in specs]
     hint = nearest_hint(result, names) or f"results are {listed(names)}"
-    if any(result == spec.name for file in files for spec in file.specs):
+    if any(result == spec.name for file in files[first:] for spec in file.specs):
         hint = f"other specs use it, so it has no result; add `spec judged = {result}`"
     raise UsageError(f"--result {result}: no result has this name; {hint}")
 
@@ -386,6 +435,12 @@ def _judged_episode(
         seed=label.seed,
         log=path,
     )
+
+
+def _with_failure(row: JudgedEpisode, failure: Failure | None) -> JudgedEpisode:
+    if failure is None or row.is_success is not False:
+        return row
+    return replace(row, failure=failure.name, failure_at=failure.at)
 
 
 def _undecided_reason(row: Values, allow: AbstractSet[str]) -> str:

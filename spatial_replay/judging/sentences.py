@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement, Kind
 from spatial_replay.judging.statistics import Rate
-from spatial_replay.text import counted, first_lines
+from spatial_replay.text import counted, first_lines, listed
 
 _TITLES: Final[dict[Kind, str]] = {
     "only_theirs": "only the label counts",
@@ -17,6 +18,7 @@ _TITLES: Final[dict[Kind, str]] = {
 }
 _MOST: Final = 10
 """Episodes of a kind that are listed."""
+_MOST_IN_LINE: Final = 5
 
 
 def summary_lines(judgement: Judgement) -> Iterator[str]:
@@ -69,6 +71,30 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
             yield f"{title} {len(rows):,}:"
             width = max(len(row.episode) for row in rows[:_MOST])
             yield from (f"  {line}" for line in first_lines([_line(row, width) for row in rows], _MOST))
+
+
+def failure_lines(judgement: Judgement) -> Iterator[str]:
+    """Yield how many episodes failed by which failure, and the first of them."""
+    failed = sum(map(len, judgement.failures.values()))
+    yield f"first failures of the {counted(failed, 'episode')} that fail `{judgement.result}`"
+    names = {name: name or "none of the file" for name in judgement.failures}
+    width = max(map(len, names.values()), default=0)
+    for name, rows in judgement.failures.items():
+        episodes = listed([row.episode for row in rows], _MOST_IN_LINE)
+        yield f"  {names[name]:<{width}}  {len(rows):>{len(str(failed))},}  {episodes}"
+
+
+def stage_lines(judgement: Judgement) -> Iterator[str]:
+    """Yield how many episodes ended at which stage, also of those that the label calls failures."""
+    failures = [row for row in judgement.rows if row.label is False]
+    title, end = f"stages of `{judgement.result}`", "at the end"
+    width = max(map(len, (*judgement.stages, title)))
+    of_label = f"of the {len(failures):,} that the label calls failures"
+    yield f"{title:<{width}}  {end}  {of_label if failures else ''}".rstrip()
+    numbers = [Counter(row.stage for row in rows) for rows in (judgement.rows, failures)]
+    for name in judgement.stages:
+        at_end, of_failures = (f"{count[name]:,}" for count in numbers)
+        yield f"{name:<{width}}  {at_end:<{len(end)}}  {of_failures if failures else ''}".rstrip()
 
 
 def _line(row: JudgedEpisode, width: int) -> str:

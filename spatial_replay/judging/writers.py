@@ -31,8 +31,12 @@ _WORDS: Final = {True: "success", False: "failure", None: None}
 def labelled_batch(judgement: Judgement) -> BatchResult:
     """Return the batch of a judgement with its labels, of which disagreements are the failures."""
     import pyarrow as pa
+    import pyarrow.compute as pc
 
     table = judgement.batch.table
+    if judgement.failure_file:
+        # a failure that does not happen is no failing result
+        table = table.filter(pc.not_equal(table["file"], judgement.failure_file))
     paths = {request.log.name: request.log.path for request in judgement.batch.wanted}
     episodes = {row.log: row for row in judgement.rows}
     rows = [episodes[paths[log]] for log in table["log"].to_pylist()]
