@@ -371,7 +371,8 @@ def evaluate_logs(
 
     Returns:
         `table`, a `pyarrow.Table` with one row for each log, spec and object of a template, and `failures`,
-        the rows that do not pass. A log that cannot be read is a row with its `error`.
+        the rows that do not pass. A log that cannot be read is a row with its `error`. Rows that pass have
+        no explanation.
 
     Raises:
         UsageError: a pattern without a log, options that do not work, pyarrow is not installed.
@@ -379,6 +380,7 @@ def evaluate_logs(
         OutputError: results cannot be written; those written so far stay.
         ClusterError: the scheduler is lost; the results written so far stay.
     """
+    from spatial_replay.batch.explanations import explain_batch, failing_places
     from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.suite import Conditions, load_suite
 
@@ -395,7 +397,9 @@ def evaluate_logs(
         suite = load_suite(named[0])
     else:
         suite = _suite(logs, specifications, conditions)
-    return run_batch(prepare(suite.allowing(allowed)), output, workers_of(jobs, dask), fail_on=fails)
+    workers = workers_of(jobs, dask)
+    result = run_batch(prepare(suite.allowing(allowed)), output, workers, fail_on=fails)
+    return explain_batch(result, failing_places(result.table), workers, results=output)
 
 
 def judge(
@@ -455,7 +459,10 @@ def judge(
     ]
     with TemporaryDirectory() as folder:
         cases = [part.case for part in prepared]
-        batch = run_batch(cases, folder if output is None else output, workers_of(jobs))
+        workers = workers_of(jobs)
+        batch = run_batch(cases, folder if output is None else output, workers)
+        for part in prepared:
+            batch = part.explain(batch, workers, allowed)
     judgement, *earlier = (part.judgement(batch, allowed) for part in prepared)
     if stages:
         judgement = with_stages(judgement, episode_stages(judgement, cases[0]))

@@ -96,7 +96,7 @@ class ReplayItem(pytest.Item):
             return None
         title = row.spec if row.object is None else f"{row.spec}[{row.object}]"
         about = requirement_text(row.requirement or ", ".join(self._case.requirements), row.title)
-        lines = [f"{self._log}: {title}: {failure}", about, *row.explanation]
+        lines = [f"{self._log}: {title}: {failure}", about, *(row.explanation or ())]
         return "\n".join(filter(None, lines))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
@@ -132,11 +132,11 @@ class _Results:
         return self._rows[task]
 
     def _evaluated(self, tasks: list[Task]) -> Iterator[tuple[Task, tuple[tuple[ResultRow, ...], ...]]]:
-        from spatial_replay.batch.rows import error_rows, rows_from_task
+        from spatial_replay.batch.rows import error_rows, rows_with_explanations
         from spatial_replay.batch.run import workers_of
         from spatial_replay.batch.workers import WorkerLost
 
-        for task, rows in workers_of(self._jobs).results(rows_from_task, tasks):
+        for task, rows in workers_of(self._jobs).results(rows_with_explanations, tasks):
             yield task, error_rows(task, str(rows), "machine") if isinstance(rows, WorkerLost) else rows
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from types import MappingProxyType
@@ -147,6 +147,8 @@ def diff_runs(
     now: pa.Table,
     tolerance: Tolerance = Tolerance(),  # noqa: B008 - a frozen value
     names: tuple[str | PathLike[str], str | PathLike[str]] = ("the first", "the second"),
+    *,
+    explain: Callable[[pa.Table, list[int]], pa.Table] = lambda table, places: table,
 ) -> RunDiff:
     """Compare the tables of two runs, result by result.
 
@@ -156,18 +158,26 @@ def diff_runs(
     Args:
         tolerance: how much less is no change.
         names: of the two, for errors.
+        explain: returns a table in which the rows at some places are explained.
 
     Raises:
         UsageError: the runs have no result in common, or a tolerance without the unit of the results.
     """
+    unexplained = before, now
     before, now = _tested(_renamed(before, now)), _tested(now)
-    rows = {key: row for table in (before, now) for key, row in _rows(table)}
     if not set(keys_of(before)) & set(keys_of(now)):
         examples = [f"{name} has {_example(table)}" for name, table in zip(names, (before, now), strict=True)]
         raise UsageError(f"no result is in both: {', and '.join(examples)}; give runs over the same logs")
+    differences = compare(now, before, tolerance, with_all=True)
+    different = {difference.key for difference in differences if difference.change not in ("new", "more")}
+    before, now = (
+        _with_reasons(table, explain(rows, [at for at, key in enumerate(keys_of(table)) if key in different]))
+        for table, rows in zip((before, now), unexplained, strict=True)
+    )
+    rows = {key: row for table in (before, now) for key, row in _rows(table)}
     firsts = dict(_rows(before))
     changes = []
-    for difference in compare(now, before, tolerance, with_all=True):
+    for difference in differences:
         row = rows.get(difference.key) or rows[*difference.key[:-1], None]
         is_fixed = difference.change == "better" and difference.key in firsts
         reason = (firsts[difference.key] if is_fixed else row)["reason"] or row["error"] or ""
@@ -178,6 +188,12 @@ def diff_runs(
     changes.sort(key=lambda change: KINDS.index(change.kind))
     specs = Counter((case, file, spec) for case, _, file, spec, _ in rows)
     return RunDiff(len({log for _, log, *_ in rows}), len(rows), tuple(changes), specs)
+
+
+def _with_reasons(table: pa.Table, explained: pa.Table) -> pa.Table:
+    """Return a table with the reasons of another one, which has the same rows under other names."""
+    index = table.schema.get_field_index("reason")
+    return table.set_column(index, table.schema.field(index), explained.column("reason"))
 
 
 def _rows(table: pa.Table) -> Iterator[tuple[Key, dict[str, Any]]]:

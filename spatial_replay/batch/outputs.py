@@ -121,7 +121,7 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
     for row in (rows[place] for place in order[:_ANNOTATIONS]):
         about = requirement_of(row)
         name = f"{row['spec']} ({about})" if about else row["spec"]
-        message = f"{row['log']}: {row['failure'].rstrip('.')}. {row['reason']}".rstrip()
+        message = f"{row['log']}: {row['failure'].rstrip('.')}. {row['reason'] or ''}".rstrip()
         file = row["file"] if is_address(row["file"]) else folder / row["file"]
         yield annotation("error", repository_path(file), row["line"], message, title=name)
 
@@ -165,7 +165,7 @@ def markdown(table: pa.Table) -> str:
         for row in failing:
             names = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
             verdict = f"{verdict_word(row)}{damage_word(row)}"
-            lines.append(_line([*names, verdict, row["failure"], row["reason"]]))
+            lines.append(_line([*names, verdict, row["failure"], row["reason"] or ""]))
     flaky = first_lines([result.text for result in flaky_results(table)], _MOST_FLAKY)
     lines += ["", *(f"- {_markdown_cell(line)}" for line in flaky)] if flaky else []
     return "\n".join([*lines, "", ""])
@@ -316,7 +316,7 @@ def _case(
         # errors are about the test, failures about what it tests
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or _unmet(row)
-        texts = [*dict.fromkeys([*row["explanation"], *row["vacuous"]])] or [row["failure"]]
+        texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
         text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
         text = cut(text, limit or len(text))
         message = printable(row["failure"], limit or 1_000)
@@ -443,7 +443,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
             element("td", *_named(row)),
             _number("td", robustness_of(row)),
             element("td", text(row["failure"])),
-            element("td", *_with_code(row["reason"])),
+            element("td", *_with_code(row["reason"] or "")),
         )
         for row in rows
     ]
@@ -578,9 +578,13 @@ def _cell(row: Values | None) -> Html:
     words = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
     value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
     why = f": {row['failure'].rstrip('.')}" if fails else ""
-    tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
+    tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}."
     tip = " ".join(
-        [tip, *(sentence for sentence in row["untested"] or () if sentence.rstrip(".") not in why)]
+        [
+            tip,
+            *filter(None, [row["reason"]]),
+            *(sentence for sentence in row["untested"] or () if sentence.rstrip(".") not in why),
+        ]
     )
     words = f"{words}{damage_word(row)}{before}"
     return element("td", words, title=tip, **{"class": kind, "data-value": value})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal, TypeAlias
@@ -43,6 +43,9 @@ ErrorKind: TypeAlias = Literal["usage", "log", "unfit", "machine"]
 
 A log that is "unfit" can be read, and lacks what the suite requires.
 """
+
+ResultName: TypeAlias = tuple[int, str, str | None]
+"""A result of a task: the number of its specification file, its spec, and the object of a template."""
 
 _LONGEST: Final = 2_000
 """Characters of a text in a row."""
@@ -87,7 +90,8 @@ class ResultRow:
         atom, atom_time_ns, atom_objects: what decides the verdict: the first cause of a violation.
         reason: what decided and, if that is not what the number is of, what gave it; "" under the paper's
             semantics.
-        explanation: what `explain` says, in sentences, but for since when a satisfied spec has held.
+        explanation: what `explain` says, in sentences, but for since when a satisfied spec has held. Here, in
+            `reason` and in `atom…`, None stands for a result that is not explained.
         tested: what the verdict was tested by, see `SpecResult.tested`; None if there is an error.
         untested: sentences on the parts for which that is not "full".
         vacuous: sentences on the parts that decided nothing.
@@ -121,9 +125,9 @@ class ResultRow:
     satisfied_at_ns: int | None = None
     atom: str | None = None
     atom_time_ns: int | None = None
-    atom_objects: tuple[str, ...] = ()
-    reason: str = ""
-    explanation: tuple[str, ...] = ()
+    atom_objects: tuple[str, ...] | None = ()
+    reason: str | None = ""
+    explanation: tuple[str, ...] | None = ()
     tested: Tested | None = None
     untested: tuple[str, ...] = ()
     vacuous: tuple[str, ...] = ()
@@ -144,8 +148,13 @@ class ResultRow:
     source: str = ""
 
 
-def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
+def rows_from_task(
+    task: Task, explained: Collection[ResultName] | None = ()
+) -> tuple[tuple[ResultRow, ...], ...]:
     """Open a log once, evaluate all its specifications over it, and return their rows.
+
+    Args:
+        explained: the results that get an explanation, which takes longer than all the rest; None for all.
 
     Returns:
         For each of `task.specs` one row for each of its results, in the order of the text, and for each
@@ -158,11 +167,16 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
         _refuse_unfit(task, source)
         replay = Replay(source, files, options, keep_leaves=True, certify=False)
         replayed = replay.run()
-        rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
+        rows = [_rows_of_file(replay, replayed, file, index, explained) for index, file in enumerate(files)]
     except Exception as error:  # one log must not end a batch
         return error_rows(task, *error_from_exception(error))
     seconds, name = time.perf_counter() - begin, encodable(log_file(task.log).name)
     return tuple(tuple(replace(row, seconds=seconds, source=name) for row in each) for each in rows)
+
+
+def rows_with_explanations(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
+    """Return the rows of a log, each with its explanation (see `rows_from_task`)."""
+    return rows_from_task(task, None)
 
 
 def _refuse_unfit(task: Task, source: Source) -> None:
@@ -248,7 +262,11 @@ def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int]) -> ResultR
 
 
 def _rows_of_file(
-    replay: Replay, replayed: Replayed, file: Specification, index: int
+    replay: Replay,
+    replayed: Replayed,
+    file: Specification,
+    index: int,
+    explained: Collection[ResultName] | None,
 ) -> tuple[ResultRow, ...]:
     lines = spec_lines(file)
     log = ResultRow(
@@ -267,6 +285,12 @@ def _rows_of_file(
     results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
     parts = {part.text: part for part in replayed.vacuous}
     rows = [_row(_about(log, result.spec, lines), result, replayed.first_ns) for result in results]
+    rows = [
+        _with_explanation(row, result, replayed.first_ns)
+        if explained is None or (index, row.spec, row.object) in explained
+        else row
+        for row, result in zip(rows, results, strict=True)
+    ]
     evaluated = {result.name for result in results}
     idle = [spec for spec in file.results if spec.name not in evaluated and spec.parameter is not None]
     rows += [_idle_row(_about(log, spec, lines), parts[f"{spec.name}({spec.parameter})"]) for spec in idle]
@@ -280,20 +304,29 @@ def _missing(name: Diagnostic) -> str:
 
 
 def _row(about: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
-    witness = result.worst
-    deciding = None if witness is None else witness.deciding
     return replace(
         about,
         **{name: getattr(result, name) for name in (*RESULT_COLUMNS, "unit", "tested") if name != "name"},
+        atom_objects=None,
+        reason=None,
+        explanation=None,
+        untested=_some(counted_from((part.message for part in result.untested), first_ns)),
+        vacuous=_some(counted_from((part.message for part in result.vacuous), first_ns)),
+        doubts=tuple(doubt.assumption for doubt in result.doubts),
+        doubtful=_some([doubt.text for doubt in result.doubts]),
+    )
+
+
+def _with_explanation(row: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
+    witness = result.worst
+    deciding = None if witness is None else witness.deciding
+    return replace(
+        row,
         atom=None if deciding is None else _cut(deciding.text),
         atom_time_ns=None if witness is None else witness.time_ns,
         atom_objects=() if deciding is None else tuple(deciding.objects),
         reason=_cut(result.reason(first_ns)),
         explanation=_some(result.sentences(first_ns)),
-        untested=_some(counted_from((part.message for part in result.untested), first_ns)),
-        vacuous=_some(counted_from((part.message for part in result.vacuous), first_ns)),
-        doubts=tuple(doubt.assumption for doubt in result.doubts),
-        doubtful=_some([doubt.text for doubt in result.doubts]),
     )
 
 

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from spatial_replay import __version__
+from spatial_replay.batch.record import with_explanations, with_record
 from spatial_replay.batch.rows import (
     ResultRow,
     Task,
@@ -664,6 +665,10 @@ def run_batch(
                         unstored[key] = rows
                 advance(1)
         table = _table(wanted, [stored, *new_rows.tables], unstored, fail_on)
+        explanations = folder.read_explanations()
+        names = zip(*(table.column(name).to_pylist() for name in ("key", "spec", "object")), strict=True)
+        places = {place: explanations[name] for place, name in enumerate(names) if name in explanations}
+        table = with_record(with_explanations(table, places), wanted)
         folder.write_run(table)
     # a log that cannot be read was tried, and is not known
     evaluated = {task.log for task in tasks} | {request.log.path for request in wanted if request.key is None}
@@ -678,10 +683,19 @@ def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None])
         for log in prepared.logs:
             identity = identities[log.path]
             for file in prepared.files:
-                parts = [FORMAT, __version__, identity, conditions, file.hash]
-                key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:HASH_DIGITS]
+                key = _key(identity, conditions, file.hash)
                 wanted.append(Wanted(case, log, file, None if identity is None else key))
     return wanted
+
+
+def row_key(identity: str, conditions: Conditions, meaning: str) -> str:
+    """Return a hash of all that rows depend on: the log, the conditions and the hash of a specification."""
+    return _key(identity, _key_of(conditions), meaning)
+
+
+def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
+    parts = [FORMAT, __version__, identity, conditions, meaning]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:HASH_DIGITS]
 
 
 def _key_of(conditions: Conditions) -> list[Any]:

@@ -149,6 +149,8 @@ FORMAT: Final = 4
 LAST_RUN: Final = "last_run.parquet"
 SOURCE: Final = "source"
 """The column of the file that was read: logs that hold the same share their rows."""
+EXPLANATION: Final = ("atom", "atom_time_ns", "atom_objects", "reason", "explanation")
+"""The columns of what decided a result: null until it is explained."""
 _FORMAT_FILE: Final = "format.json"
 _IDENTITIES: Final = "identities.parquet"
 _ROWS: Final = "rows"
@@ -439,6 +441,20 @@ class ResultsFolder:
             ) from None
         except LogError as error:
             raise LogError(f"{error}; run the batch again, which writes it again") from None
+
+    def read_explanations(self) -> dict[tuple[str, str, str | None], tuple[Any, ...]]:
+        """Return the values of `EXPLANATION` that the last run knows, by key, spec and object."""
+        import pyarrow.compute as pc
+
+        try:
+            table = self._read(LAST_RUN)
+        except (MissingFileError, LogError):
+            return {}
+        is_known = pc.and_(pc.is_valid(table["explanation"]), pc.is_valid(table["verdict"]))
+        rows = table.filter(is_known).select(["key", "spec", "object", *EXPLANATION]).to_pylist()
+        return {
+            (row["key"], row["spec"], row["object"]): tuple(row[name] for name in EXPLANATION) for row in rows
+        }
 
     def _read(self, name: str) -> pa.Table:
         (data,) = self._files.read([name])

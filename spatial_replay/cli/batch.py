@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -269,14 +270,9 @@ def batch(
       spatial-replay batch logs --spec safety.spatial --dask tcp://scheduler:8786
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.outputs import (
-        is_github,
-        worst_annotations,
-        write_junit,
-        write_pages,
-        write_summary,
-    )
-    from spatial_replay.batch.run import prepare, workers_of
+    from spatial_replay.batch.explanations import explain_batch, failing_places
+    from spatial_replay.batch.outputs import is_github, worst_annotations, write_summary
+    from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.run_table import compare, with_baseline
 
     if dask is not None and jobs is not None:
@@ -291,41 +287,70 @@ def batch(
     tolerance, before = _baseline(outputs)
     check_outputs({"--junit": outputs.junit, "--json": outputs.json_file}, inputs_of(suite))
     workers = workers_of(jobs or os.cpu_count() or 1, dask, warn)
-    evaluated = evaluated_batch(cases, folder, workers, fail_on)
-    differences = None if before is None else compare(evaluated.table, before, tolerance)
-    # what is worse than the baseline fails wherever results are shown
-    result = (
-        evaluated
-        if before is None
-        else replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
-    )
-    inputs = inputs_of(suite)
-    pages = {}
+    with resumable(folder):
+        evaluated = run_batch(cases, folder, workers, fail_on=fail_on, progress=progress)
+        differences = None if before is None else compare(evaluated.table, before, tolerance)
+
+        def compared(evaluated: BatchResult) -> BatchResult:
+            # what is worse than the baseline fails wherever results are shown
+            if before is None:
+                return evaluated
+            return replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
+
+        is_exported = any((outputs.junit, outputs.html, outputs.json_file, is_github()))
+        failing = failing_places(compared(evaluated).table, None if is_exported else _WORST)
+        # results that only the baseline has come last
+        failing = [place for place in failing if place < len(evaluated.table)]
+        evaluated = explain_batch(evaluated, failing, workers, results=folder, progress=progress)
+        result = compared(evaluated)
+        _write_outputs(outputs, suite, evaluated, result, workers)
+        if outputs.json_file != "-":
+            _print(result, evaluated, folder)
+        warn(*first_lines(evaluated.remarks, _MOST_WARNINGS))
+        warn_of_names(evaluated.table)
+        warn_of_damage(evaluated.table)
+        if is_github():
+            for line in worst_annotations(result.table, suite.folder):
+                show(line, err=True)
+            write_summary(result.table)
+        code = exit_code_from_table(evaluated.table, fail_on)
+        if differences is not None and _print_differences(differences, outputs.json_file == "-"):
+            code = most_severe([code, ExitCode.VIOLATED])
+    return code
+
+
+@contextmanager
+def resumable(folder: str) -> Iterator[None]:
+    """Have an interruption say where the results so far are."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        error.add_note(f"what was evaluated so far is in {folder}; the same command goes on from there")
+        raise
+
+
+def _write_outputs(
+    outputs: BatchOutputs, suite: Suite, evaluated: BatchResult, result: BatchResult, workers: Workers
+) -> None:
+    """Write the files that were asked for.
+
+    Args:
+        result: the evaluated batch, compared with a baseline if there is one.
+    """
+    from spatial_replay.batch.outputs import write_junit, write_pages
+    from spatial_replay.batch.store import ResultsFolder
+
+    inputs, pages = inputs_of(suite), {}
     if outputs.html is not None:
         pages = write_pages(result, outputs.html, suite.name, workers, progress=progress)
     if outputs.junit is not None:
         attached = {key: path.as_posix() for key, path in pages.items()}
         write_junit(outputs.junit, result.table, suite.name, attached, inputs=inputs)
     if outputs.update_baseline and outputs.baseline is not None:
-        from spatial_replay.batch.store import ResultsFolder
-
         ResultsFolder.create(outputs.baseline).write_run(evaluated.table)
         show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
     if outputs.json_file is not None:
         write_json_lines(result.table, outputs.json_file, inputs)
-    if outputs.json_file != "-":
-        _print(result, evaluated, folder)
-    warn(*evaluated.remarks)
-    warn_of_names(evaluated.table)
-    warn_of_damage(evaluated.table)
-    if is_github():
-        for line in worst_annotations(result.table, suite.folder):
-            show(line, err=True)
-        write_summary(result.table)
-    code = exit_code_from_table(evaluated.table, fail_on)
-    if differences is not None and _print_differences(differences, outputs.json_file == "-"):
-        code = most_severe([code, ExitCode.VIOLATED])
-    return code
 
 
 def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
@@ -409,11 +434,8 @@ def evaluated_batch(
     """Evaluate what is new; an interruption says where the results so far are."""
     from spatial_replay.batch.run import run_batch
 
-    try:
+    with resumable(folder):
         return run_batch(cases, folder, workers, fail_on=fail_on, progress=progress)
-    except KeyboardInterrupt as error:
-        error.add_note(f"what was evaluated so far is in {folder}; the same command goes on from there")
-        raise
 
 
 def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
@@ -551,6 +573,7 @@ def results(
       spatial-replay results main.results branch.results --tolerance 0.02m
     """
     # imported here so that --help stays fast
+    from spatial_replay.batch.explanations import worst_places
     from spatial_replay.batch.run_table import absent_values, rows_where, summary_text
     from spatial_replay.batch.store import ResultsFolder
 
@@ -564,6 +587,7 @@ def results(
         if not len(rows):
             warn(*absent_values(table, where))
         table = rows
+    table = explain_shown(table, range(len(table)) if json_file else worst_places(table, worst))
     if json_file is not None:
         write_json_lines(table, json_file, ())
     if json_file == "-":
@@ -577,6 +601,21 @@ def results(
     return ExitCode.SATISFIED
 
 
+_MOST_HERE = 64
+"""Results that are explained by this process alone."""
+
+
+def explain_shown(table: pa.Table, places: Collection[int]) -> pa.Table:
+    """Return the table of a run in which the rows at some places are explained, from their logs."""
+    from spatial_replay.batch.explanations import explain_rows
+    from spatial_replay.batch.run import workers_of
+
+    workers = workers_of(1 if len(places) <= _MOST_HERE else os.cpu_count() or 1)
+    table, remarks = explain_rows(table, places, workers, progress)
+    warn(*first_lines(remarks, _MOST_WARNINGS))
+    return table
+
+
 def _compare_results(folder: str, other: str, json_file: str | None, tolerance: str | None) -> ExitCode:
     """Show what differs between two runs."""
     from spatial_replay.batch.flips import diff_runs
@@ -586,7 +625,7 @@ def _compare_results(folder: str, other: str, json_file: str | None, tolerance: 
     with naming_option("--tolerance"):
         allowed = Tolerance.parse(tolerance or "0")
     before, now = (ResultsFolder.open(place).read_run() for place in (folder, other))
-    flips = diff_runs(before, now, allowed, (folder, other))
+    flips = diff_runs(before, now, allowed, (folder, other), explain=explain_shown)
     if json_file is not None:
         write_json_lines([change.document for change in flips.changes], json_file, ())
     if json_file != "-":

@@ -148,7 +148,7 @@ def _over_logs(
     from spatial_replay.batch.rows import parsed_specifications
     from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.suite import Conditions, Suite
-    from spatial_replay.cli.batch import code_of_errors, warn_of_damage, warn_of_names
+    from spatial_replay.cli.batch import code_of_errors, explain_shown, warn_of_damage, warn_of_names
 
     others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
     objects = objects_by_parameter(given.choices)
@@ -160,7 +160,7 @@ def _over_logs(
     with TemporaryDirectory() as folder:
         table = run_batch(cases, folder, workers, progress=progress).table
     before, now = (table.filter(pc.equal(table["file"], file.name)) for file in (old, new))
-    flips = diff_runs(before, now, names=(old.name, new.name))
+    flips = diff_runs(before, now, names=(old.name, new.name), explain=explain_shown)
     paths = {log.name: log.path for log in cases[0].logs}
     specifications = parsed_specifications((old.text, new.text), conditions)
     causes = list(_causes(flips, paths, given, specifications, semantics))

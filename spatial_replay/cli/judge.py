@@ -170,6 +170,9 @@ def judge(
     folder = output or f"{prepared[0].name}.results"
     workers = workers_of(jobs or os.cpu_count() or 1)
     batch = evaluated_batch(cases, folder, workers)
+    is_exported = any((write_labels, annotate, html, json_file))
+    for part in prepared:
+        batch = part.explain(batch, workers, allow, is_exported=is_exported, progress=progress)
     judgement = prepared[0].judgement(batch, allow)
     if against:
         comparison = compare_judgements(

@@ -11,11 +11,12 @@ from pathlib import Path, PurePosixPath
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
+from spatial_replay.batch.explanations import explain_batch
 from spatial_replay.batch.rows import parsed_specifications
 from spatial_replay.batch.run import BatchResult, PreparedCase, prepare
 from spatial_replay.batch.run_table import RUN, Values, worst_rows
 from spatial_replay.batch.suite import Suite
-from spatial_replay.batch.workers import Progress, no_progress
+from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import UsageError
 from spatial_replay.judging.failures import Failure, first_failures
 from spatial_replay.judging.labels import Labels, SuccessLabel, read_labels
@@ -317,6 +318,32 @@ class PreparedJudgement:
             rows = tuple(_with_failure(row, failures.get(log)) for row, log in zip(rows, paths, strict=True))
         return Judgement(self.name, *self.spec, rows, batch, failure_file=self.failure_file)
 
+    def explain(
+        self,
+        batch: BatchResult,
+        workers: Workers,
+        allow: AbstractSet[str] = frozenset(),
+        *,
+        is_exported: bool = True,
+        progress: Progress = no_progress,
+    ) -> BatchResult:
+        """Return a batch in which episodes that differ from their labels, or are undecided, are explained.
+
+        Args:
+            is_exported: whether violated episodes that agree with their labels are explained as well.
+        """
+        kinds: set[Kind] = {"only_theirs", "only_ours", "undecided"}
+        rows = self.judgement(batch, allow).rows
+        paths = {row.log for row in rows if row.kind in kinds or (is_exported and not row.is_success)}
+        logs = {log.name for log in self.case.logs if log.path in paths}
+        names = zip(*(batch.table.column(name).to_pylist() for name in ("log", "file", "spec")), strict=True)
+        places = [
+            place
+            for place, (log, file, spec) in enumerate(names)
+            if log in logs and (file, spec) == (self.spec.file, self.spec.name)
+        ]
+        return explain_batch(batch, places, workers, progress=progress)
+
 
 def prepare_judgement(
     suite: Suite,
@@ -430,7 +457,7 @@ def _judged_episode(
         margin,
         success_at=(times[0] - row["zero_ns"]) / 1e9 if times and is_satisfied else None,
         tested=row["tested"],
-        reason=reason or row["reason"],
+        reason=reason or row["reason"] or "",
         task=label.task,
         seed=label.seed,
         log=path,

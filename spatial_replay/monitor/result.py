@@ -492,7 +492,10 @@ class SpecResult(Displayed):
             return cause_reason(self.causes[0], first_ns)
         if self.worst is None or self.leaves is None:
             return Sentence("")
-        whole = find_witness(self.evidence, self.leaves, self.times_ns, flips=False)
+        is_settled = self.worst.is_settled
+        whole = (
+            find_witness(self.evidence, self.leaves, self.times_ns, flips=False) if is_settled else self.worst
+        )
         return reason_sentence(whole, first_ns=first_ns)
 
     def explain(self, *, first_ns: int | None = None) -> str:

@@ -551,12 +551,66 @@ def test_the_reason_is_about_the_number_beside_it(fleet: Path) -> None:
     Path("later.spatial").write_text(
         "spec apart = G (cart dist person >= 0.3)\nspec near = F (cart dist person <= 0.3)"
     )
-    apart, near = sr.evaluate_logs("later.jsonl", "later.spatial", output="results").table.to_pylist()
+    assert batch("later.jsonl", "--spec", "later.spatial", "-o", "results").code == 1
+    apart, near = map(json.loads, command("results", "results", "--json", "-").out.splitlines())
     assert apart["reason"] == (
         "`cart dist person >= 0.3` fails by 0.2 at 0.200 s (its least within `apart`): "
         "cart and person are 0.1 apart. It was violated first at 0.100 s, by 0.1."
     )
     assert near["reason"].startswith("`cart dist person <= 0.3` holds by 0.2 at 0.200 s")
+
+
+def test_results_that_pass_are_explained_when_they_are_asked_for(fleet: Path) -> None:
+    first = batch("logs", "--spec", "gate.spatial", "-o", "results", "--json", "-")
+    rows = [json.loads(line) for line in first.out.splitlines()]
+    columns = ("atom", "atom_time_ns", "atom_objects", "reason", "explanation")
+    for row in rows:
+        is_explained = row["verdict"] == "violated"
+        assert [row[name] is not None for name in columns] == [is_explained] * len(columns)
+    asked = [json.loads(line) for line in command("results", "results", "--json", "-").out.splitlines()]
+    for row, full in zip(rows, asked, strict=True):
+        assert {**row, **{name: full[name] for name in columns}} == full
+        result = sr.replay_log(full["log"], "gate.spatial").results[full["spec"] == "arrives"]
+        assert "\n".join(full["explanation"]) == result.explain()
+    # a second run evaluates nothing, and knows what was explained
+    shutil.move("logs/run-3.jsonl", "run-3.jsonl")
+    Path("logs/run-3.jsonl").write_bytes(Path("run-3.jsonl").read_bytes())
+    again = batch("logs", "--spec", "gate.spatial", "-o", "results", "--json", "-")
+    assert again.out == first.out
+
+
+def test_a_log_that_is_gone_or_another_one_is_not_explained(fleet: Path) -> None:
+    batch("logs", "--spec", "gate.spatial", "-o", "results")
+    Path("logs/run-0.jsonl").unlink()
+    write_log(Path("logs/run-1.jsonl"), 0.7)
+    passing = ("results", "results", "--where", 'spec == "arrives"', "--json", "-")
+    reply = command(*passing)
+    reasons = [json.loads(line)["reason"] for line in reply.out.splitlines()]
+    assert [reason is None for reason in reasons] == [True, True, False, False]
+    assert "logs/run-0.jsonl is not explained: the log cannot be read any more" in reply.err
+    assert "logs/run-1.jsonl is not explained: the log, the mapping or the version has changed" in reply.err
+    assert reply.code == 0
+    # elsewhere, with the folder alone
+    shutil.copytree("results", "elsewhere/results")
+    shutil.rmtree("logs")
+    listed = command("results", "elsewhere/results", "--worst", "1")
+    assert "`cart dist person >= 0.3` fails by 0.2" in listed.out
+    assert "Traceback" not in command(*passing).err
+
+
+def test_the_conditions_of_a_suite_are_those_of_its_explanations(fleet: Path) -> None:
+    Path("limits.spatial").write_text("const near = 0.3\nspec apart = G (cart dist person >= near)")
+    Path("suites").mkdir()
+    Path("suites/night.yaml").write_text(
+        "cases:\n  - name: wide\n    logs: ../logs/*.jsonl\n    specs: [../limits.spatial]\n"
+        "    constants: {near: 0.15}\n    from: 0.1s\n    every: 2\n"
+    )
+    assert batch("suites/night.yaml", "-o", "results").code == 1
+    rows = command("results", "results", "--json", "-").out.splitlines()
+    assert [json.loads(row)["reason"].split(" by ")[0] for row in rows] == [
+        *["`cart dist person >= 0.15` holds"] * 3,
+        "`cart dist person >= 0.15` fails",
+    ]
 
 
 def test_a_suite_requires_what_info_prints_and_refuses_unfit_logs(fleet: Path) -> None:

@@ -78,7 +78,7 @@ def test_runs_of_other_lengths_objects_and_times_do_not_touch_each_other(semanti
     assert verdicts == ["satisfied", "satisfied", "violated", "satisfied"]
 
 
-def test_terms_that_look_back_start_anew_in_each_trace():
+def test_terms_that_look_back_begin_in_each_trace():
     specification = parse_specification(
         "spec still = G (puck[-1] dist puck <= 0.01)\nspec slow = G (speed(goal) <= 5)"
     )

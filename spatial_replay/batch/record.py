@@ -1,0 +1,106 @@
+"""How the logs of a run were evaluated, kept with its table, so that results can be explained later."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from spatial_replay.batch.rows import ResultName, Task
+from spatial_replay.batch.store import EXPLANATION
+from spatial_replay.batch.suite import Conditions
+from spatial_replay.logs.remote import is_address
+from spatial_replay.spec.load import SpecificationText
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spatial_replay.batch.run import Wanted
+
+
+_RECORD: Final = b"spatial_replay"
+"""The metadata of a table that holds the record."""
+Explanation: TypeAlias = tuple[Any, ...]
+"""The values of the columns `EXPLANATION` in a row."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """How the logs of a run were evaluated.
+
+    Attributes:
+        folder: what names of logs are relative to.
+        cases: by name, the conditions of each case and the texts of its specification files.
+    """
+
+    folder: str
+    cases: Mapping[str, Mapping[str, Any]]
+
+    @classmethod
+    def of(cls, table: pa.Table) -> RunRecord:
+        """Return the record of a table; one without cases if the table has none."""
+        data = (table.schema.metadata or {}).get(_RECORD, b'{"folder": "", "cases": {}}')
+        return cls(**json.loads(data))
+
+    def files(self, case: str) -> list[str]:
+        """Return the names of the specification files of a case."""
+        return list(self.cases[case]["files"])
+
+    def result_name(self, case: str, file: str, spec: str, object_name: str | None) -> ResultName:
+        """Return the name of a result in the task of its log."""
+        return self.files(case).index(file), spec, object_name
+
+    def task(self, case: str, log: str) -> Task:
+        """Return the task that evaluates a log, named as in the table, as the run did."""
+        path = log if is_address(log) else str(Path(self.folder) / log)
+        texts = tuple(SpecificationText(*text) for text in self.cases[case]["files"].values())
+        values = self.cases[case]["conditions"]
+        return Task(path, texts, Conditions(**{name: _frozen(value) for name, value in values.items()}))
+
+
+def _frozen(value: Any) -> Any:
+    """Return a value of JSON with tuples instead of lists."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
+def with_record(table: pa.Table, wanted: Sequence[Wanted]) -> pa.Table:
+    """Return the table of a run with its record."""
+    cases: dict[str, dict[str, Any]] = {}
+    for request in wanted:
+        case, file = request.case, request.file
+        if case.name not in cases:
+            cases[case.name] = {"conditions": _recorded_conditions(case.conditions), "files": {}}
+        cases[case.name]["files"][file.name] = [file.text.text, file.text.filename]
+    record = json.dumps({"folder": _folder_of(wanted), "cases": cases})
+    return table.replace_schema_metadata({**(table.schema.metadata or {}), _RECORD: record.encode()})
+
+
+def _folder_of(wanted: Sequence[Wanted]) -> str:
+    for request in wanted:
+        log = request.log
+        if not is_address(log.path) and log.path.endswith(log.name) and not Path(log.name).is_absolute():
+            return str(Path(log.path.removesuffix(log.name)).absolute())
+    return str(Path.cwd())
+
+
+def _recorded_conditions(conditions: Conditions) -> dict[str, Any]:
+    mapping = conditions.mapping
+    if mapping is not None and not is_address(mapping):
+        mapping = str(Path(mapping).absolute())
+    return asdict(replace(conditions, mapping=mapping))
+
+
+def with_explanations(table: pa.Table, explanations: Mapping[int, Explanation]) -> pa.Table:
+    """Return a table with explanations in the rows at their places."""
+    import pyarrow as pa
+
+    for number, name in enumerate(EXPLANATION if explanations else ()):
+        values = table.column(name).to_pylist()
+        for place, explanation in explanations.items():
+            values[place] = explanation[number]
+        index = table.schema.get_field_index(name)
+        field = table.schema.field(index)
+        table = table.set_column(index, field, pa.array(values, field.type))
+    return table
