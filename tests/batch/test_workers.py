@@ -96,9 +96,7 @@ def test_a_batch_that_is_killed_loses_no_row_and_has_none_twice(fleet: Path) -> 
             _, said = process.communicate(timeout=60)
         assert process.returncode in (130, -signal.SIGKILL, 1), said
         if process.returncode == 130:
-            # with all rows stored, there is nothing to go on with
-            is_whole = len(keys_of(fleet / "results")) == 2 * LOGS
-            assert is_whole or "the same command goes on from there" in said
+            assert "the same command goes on from there" in said
         stored = sum(keys_of_files(fleet))
         assert stored >= 1
     deadline = time.monotonic() + 30
