@@ -309,7 +309,7 @@ def test_two_runs_in_one_episode_of_minari_are_not_judged(tmp_path: Path) -> Non
 
 
 def test_a_combined_set_and_a_number_of_episodes_that_differs_are_remarked(tmp_path: Path) -> None:
-    about = {"combined_datasets": ["push/a-v0", "push/b-v0"], "total_episodes": 2}
+    about = {"combined_datasets": ["push/a-v0", "push/b-v0", "push/a-v0"], "total_episodes": 2}
     first, second = opened(minari(tmp_path / "set", [True], **about)).remarks
     assert first == "metadata.json says 2 episodes, and the data have 1"
     assert second.startswith("it combines push/a-v0, push/b-v0: episodes that were filtered out")

@@ -89,7 +89,7 @@ class _Minari(DataSet):
             yield f"metadata.json says {counted(total, 'episode')}, and the data have {len(self.episodes)}"
         if isinstance(combined, list):
             yield (
-                f"it combines {listed([str(name) for name in combined])}: episodes that were filtered out of"
+                f"it combines {listed(list(dict.fromkeys(map(str, combined))))}: episodes that were filtered out of"
                 " these are in it again"
             )
 
