@@ -88,10 +88,8 @@ class _Minari(DataSet):
         if isinstance(total, int) and total != len(self.episodes):
             yield f"metadata.json says {counted(total, 'episode')}, and the data have {len(self.episodes)}"
         if isinstance(combined, list):
-            yield (
-                f"it combines {listed(list(dict.fromkeys(map(str, combined))))}: episodes that were filtered out of"
-                " these are in it again"
-            )
+            names = listed(list(dict.fromkeys(map(str, combined))))
+            yield f"it combines {names}: episodes that were filtered out of these are in it again"
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
         """Yield its episodes by number."""
