@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     "--annotate",
     metavar="NEW",
     type=click.Path(path_type=Path),
-    help="Copy of a LeRobot data set, whose episodes have the verdicts.",
+    help="Copy of a LeRobot data set with the verdicts; with --stages, its frames have their stages.",
 )
 @click.option(
     "--against",
@@ -182,12 +182,13 @@ def judge(
             SAME_START if same_start is None else same_start,
         )
         judgement = replace(judgement, comparison=comparison)
+    runs = episode_stages(judgement, cases[0], progress) if stages else {}
     if stages:
-        judgement = with_stages(judgement, episode_stages(judgement, cases[0], progress))
+        judgement = with_stages(judgement, runs)
     if write_labels is not None:
         write_label_table(judgement, write_labels, inputs)
     if annotate is not None and data_set is not None:
-        annotate_data_set(judgement, data_set, annotate)
+        annotate_data_set(judgement, data_set, annotate, runs)
     if html is not None:
         from spatial_replay.batch.outputs import write_pages
         from spatial_replay.judging.writers import labelled_batch

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from spatial_replay.annotate.stages import LOST, UNKNOWN, Stages, stages_of_result
 from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
@@ -12,7 +17,16 @@ from spatial_replay.batch.run import PreparedCase
 from spatial_replay.batch.workers import Progress, no_progress
 from spatial_replay.errors import GeometryError, LogError, TraceError, UsageError
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement
+from spatial_replay.logs.formats.datasets import data_set_address
 from spatial_replay.replay.engine import Replay
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SUBTASK: Final = "subtask_index"
+PROGRESS: Final = "judge.progress"
+LANGUAGE: Final = "language_persistent"
+"""Columns of frames that have stages."""
 
 
 def episode_stages(
@@ -62,16 +76,110 @@ def _has_constant(task: Task, name: str) -> bool:
 def with_stages(judgement: Judgement, stages: Mapping[str, Stages]) -> Judgement:
     """Return a judgement whose rows have the stage and the progress at the end of each episode."""
     rows = tuple(_at_stage(row, stages.get(row.log)) for row in judgement.rows)
-    names = dict.fromkeys(stage.name for run in stages.values() for stage in run.stages)
     ends = {row.stage for row in rows}
-    return replace(
-        judgement,
-        rows=rows,
-        stages=tuple(name for name in names if name in ends or name not in (LOST, UNKNOWN)),
-    )
+    names = tuple(name for name in stage_names(stages) if name in ends or name not in (LOST, UNKNOWN))
+    return replace(judgement, rows=rows, stages=names)
+
+
+def stage_names(runs: Mapping[str, Stages]) -> tuple[str, ...]:
+    """Return the names of all stages of some episodes, the farthest from success first."""
+    return tuple(dict.fromkeys(stage.name for run in runs.values() for stage in run.stages))
 
 
 def _at_stage(row: JudgedEpisode, stages: Stages | None) -> JudgedEpisode:
     if stages is None:
         return row
     return replace(row, stage=stages[-1].name, progress=float(stages.progress[-1]))
+
+
+def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Sequence[str]) -> pa.Table:
+    """Return a table of frames of a LeRobot data set with the stages of episodes.
+
+    Column `subtask_index` is the place of the frame's stage in `names`, `judge.progress` the progress.
+    `language_persistent` has a row for each change of the stage, with the style `subtask`. Frames of other
+    episodes have -1, NaN and no rows, and so have episodes with more or fewer frames than samples.
+    """
+    import pyarrow as pa
+
+    episodes, frames = (table[name].to_numpy() for name in ("episode_index", "frame_index"))
+    times_s = table["timestamp"].to_pylist()
+    places = {name: place for place, name in enumerate(names)}
+    indices = np.full(len(table), -1, np.int64)
+    progress = np.full(len(table), np.nan, np.float32)
+    rows: list[list[dict[str, Any]]] = [[] for _ in times_s]
+    for number in np.unique(episodes).tolist():
+        run, own = runs.get(number), np.flatnonzero(episodes == number)
+        if run is None or len(run.numbers) != len(own):
+            continue
+        own = own[np.argsort(frames[own], kind="stable")]
+        indices[own] = np.array([places[stage.name] for stage in run.stages])[run.numbers]
+        progress[own] = run.progress
+        changes = [0, *(np.flatnonzero(np.diff(run.numbers)) + 1).tolist()]
+        persistent = [_subtask(run[change].name, times_s[own[change]]) for change in changes]
+        for place in own.tolist():
+            rows[place] = persistent
+    columns = {
+        SUBTASK: pa.array(indices),
+        PROGRESS: pa.array(progress),
+        # the types that lerobot's own annotations have
+        LANGUAGE: pa.array(rows, pa.list_(_row_type())),
+    }
+    # without descriptions of the old columns
+    table = table.drop_columns([name for name in columns if name in table.column_names])
+    table = table.replace_schema_metadata(None)
+    for name, column in columns.items():
+        table = table.append_column(name, column)
+    return table
+
+
+def _subtask(content: str, timestamp: float) -> dict[str, Any]:
+    return {"role": "assistant", "content": content, "style": "subtask", "timestamp": timestamp}
+
+
+def _row_type() -> pa.StructType:
+    import pyarrow as pa
+
+    text = ("role", "content", "style")
+    return pa.struct(
+        [
+            *((name, pa.string()) for name in text),
+            ("timestamp", pa.float32()),
+            ("camera", pa.null()),
+            ("tool_calls", pa.null()),
+        ]
+    )
+
+
+def annotate_frames(folder: Path, runs: Mapping[str, Stages], names: Sequence[str]) -> None:
+    """Write the stages of episodes into a LeRobot data set, whose files are replaced.
+
+    Args:
+        runs: by the address of each episode.
+        names: see `frames_with_stages`.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    numbered = {address[1]: run for log, run in runs.items() if (address := data_set_address(log))}
+    for file in sorted((folder / "data").glob("*/*.parquet")):
+        with parquet.ParquetFile(file) as source:
+            groups = [source.read_row_group(place) for place in range(source.num_row_groups)]
+        table = frames_with_stages(pa.concat_tables(groups), numbered, names)
+        file.unlink()
+        with parquet.ParquetWriter(file, table.schema) as writer:
+            begin = 0
+            for group in groups:
+                writer.write_table(table.slice(begin, len(group)))
+                begin += len(group)
+    subtasks = pa.table({SUBTASK: pa.array(range(len(names)), pa.int64()), "subtask": list(names)})
+    # read by pandas, the names are the index, as those of tasks
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind, "metadata": None}
+        for name, kind in ((SUBTASK, "int64"), ("subtask", "object"))
+    ]
+    index = json.dumps({"index_columns": ["subtask"], "column_indexes": [], "columns": columns})
+    parquet.write_table(subtasks.replace_schema_metadata({"pandas": index}), folder / "meta/subtasks.parquet")
+    info = json.loads((folder / "meta/info.json").read_text("utf-8"))
+    types = {SUBTASK: "int64", PROGRESS: "float32", LANGUAGE: "language"}
+    info["features"] |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in types.items()}
+    (folder / "meta/info.json").write_text(json.dumps(info, indent=4), "utf-8")

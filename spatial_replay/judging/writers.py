@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +15,14 @@ from spatial_replay.batch.outputs import AGREEMENT, LABEL
 from spatial_replay.batch.run import BatchResult
 from spatial_replay.errors import UsageError
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement
+from spatial_replay.judging.stages import annotate_frames, stage_names
 from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
 from spatial_replay.logs.output_file import output_error, replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from spatial_replay.annotate.stages import Stages
 
 _DIFFERENCES: Final = {
     "only_theirs": "only the label counts a success",
@@ -147,8 +150,12 @@ def check_annotation(logs: Sequence[str], new: Path) -> Path:
     return Path(folder)
 
 
-def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
+def annotate_data_set(
+    judgement: Judgement, folder: Path, new: Path, stages: Mapping[str, Stages] | None = None
+) -> None:
     """Make a copy of a LeRobot data set, whose episodes have the columns `judge/success` and so on.
+
+    With stages of episodes, by their addresses, its frames have them, see `frames_with_stages`.
 
     Files of data and videos are links to those of the original, the metadata is copied.
 
@@ -171,6 +178,8 @@ def annotate_data_set(judgement: Judgement, folder: Path, new: Path) -> None:
                         shutil.copyfile(source, place / name)
         for file in sorted((partial / "meta/episodes").glob("chunk-*/file-*.parquet")):
             parquet.write_table(_with_labels(parquet.read_table(file), judgement), file)
+        if stages:
+            annotate_frames(partial, stages, stage_names(stages))
         partial.chmod(0o755)
         partial.rename(new)
     except OSError as error:

@@ -7,12 +7,15 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
 import spatial_replay as sr
 from batch.fleet import command, write_fleet, write_log
+from spatial_replay.annotate.stages import stages
 from spatial_replay.judging import statistics
 
 DISTANCES = [0.5, 0.4, 0.2, 0.1]
@@ -305,6 +308,54 @@ def test_a_data_set_is_copied_with_its_verdicts_for_training() -> None:
     table = pq.read_table("one/meta/episodes/chunk-000/file-000.parquet")
     assert table["judge/success"].to_pylist() == [None, None, True, None]
     assert table["judge/spec"].null_count == 3
+
+
+@pytest.mark.usefixtures("push")
+def test_a_copy_has_the_stage_of_each_frame() -> None:
+    Path("stages.spatial").write_text(
+        "spec close = center(puck) dist center(goal) <= 0.1\n"
+        "spec there = center(puck) dist center(goal) <= 0.05\n"
+        "spec task = F (close and F (G there))\n"
+    )
+    options = ("--spec", "stages.spatial", "--mapping", "push.yaml", "--stages")
+    files = {path: path.read_bytes() for path in Path("push_v3").rglob("*") if path.is_file()}
+    assert command("judge", "push_v3", *options, "--annotate", "new").code == 0
+    assert all(path.read_bytes() == data for path, data in files.items())
+    file = "data/chunk-000/file-000.parquet"
+    old, new = pq.read_table(f"push_v3/{file}"), pq.read_table(f"new/{file}")
+    assert new.select(old.column_names).cast(old.schema).equals(old)
+    assert pq.ParquetFile(f"new/{file}").num_row_groups == pq.ParquetFile(f"push_v3/{file}").num_row_groups
+    names = pandas.read_parquet("new/meta/subtasks.parquet").index.tolist()
+    assert names[:3] == ["never close", "close, not there", "there"]
+    info = json.loads(Path("new/meta/info.json").read_text())["features"]
+    assert {info[name]["dtype"] for name in ("subtask_index", "judge.progress", "language_persistent")} == {
+        "int64",
+        "float32",
+        "language",
+    }
+    for number in range(4):
+        evaluation = sr.evaluate(
+            sr.load_specification("stages.spatial"), sr.read_trace(f"push_v3#{number}", mapping="push.yaml")
+        )
+        run, frames = stages(evaluation), new.filter(pc.equal(new["episode_index"], number)).to_pylist()
+        assert [names[frame["subtask_index"]] for frame in frames] == [
+            run[sample].name for sample in range(len(frames))
+        ]
+        np.testing.assert_allclose([frame["judge.progress"] for frame in frames], run.progress, rtol=1e-6)
+        # a row holds from its time on, until the next one
+        rows = frames[0]["language_persistent"]
+        assert len(rows) > 1 or number in (1, 3)
+        for frame in frames:
+            assert frame["language_persistent"] == rows
+            row = [row for row in rows if row["timestamp"] <= frame["timestamp"]][-1]
+            assert (row["style"], row["content"]) == ("subtask", names[frame["subtask_index"]])
+    # frames of an episode that is not judged have none; a copy is annotated again
+    assert command("judge", "new#2", *options, "--annotate", "one").code == 0
+    one = pq.read_table(f"one/{file}")
+    assert one.column_names == new.column_names
+    rest = one.filter(pc.not_equal(one["episode_index"], 2))
+    assert set(rest["subtask_index"].to_pylist()) == {-1}
+    assert not any(rest["language_persistent"].to_pylist())
 
 
 @pytest.mark.usefixtures("push")
