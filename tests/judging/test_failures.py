@@ -81,7 +81,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_failure_is_told_from_what_only_looks_like_it(case: str) -> None:
+def test_a_failure_is_distinct_from_what_only_looks_like_it(case: str) -> None:
     name = case.split()[0]
     failing, similar = CASES[case]
     assert name in happened(failing)
