@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from typing import Final
 
@@ -17,7 +17,7 @@ _TITLES: Final[dict[Kind, str]] = {
     "undecided": "undecided",
 }
 _MOST: Final = 10
-"""Episodes of a kind that are listed."""
+"""Lines of a kind that are listed."""
 _MOST_IN_LINE: Final = 5
 
 
@@ -69,8 +69,14 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
         if rows:
             yield ""
             yield f"{title} {len(rows):,}:"
-            width = max(len(row.episode) for row in rows[:_MOST])
-            yield from (f"  {line}" for line in first_lines([_line(row, width) for row in rows], _MOST))
+            lines = defaultdict[tuple[str, str], list[str]](list)
+            for row in rows:
+                # what keeps an episode from being read often keeps all
+                lines[_reason(row), "" if kind == "undecided" else row.episode].append(row.episode)
+            names = [listed(episodes, _MOST_IN_LINE) for episodes in lines.values()]
+            width = max(map(len, names[:_MOST]))
+            pairs = [f"  {name:<{width}}  {line}" for name, (line, _) in zip(names, lines, strict=True)]
+            yield from first_lines(pairs, _MOST)
 
 
 def failure_lines(judgement: Judgement) -> Iterator[str]:
@@ -97,7 +103,7 @@ def stage_lines(judgement: Judgement) -> Iterator[str]:
         yield f"{name:<{width}}  {at_end:<{len(end)}}  {of_failures if failures else ''}".rstrip()
 
 
-def _line(row: JudgedEpisode, width: int) -> str:
+def _reason(row: JudgedEpisode) -> str:
     is_early = row.kind == "only_ours" and row.success_at is not None
     success = f"succeeds at {row.success_at:.3f} s; " if is_early else ""
-    return f"{row.episode:<{width}}  {success}{row.reason.split(chr(10))[0]}"
+    return f"{success}{row.reason.split(chr(10))[0]}"

@@ -275,6 +275,14 @@ def test_successes_after_the_last_frame_are_unstored_and_no_disagreements() -> N
 
 
 @pytest.mark.usefixtures("push")
+def test_one_reason_of_several_episodes_is_printed_once() -> None:
+    ended = command("judge", "push_v3", "--spec", "push.spatial", "--jobs", "1")
+    assert ended.code == 2
+    assert ended.out.count("--suggest-mapping") == 1
+    assert "undecided 4:\n  push_v3#0, push_v3#1, push_v3#2, push_v3#3  push_v3 is a LeRobot" in ended.out
+
+
+@pytest.mark.usefixtures("push")
 def test_a_field_or_a_file_gives_the_labels_instead() -> None:
     assert "label     4 of 4" in judge_set("push_v3", "--labels", "next.done")
     assert "did you mean 'next.success'?" in judge_set("push_v3", "--labels", "next.succes", code=2)
