@@ -17,3 +17,5 @@ successes = LeRobotDataset("local/push", root=root, episode_filter=lambda episod
 print(f"LeRobot reads {whole.num_episodes} episodes, {successes.num_episodes} of them judged successes")
 print("episode columns:", ", ".join(name for name in whole.meta.episodes.column_names if "judge" in name))
 print("frame columns:", ", ".join(sorted(whole[0])))
+stages = [(row["timestamp"], row["content"]) for row in whole[0]["language_persistent"]]
+print("stages of episode 0:", "; ".join(f"{name} from {second:.2f} s" for second, name in stages))
