@@ -573,7 +573,7 @@ def _cell(row: Values | None) -> Html:
     before = f" (was {was:.4g})" if fails and was is not None and was != number else ""
     if row["verdict"] is None:
         return element(
-            "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
+            "td", f"{verdict}{before}", title=row["failure"] or "", **{"class": kind, "data-value": "-1e400"}
         )
     words = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
     value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
