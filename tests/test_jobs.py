@@ -41,7 +41,10 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
     programs = tmp_path / "bin"
     programs.mkdir()
-    (programs / "python").symlink_to(sys.executable)
+    # a link would leave the packages of a virtual environment behind
+    python = programs / "python"
+    python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n')
+    python.chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -50,7 +53,8 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def commands(block: Block) -> Iterator[tuple[str, int]]:
     """The commands of a block; a comment that begins with a digit is the exit code, else 0."""
     for line in block.text.splitlines():
-        typed_line, _, comment = line.partition("#")
+        # push_v3#2 is an address
+        typed_line, _, comment = line.partition(" #")
         code = re.match(r"\s*(\d)", comment)
         yield typed_line.strip(), int(code[1]) if code else 0
 
@@ -141,6 +145,11 @@ def test_what_changed_is_found_and_the_smallest_piece_that_shows_it_is_cut_out(
 def test_labelled_episodes_are_judged_and_gated(capsys: pytest.CaptureFixture[str]) -> None:
     follow("judge.md", {}, capsys)
     assert Path("push.results").is_dir()
+
+
+@pytest.mark.usefixtures("desk")
+def test_a_success_rate_is_corrected_and_a_data_set_filtered(capsys: pytest.CaptureFixture[str]) -> None:
+    follow("success-rate.md", {}, capsys)
 
 
 @pytest.mark.usefixtures("desk")

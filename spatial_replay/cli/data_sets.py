@@ -204,7 +204,7 @@ def _lines(
         yield "it names its objects, so it needs no mapping"
     else:
         yield "it names its objects; a mapping with `fps:` is enough"
-    first = shlex.quote(f"{data_set.path}#{data_set.episodes[0].number}")
+    first = f"{shlex.quote(str(data_set.path))}#{data_set.episodes[0].number}"
     yield f"each episode is a log: spatial-replay info {first}"
 
 

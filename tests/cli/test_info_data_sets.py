@@ -60,7 +60,7 @@ def test_tasks_labels_and_features_are_listed(tmp_path: Path, capsys: pytest.Cap
         "features observation.state  hand_x hand_y hand_z gripper",
         "pictures observation.images.top",
         "a mapping says which of these are objects: --suggest-mapping",
-        f"each episode is a log: spatial-replay info '{folder}#0'",
+        f"each episode is a log: spatial-replay info {folder}#0",
     ]
     assert run(["info", str(folder), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
