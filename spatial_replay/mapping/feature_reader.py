@@ -30,7 +30,7 @@ from spatial_replay.mapping.detections import (
 from spatial_replay.mapping.mapping_file import LogMapping, Measure, ShapeMapping, SignalMapping, TopicMapping
 from spatial_replay.mapping.message_types import MessageLayout, layout_of_topic
 from spatial_replay.mapping.topic_reader import with_single_precision
-from spatial_replay.text import listed, nearest_hint, number_text
+from spatial_replay.text import counted, listed, nearest_hint, number_text
 
 _SLICE: Final = re.compile(r"(.*)\[(?:(-?\d{1,9})|(-?\d{1,9})?:(-?\d{1,9})?)\]", re.DOTALL)
 _NAME_ENDS: Final = re.compile(r"[./]")
@@ -79,7 +79,10 @@ class BoundObject:
         if self.layout.invalid:
             numbers[np.isin(numbers, with_single_precision(self.layout.invalid))] = nan
         if self.quaternion:
-            self._check_quaternions(numbers[:, list(self.binding.orientation)], mapping_name, episode)
+            quaternions = numbers[:, list(self.binding.orientation)]
+            self._check_quaternions(quaternions, mapping_name, episode)
+            # an object with a shape of no direction would be in place, and without an orientation
+            numbers[~np.isfinite(quaternions).all(axis=1)] = nan
         return detections_of(self.layout, self.binding, numbers)
 
     def _check_quaternions(self, quaternions: Floats, mapping_name: str, episode: str) -> None:
@@ -370,9 +373,9 @@ class _Places:
         parts = (texts,) if isinstance(texts, str) else texts
         places = tuple(place for text in parts for place in self._places(key, text))
         if len(places) not in counts:
-            needed = " or ".join(map(str, counts))
+            needed = f"{' or '.join(map(str, counts))} {'is' if counts == (1,) else 'are'} needed"
             raise UsageError(
-                f"{self.key}.{key}: {listed(list(parts))} has {len(places)} numbers, and {needed} are needed;"
+                f"{self.key}.{key}: {listed(list(parts))} has {counted(len(places), 'number')}, and {needed};"
                 f" write {self._example(counts[-1])}"
             )
         return places
@@ -409,8 +412,8 @@ class _Places:
         index = int(numbered[2])
         if not -source.width <= index < source.width:
             raise UsageError(
-                f"{self.key}.{key}: {source.name} has {source.width} numbers, so there is no {text}; write"
-                f" [0] to [{source.width - 1}]"
+                f"{self.key}.{key}: {source.name} has {counted(source.width, 'number')}, so there is no"
+                f" {text}; write [0] to [{source.width - 1}]"
             )
         yield _place(source, index % source.width)
 

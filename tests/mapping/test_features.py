@@ -155,9 +155,16 @@ shapes: {big: {box: [2, 1], height: [0, 1]}}
 
 
 def test_numbers_that_are_not_finite_are_unknown(tmp_path: Path) -> None:
-    columns = {"obs": [[1.0, 2.0], [np.nan, 2.0], [np.inf, 2.0]]}
-    trace = episode(tmp_path, 'features: {obs: {name: a, position: "[0:2]", shape: {disc: 1}}}', columns)
-    assert (trace.rows[:, 0] >= 0).tolist() == [True, False, False]
+    rows = [[1.0, 2.0], [np.nan, 2.0], [np.inf, 2.0], [1.0, 2.0]]
+    turns = [[0.0, 0.0, 0.0, 1.0]] * 3 + [[0.0, 0.0, np.nan, 1.0]]
+    mapping = """
+features:
+  obs:
+    - {name: a, position: "[0:2]", shape: {disc: 1}}
+    - {name: b, position: "[0:2]", orientation: turn, order: xyzw}
+"""
+    trace = episode(tmp_path, mapping, {"obs": rows, "turn": turns})
+    assert (trace.rows >= 0).tolist() == [[True, True], [False, False], [False, False], [True, False]]
 
 
 def test_numbers_that_are_no_quaternion_are_refused_by_name(tmp_path: Path) -> None:
