@@ -141,6 +141,11 @@ class EpisodeSource(Source):
         mapping, times_ns = self.mapped_by, columns.times_ns
         features = FeatureReading() if mapping is None else _bind(mapping, self.data_set)
         shapes = {} if mapping is None else mapping.shapes
+        if mapping is not None and mapping.episodes.model is not None and not columns.bodies:
+            raise UsageError(
+                f"{mapping.name}: model: {self.data_set.name} ({self.data_set.kind}) has no states of a"
+                " model; leave it out"
+            )
         class_of = {thing.name: thing.class_name for thing in features.objects}
         detected = {
             thing.name: thing.detections(

@@ -9,7 +9,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from batch.fleet import batch, write_log
+import spatial_replay as sr
+from batch.fleet import batch, command, write_log
 
 MAPPING = """
 features:
@@ -39,7 +40,7 @@ def push(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     episodes = [json.dumps({"episode_index": number, "length": 3}) for number in range(11)]
     (folder / "meta" / "episodes.jsonl").write_text("\n".join(episodes))
     for number in range(11):
-        write_episode(folder, number, 0.05 if number == 4 else 0.5)
+        write_episode(folder, number, 0.05 if number == 4 else 0.5 + number / 100)
     (tmp_path / "m.yaml").write_text(MAPPING)
     (tmp_path / "gap.spatial").write_text("spec apart = G (gap >= 0.1)\n")
     monkeypatch.chdir(tmp_path)
@@ -78,6 +79,29 @@ def test_a_folder_has_the_episodes_of_data_sets_in_it(push: Path) -> None:
     done = batch("all", "--spec", "present.spatial", "--mapping", "m.yaml", "-o", "results", "--json", "j")
     names = [json.loads(line)["log"] for line in Path("j").read_text().splitlines()]
     assert names[0] == "all/other.jsonl" and names[1:] == [f"all/push#{number}" for number in range(11)]
+
+
+def test_every_command_that_takes_a_log_takes_an_episode(push: Path) -> None:
+    reading = ("--mapping", "m.yaml")
+    tuned = "const d = 0.1 in [0.01, 0.4]\nspec apart = G (gap >= d)\n"
+    Path("tuned.spatial").write_text(tuned)
+    for code, arguments in (
+        (0, ("explain", "push#3", "--spec", "gap.spatial")),
+        (0, ("replay", "push#3", "--spec", "gap.spatial", "-o", "three.mcap")),
+        (1, ("report", "push#4", "--spec", "gap.spatial", "-o", "four.html")),
+        (1, ("diff", "push#3", "push#4", "--spec", "gap.spatial")),
+        (0, ("clip", "push#4", "--spec", "gap.spatial", "-o", "clip.mcap")),
+        (0, ("learn", "push#3", "push#5", "--bad", "push#4")),
+        (0, ("tune", "--spec", "tuned.spatial", "--good", "push#3", "--bad", "push#4")),
+        (0, ("check", "gap.spatial", "--log", "push#3")),
+        (0, ("info", "push#3")),
+    ):
+        done = command(*arguments, *reading)
+        assert done.code == code, done
+    original, copy = sr.read_trace("push#3", mapping="m.yaml"), sr.read_trace("three.mcap")
+    assert copy == original
+    refusal = command("explain", "push", "--spec", "gap.spatial", *reading)
+    assert (refusal.code, "give one, such as push#0" in refusal.err) == (2, True)
 
 
 def test_an_episode_that_is_not_there_is_an_error_of_the_pattern(push: Path) -> None:

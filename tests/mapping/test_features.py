@@ -301,6 +301,8 @@ def test_states_without_a_model_get_one_by_the_mapping(tmp_path: Path) -> None:
     trace = sr.read_trace(f"{tmp_path}/set.npz#0", mapping=tmp_path / "m.yaml")
     assert trace.names == ("cube",) and trace.times_ns.tolist() == [0, 50_000_000]
     assert np.allclose(positions(trace, "cube"), [[1, 2, 3], [1, 2, 4]])
+    with pytest.raises(UsageError, match=r"m\.yaml: model: set .* has no states of a model"):
+        episode(tmp_path, "model: scene.xml\nfeatures: {obs: {signals: {a: 0}}}", {"obs": [1.0]})
     (tmp_path / "bare.yaml").write_text("fps: 20\n")
     with pytest.raises(UsageError, match="names no objects of set"):
         sr.read_trace(f"{tmp_path}/set.npz#0", mapping=tmp_path / "bare.yaml")
