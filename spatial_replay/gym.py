@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from os import PathLike
-from typing import Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,12 @@ with importing("judging environments takes gymnasium", extra="gym"):
     import gymnasium
     from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
     from gymnasium.vector.utils import iterate
+
+if TYPE_CHECKING:
+    _VectorWrapper: TypeAlias = VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    # no generic class in gymnasium 1.1
+    _VectorWrapper = VectorWrapper
 
 Objects: TypeAlias = Callable[[Any, dict[str, Any]], Mapping[str, TrackedObject | Footprint]]
 """From an observation and its info, the objects by name."""
@@ -124,7 +130,7 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().close()
 
 
-class VectorJudge(VectorWrapper[Any, Any, Any, Any, Any]):
+class VectorJudge(_VectorWrapper):
     """A vector environment whose episodes are judged; `Judge` returns it for a vector environment.
 
     Values of `info["judge"]` are arrays with masks (`_verdict`, …). Where the same step resets an episode,
