@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     "--annotate",
     metavar="NEW",
     type=click.Path(path_type=Path),
-    help="Copy of a LeRobot data set with the verdicts; with --stages, its frames have their stages.",
+    help="Copy of a LeRobot data set with verdicts, and with --stages stages.",
 )
 @click.option(
     "--against",
@@ -91,9 +91,9 @@ if TYPE_CHECKING:
     "--failures",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Specs that are failures: the first that is satisfied is named for each failed episode.",
+    help="Specification of failures: names the first in each failed episode.",
 )
-@click.option("--stages", is_flag=True, help="Print at which stage of the task the episodes end.")
+@click.option("--stages", is_flag=True, help="Count the stages at the end of the episodes.")
 @click.option(
     "--at-least",
     metavar="RATE",
