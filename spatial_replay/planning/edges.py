@@ -525,9 +525,15 @@ class Attempts:
                 self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
             del self._failed[aim.edge]
+        elif not _is_at(target, sample, settings):
+            place = "({:.4g}, {:.4g})".format(*centre_of(sample.objects[target.name].footprint))
+            self._last[aim.edge] = f"moved, but then not at its target: {target.name} at {place}"
         elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
             # one of several motions, and fewer are left than ever before
             self._left[aim.edge] = len(aim.motions)
+            self._failed[aim.edge] = 0
+        elif aim.is_joint:
+            # a detour after a failure; all motions for an edge are bounded, too
             self._failed[aim.edge] -= 1
 
     def withdraw(self, edge: Edge) -> None:
@@ -564,6 +570,13 @@ class Attempts:
         for motion in self._motions:
             if motion.target.name == name and _is_same_scene(motion, sample, settings):
                 yield motion
+
+
+def _is_at(target: Target, sample: Sample, settings: Settings) -> bool:
+    """Return whether an object is at its target, or not in a sample."""
+    tracked = sample.objects.get(target.name)
+    allowed = settings.workspace.grid.cell_size + (0.0 if tracked is None else tracked.uncertainty)
+    return tracked is None or math.dist(centre_of(tracked.footprint), (target.x, target.y)) <= allowed
 
 
 def _count_text(count: int) -> str:
