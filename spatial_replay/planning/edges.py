@@ -41,7 +41,7 @@ from spatial_replay.spec.formula import (
     expand,
 )
 from spatial_replay.spec.walks import base_of, iter_formulas, iter_terms
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import nearest_hint, time_text
 from spatial_replay.trace.trace import Sample, Trace
 
 # ---------------------------------------------------------------------------------------------------- demands
@@ -176,12 +176,12 @@ class Observer:
 
 
 def unknown_reasons(
-    formulas: Iterable[Formula], sample: Sample, seen: Collection[str], regions: Mapping[str, Outline]
+    formulas: Iterable[Formula], sample: Sample, seen: Mapping[str, int], regions: Mapping[str, Outline]
 ) -> list[str]:
     """Return why propositions are unknown in a sample, each reason once.
 
     Args:
-        seen: names of the objects of this sample and of those before.
+        seen: the objects of this sample and of those before, with the newest time of each in nanoseconds.
     """
     scene = TraceScene(Trace.from_samples([sample]), regions)
     reasons: dict[str, None] = {}
@@ -191,6 +191,8 @@ def unknown_reasons(
         names = [base.name for term in leaf.terms if isinstance(base := base_of(term), TrackedName)]
         for reason in unknowns_of(scene, leaf):
             missing = next((name for name in names if reason == f"{name} is not in the sample"), None)
+            if missing is not None and missing in seen:
+                reason = f"{missing} has not been seen since {time_text(seen[missing])}"
             hint = nearest_hint(missing, sample.objects) if missing and missing not in seen else ""
             reasons[f"{reason}; {hint}" if hint else reason] = None
     return list(reasons)

@@ -147,7 +147,8 @@ class Planner:
         # the same, where what only groups without members satisfy may still be to do
         self._tested = self._states
         self._awaited: list[Group] = []
-        self._seen: frozenset[str] = frozenset()
+        # when each object was seen last
+        self._seen: dict[str, int] = {}
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
@@ -250,7 +251,7 @@ class Planner:
         states, symbol = self._states, self._symbol
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(states, self._symbol)
-        self._seen |= sample.objects.keys()
+        self._seen |= dict.fromkeys(sample.objects, sample.time_ns)
         self._test(sample)
         if self._lost is None and self._states.isdisjoint(self.automaton.can_accept):
             text = loss_text(self._words, states, symbol, self._symbol)
@@ -459,6 +460,8 @@ class Planner:
             is_later = any(reason.kind == LATER for reason in self._pruned.values())
             why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
         said = why_no_path(self.automaton, state, self._pruned, why)
+        if budget.left <= 0:
+            said += f"; the search ended after {MOST_MAPS} maps, and there may be a way that it did not find"
         return self._decision("no path", considered, said)
 
     def _foresight(self, attempts: Attempts, budget: Budget) -> Lookahead:
@@ -521,6 +524,9 @@ class Planner:
             min((_cost(rival_target, pushes), rival_target.name) for rival_target in rivals),
         )
         how = "a longer way" if pushes else "less robustness"
+        if math.isclose(cost, least):
+            how = "as short a way" if pushes else "as much robustness"
+            return f"{why}; {rival} could do it with {how} ({abs(least):.3g}), and comes later in `movable`"
         if cost > least:
             how = f"{'a shorter way' if pushes else 'more robustness'}, but no motions lead on from there"
         return f"{why}; {rival} could do it with {how} ({abs(least):.3g}, here {abs(cost):.3g})"

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from spatial_replay.planning.maps import (
     OUT_OF_REACH,
     REASONS,
     GradientMap,
+    MapSubject,
     avoided_cells,
     danger_of,
     distance_to,
@@ -29,6 +30,9 @@ from spatial_replay.planning.maps import (
 )
 from spatial_replay.planning.paths import Path, shortest_path
 from spatial_replay.planning.settings import Grid, Settings
+from spatial_replay.spec.format import format_term
+from spatial_replay.spec.formula import Atom, Term, TrackedName
+from spatial_replay.spec.walks import base_of, iter_formulas
 
 _COARSEST: Final = 0.5
 """The first distance between places, in cells."""
@@ -293,6 +297,8 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
     enough = gradient.robustness >= settings.margin
     if not enough.any():
         best = float(gradient.robustness.max())
+        if why := _why_too_large(gradient):
+            return why
         return f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed"
     counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
     if counts[FREE] and has_failed:
@@ -300,6 +306,50 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
     reasons = zip(counts[1:].tolist(), REASONS[1:], strict=True)
     causes = ", ".join(f"{count} cells: {reason}" for count, reason in reasons if count)
     return f"blocked wherever it would hold: {causes}"
+
+
+def _why_too_large(gradient: GradientMap) -> str:
+    """Return in what an object of a map would have to be and does not fit; "" if it may fit."""
+    about = gradient.made_of.then.about
+    formulas = [
+        about.propositions[number] for cube in gradient.made_of.progress for number, value in cube if value
+    ]
+    for formula in formulas:
+        for atom in iter_formulas(formula):
+            if not isinstance(atom, Atom) or atom.relation != "enclosedin":
+                continue
+            inner, outer = (_outlines_of(term, about) for term in atom.terms)
+            if getattr(atom.terms[0], "name", "") != gradient.name or not inner or not outer:
+                continue
+            room = _extent(outer, 0.0)
+            excess = min(float((_extent(inner, turn) - room).max()) for turn in gradient.turns.tolist())
+            if excess > 0.0:
+                return f"{gradient.name} is {excess:.3g} too large for {format_term(atom.terms[1])}"
+    return ""
+
+
+_Rounded: TypeAlias = tuple[Floats, float]
+"""Corners (N, 2) of an outline, and its radius."""
+
+
+def _outlines_of(term: Term, about: MapSubject) -> list[_Rounded]:
+    """Return what an object or a region covers; nothing for other terms."""
+    name = getattr(term, "name", "")
+    if isinstance(term, TrackedName) and name in about.sample.objects:
+        return [(part.vertices, part.radius) for part in about.sample.objects[name].footprint.parts]
+    if base_of(term) is term and (outline := about.regions.get(name)) is not None:
+        return [(np.array(outline.vertices), outline.radius)]
+    return []
+
+
+def _extent(outlines: Sequence[_Rounded], turn: float) -> Floats:
+    """Return the width along x and y of outlines that are turned by an angle."""
+    cosine, sine = math.cos(turn), math.sin(turn)
+    rotation = np.array([[cosine, sine], [-sine, cosine]])
+    ends = [(vertices @ rotation, radius) for vertices, radius in outlines]
+    high = np.max([vertices.max(axis=0) + radius for vertices, radius in ends], axis=0)
+    low = np.min([vertices.min(axis=0) - radius for vertices, radius in ends], axis=0)
+    return np.asarray(high - low)
 
 
 # ----------------------------------------------------------------------------------------------- refinement
