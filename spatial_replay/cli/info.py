@@ -57,7 +57,13 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
     is_flag=True,
     help="Print rates, gaps and known objects instead, as the section `requires` of a suite file for batch.",
 )
-@click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
+@click.option(
+    "--decisions",
+    metavar="[NUMBER]",
+    is_flag=False,
+    flag_value="",
+    help="Print the decisions of a planned run instead; with NUMBER, that decision in five lines.",
+)
 @click.option(
     "--specification",
     metavar="[NAME]",
@@ -79,7 +85,7 @@ def info(
     as_json: bool,
     suggest_mapping: bool,
     fit: bool,
-    decisions: bool,
+    decisions: str | None,
     specification: str | None,
     layout: bool,
     panels: bool,
@@ -104,6 +110,7 @@ def info(
       spatial-replay info push_v3 --suggest-mapping -o push.yaml
       spatial-replay info push_v3#2
       spatial-replay info push.mcap --decisions
+      spatial-replay info push.mcap --decisions 3
       spatial-replay info annotated.mcap --specification -o used.spatial
       spatial-replay info annotated.mcap --layout -o layout.json
       spatial-replay info annotated.mcap --layout --panels -o layout.json
@@ -112,7 +119,7 @@ def info(
     contents = {
         "--suggest-mapping": suggest_mapping,
         "--fit": fit,
-        "--decisions": decisions,
+        "--decisions": decisions is not None,
         "--specification": specification is not None,
         "--layout": layout,
         "--panel": panel,
@@ -120,8 +127,12 @@ def info(
     names = [name for name, is_given in contents.items() if is_given]
     if len(names) > 1:
         raise UsageError(f"{' and '.join(names)} print different things; give one of them")
-    if as_json and names and not decisions:
+    if as_json and names and decisions is None:
         raise UsageError(f"{names[0]} prints no JSON; remove --json")
+    if decisions and not decisions.isdecimal():
+        raise UsageError(
+            f"--decisions takes the number of a decision, not {decisions!r}; name the log before it"
+        )
     if panels and not layout:
         raise UsageError("--panels chooses a layout; add --layout")
     if panel and log is not None:
@@ -144,8 +155,8 @@ def info(
             return _print_layout(log, panels=panels)
         if specification is not None:
             return _print_specification(log, specification)
-        if decisions:
-            return _print_decisions(log, as_json)
+        if decisions is not None:
+            return _print_decisions(log, decisions, as_json)
         if suggest_mapping:
             return _print_mapping(log)
         if fit:
@@ -231,18 +242,20 @@ def _episode_facts(source: Source) -> dict[str, str | None]:
     return {"task": task, "label": None if label is None else "success" if label else "failure"}
 
 
-def _print_decisions(log: LogFile, as_json: bool) -> int:
-    """Print the decisions of a planned run."""
+def _print_decisions(log: LogFile, number: str, as_json: bool) -> int:
+    """Print the decisions of a planned run, or the one with a number."""
     from spatial_replay.planning.read import read_decisions
     from spatial_replay.replay.selection import known_zero_ns
     from spatial_replay.sources.open_log import open_source
 
     recorded = read_decisions(log)
     warn(*counted_from(recorded.faults, known_zero_ns(open_source(log)) if recorded.faults else 0))
+    if number:
+        recorded = recorded._replace(decisions=(recorded.decision(int(number)),))
     if as_json:
         show_json(recorded.document)
     else:
-        show(*recorded.lines())
+        show(*(recorded.brief(int(number)) if number else recorded.lines()))
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
 
 

@@ -127,8 +127,24 @@ def _redo(
     return most_severe([code, ExitCode.DAMAGED]) if redone.faults else code
 
 
+def _why(log: LogFile, number: int | None, name: str | None, place: str | None) -> int:
+    """Print why a decision did not bring an object to a place."""
+    # imported here so that --help stays fast
+    from spatial_replay.planning.read import why_not_there
+
+    if number is None or name is None or place is None:
+        raise UsageError("--why LOG asks about one place; give --step N, --object NAME and --at X,Y")
+    try:
+        x, y = map(float, place.split(","))
+    except ValueError:
+        raise UsageError(f"--at {place!r} is no place; give two numbers, as in --at 0.5,0.1") from None
+    show(*why_not_there(log, number, name, (x, y)))
+    return ExitCode.SATISFIED
+
+
 _OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations__)
 """Parameters that say how a run is made."""
+_NOT_WHY = (*_OF_RUNS, "scenario", "log", "as_json", "output", "spec", "of", "constants", "settings", "texts")
 
 
 @click.command()
@@ -140,6 +156,16 @@ _OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations_
     type=LogPath(),
     help="Decide again on the samples of a planned run, with these options.",
 )
+@click.option(
+    "--why",
+    "why_log",
+    metavar="LOG",
+    type=LogPath(),
+    help="Say which relations fail at a place, by how much, and what stands there.",
+)
+@click.option("--step", "number", metavar="N", type=int, help="With --why: number of the decision.")
+@click.option("--object", "name", metavar="NAME", help="With --why: the object.")
+@click.option("--at", "place", metavar="X,Y", help="With --why: the place, in the unit of the log.")
 @click.option("--json", "as_json", is_flag=True, help="With --redo: print JSON instead of text.")
 @log_output_option("Log to write (MCAP); with --redo, a copy with both decisions.", required=False)
 @durability_option
@@ -168,6 +194,10 @@ def plan(
     /,
     scenario: str | None,
     log: LogFile | None,
+    why_log: LogFile | None,
+    number: int | None,
+    name: str | None,
+    place: str | None,
     as_json: bool,
     output: Path | None,
     spec: LogFile | None,
@@ -191,7 +221,12 @@ def plan(
       spatial-replay plan push -o push.mcap --seed 3
       spatial-replay plan table-setting -o set.mcap --settings careful.yaml --set attempts=5
       spatial-replay plan --redo push.mcap --set room=0.02
+      spatial-replay plan --why push.mcap --step 0 --object red --at 0.5,0.1
     """
+    if why_log is not None:
+        refuse_options(context, _NOT_WHY, "is not for --why; leave it out")
+        return _why(why_log, number, name, place)
+    refuse_values({"--step": number, "--object": name, "--at": place}, "is for --why LOG")
     if log is not None:
         if scenario is not None:
             raise UsageError(f"--redo takes no scenario; leave out {scenario}")

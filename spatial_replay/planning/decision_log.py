@@ -557,10 +557,40 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
         why = f": {decision.lost.text}" if decision.lost.text else ""
         yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{why}"
     if decision.HasField("outcome"):
-        outcome = decision.outcome
-        how = "done" if outcome.succeeded else f"failed ({outcome.at})" if outcome.at else "failed"
-        after = ", ".join(map(str, outcome.states))
-        yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
+        yield f"  {_outcome_text(decision)}"
+
+
+def brief_lines(decision: PlanDecision) -> Iterator[str]:
+    """Yield at most five lines about one decision."""
+    states = ", ".join(map(str, decision.states))
+    yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}: {decision.reason}"
+    if decision.considered:
+        edge = decision.considered[-1]
+        never = f"; never {_some([guard.text for guard in edge.constraints])}" if edge.constraints else ""
+        yield f"  wanted   {_some([guard.text for guard in edge.progress])}{never}"
+        for candidate in edge.candidates:
+            if candidate.chosen:
+                rows = [f"{key} {text}" for key, text in candidate_lines(candidate)]
+                yield f"  chosen   {'; '.join([_target_text(candidate.target), *rows[:2]])}"
+        rivals = [_rival_text(candidate) for candidate in edge.candidates if not candidate.chosen]
+        if rivals:
+            yield f"  instead  {'; '.join(rivals)}"
+    yield f"  {_outcome_text(decision)}" if decision.HasField("outcome") else "  no outcome"
+
+
+def _rival_text(candidate: PlanCandidate) -> str:
+    if candidate.rejected:
+        return f"{candidate.object}: {candidate.rejected}"
+    return (
+        f"{candidate.object}: {_place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
+    )
+
+
+def _outcome_text(decision: PlanDecision) -> str:
+    outcome = decision.outcome
+    how = "done" if outcome.succeeded else f"failed ({outcome.at})" if outcome.at else "failed"
+    after = ", ".join(map(str, outcome.states))
+    return f"{how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 
 
 def joint_suffix(edge: PlanEdge) -> str:

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, get_args
 
 from spatial_replay.errors import UsageError
+from spatial_replay.geometry.footprint import centre_of
 from spatial_replay.lazy import Displayed
 from spatial_replay.text import time_text
 
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
     from spatial_replay.planning.maps import Cubes, GradientMap
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
-"""The kind of a step: move an object, hold because the specification is satisfied, wait for an observation,
-for time to pass or for others that move, or stop because no path to acceptance is left."""
+"""The kind of a step: move an object, hold because the specification is satisfied, wait, or stop because no
+path to acceptance is left. A step waits for an observation, for time to pass or for others that move."""
 
 Stage: TypeAlias = Literal["pick", "way", "place"]
 """Stages of a motion: picking the object, moving it, placing it at the target."""
@@ -205,6 +206,32 @@ class Step(Displayed):
     def aim(self) -> Consideration | None:
         """The edge that the step is for, if any."""
         return self.considered[-1] if self.considered and not self.considered[-1].pruned else None
+
+    def alternatives(self, count: int) -> tuple[Target, ...]:
+        """Return the best places besides the target, the most robust first.
+
+        They are middles of free cells for any object of the aim, at least two cells from the target and from
+        each other. Whether a way leads there, and what follows, is not checked.
+        """
+        targets = []
+        for candidate in self.candidates:
+            sample = candidate.map.made_of.now.about.sample
+            tracked = sample.objects[candidate.name]
+            start, yaw = centre_of(tracked.footprint), tracked.yaw
+            avoided = [] if candidate.target is None else [(candidate.target.x, candidate.target.y)]
+            targets += [
+                Target(
+                    candidate.name,
+                    x,
+                    y,
+                    turn,
+                    None if yaw is None else yaw + turn,
+                    (start, (x, y)),
+                    robustness,
+                )
+                for x, y, turn, robustness in candidate.map.best_poses(count, avoided)
+            ]
+        return tuple(sorted(targets, key=lambda target: -target.robustness)[:count])
 
     @property
     def progress(self) -> Guards:

@@ -100,6 +100,28 @@ class GradientMap(Displayed):
         free = self.blocked == FREE
         return float(self.robustness[free].max()) if free.any() else -np.inf
 
+    def best_poses(
+        self, count: int, avoided: Sequence[tuple[float, float]] = ()
+    ) -> list[tuple[float, float, float, float]]:
+        """Return the best free cells (x, y, turn, robustness), at least two cells from each other.
+
+        Args:
+            avoided: places (x, y) that they are to be as far from.
+        """
+        order = np.argsort(
+            -np.where(self.blocked == FREE, self.robustness, -np.inf), axis=None, kind="stable"
+        )
+        places, poses = [*avoided], list[tuple[float, float, float, float]]()
+        for number in order[: int((self.blocked == FREE).sum())]:
+            turn, row, column = map(int, np.unravel_index(int(number), self.blocked.shape))
+            place = self.grid.centre(row, column)
+            if len(poses) == count:
+                break
+            if all(math.dist(place, before) >= 2.0 * self.grid.cell_size for before in places):
+                places.append(place)
+                poses.append((*place, float(self.turns[turn]), float(self.robustness[turn, row, column])))
+        return poses
+
     def cell_of(self, x: float, y: float, turn: float) -> tuple[int, int, int]:
         """Return the turn, row and column of a pose."""
         return (int(np.argmin(np.abs(self.turns - turn))), *self.grid.cell(x, y))

@@ -39,6 +39,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDeci
 from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,
+    brief_lines,
     candidate_lines,
     decision_from_payload,
     decision_lines,
@@ -49,8 +50,9 @@ from spatial_replay.planning.decision_log import (
     plan_lines,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
+from spatial_replay.planning.maps import BlockedBy, GradientMap, danger_of, map_layers
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import changed_settings, changes_text, settings_from_text
+from spatial_replay.planning.settings import Settings, changed_settings, changes_text, settings_from_text
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_specification
@@ -76,6 +78,28 @@ class LoggedDecisions(NamedTuple):
     def lines(self) -> Iterator[str]:
         """Yield lines about each decision: its aim, the candidates, the choice and the outcome."""
         return plan_lines(self.name, self.decisions)
+
+    def brief(self, number: int) -> Iterator[str]:
+        """Yield at most five lines about one decision.
+
+        Raises:
+            UsageError: there is none with this number.
+        """
+        return brief_lines(self.decision(number))
+
+    def decision(self, number: int) -> PlanDecision:
+        """Return one decision.
+
+        Raises:
+            UsageError: there is none with this number.
+        """
+        for decision in self.decisions:
+            if decision.number == number:
+                return decision
+        raise UsageError(
+            f"{self.name} has no decision {number}; it has {self.decisions[0].number} to "
+            f"{self.decisions[-1].number}"
+        )
 
     @property
     def document(self) -> dict[str, Any]:
@@ -215,6 +239,81 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
     if not steps:
         raise _without_decisions(source)
     return tuple(steps.values())
+
+
+def why_not_there(
+    log: str | PathLike[str], number: int, name: str, place: tuple[float, float]
+) -> Iterator[str]:
+    """Yield why a decision does not bring an object to a place: each demand there, and what is in the way.
+
+    Values are those of the middle of the place's cell, in the orientation of the target if there is one.
+
+    Raises:
+        UsageError: the log holds no plan, no such decision, an object that it did not consider, or a place
+            outside its map.
+        MissingFileError, LogError: the log cannot be read.
+    """
+    steps = {logged.step.number: logged.step for logged in read_steps(log)}
+    if number not in steps:
+        raise UsageError(f"there is no decision {number}; the log has {min(steps)} to {max(steps)}")
+    step = steps[number]
+    edges = [
+        (edge, candidate)
+        for edge in reversed(step.considered)
+        for candidate in edge.candidates
+        if candidate.name == name
+    ]
+    if not edges:
+        names = {candidate.name for edge in step.considered for candidate in edge.candidates}
+        considered = ", ".join(sorted(names)) or "nothing"
+        raise UsageError(f"decision {number} did not consider {name!r}; it considered: {considered}")
+    edge, candidate = edges[0]
+    gradient, target = candidate.map, candidate.target
+    if not gradient.grid.contains(np.array(place)):
+        raise UsageError(f"({place[0]:g}, {place[1]:g}) is outside the map of {name}")
+    cell = gradient.cell_of(*place, 0.0 if target is None else target.turn)
+    settings = planner_of(open_source(log)).settings
+    yield (
+        f"{name} at ({place[0]:g}, {place[1]:g}) for the edge {edge.edge[0]} -> {edge.edge[1]}: robustness "
+        f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed"
+    )
+    layers = map_layers(gradient, settings, candidate.failed)
+    for which in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
+        value = float(layers.robustness[(which, *cell)])
+        how = f"fails by {-value:.4g}" if value < 0.0 else f"holds by {value:.4g}"
+        less = ", less than the margin" if 0.0 <= value < settings.margin else ""
+        yield f"  {layers.conjuncts[which]} {how}{less}"
+    cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
+    yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, settings))
+    if target is not None:
+        chosen = "chosen" if candidate.is_chosen else "possible"
+        yield f"  {chosen} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
+
+
+def _blocking_texts(
+    gradient: GradientMap, cell: tuple[int, int, int], cause: BlockedBy | None, settings: Settings
+) -> Iterator[str]:
+    """Yield what keeps an object out of a cell, and by how much."""
+    kind = "" if cause is None else cause.kind
+    if cause is not None and kind == "constraint":
+        danger = danger_of(gradient.made_of.now, gradient.made_of.constraints)[cell]
+        how = (
+            f"would hold by {danger:.4g}" if danger >= 0.0 else f"would nearly hold, {-danger:.4g} is missing"
+        )
+        yield f"never allowed on the way: {cause.name} {how}"
+    maps = gradient.made_of.now
+    apart = maps.distances[(slice(None), *cell)]
+    if apart.size and apart.min() <= settings.workspace.clearance:
+        nearest = float(apart.min())
+        name = maps.obstacles[int(apart.argmin())] or "an obstacle of the workspace"
+        yield f"{name} is in the way: " + (
+            f"they overlap by {-nearest:.4g}" if nearest < 0.0 else f"{nearest:.4g} is left between them"
+        )
+    others = {"reach": "the robot does not reach it", "failed": "a motion failed near it"}
+    if kind in others:
+        yield others[kind]
+    elif kind == "unknown":
+        yield "a relation there is unknown"
 
 
 def refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:

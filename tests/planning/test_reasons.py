@@ -1,0 +1,122 @@
+"""Reasons of decisions: what is too large, what was not there, what was not seen, and why not elsewhere."""
+
+from __future__ import annotations
+
+import pytest
+from click.testing import CliRunner
+
+import spatial_replay as sr
+from planning.kinematics import block
+from planning.plans import write_usual_run
+from spatial_replay import Planner, Settings
+from spatial_replay.cli.application import application
+from spatial_replay.planning import Grid, Outcome, Workspace, moved_object
+
+AREA = Workspace(Grid.over(0, 0, 1, 1, 0.02))
+
+
+def planner_for(text, objects, *names, **options):
+    planner = Planner(sr.parse_specification(text), Settings(AREA, movable=names, **options))
+    planner.observe(sr.Sample(0, objects))
+    return planner
+
+
+def test_an_object_that_is_too_large_for_a_region_is_named_with_the_excess():
+    text = "region slot = box(0.4, 0.4, 0.47, 0.6)\nspec s = F (a enclosedin slot)"
+    step = planner_for(text, {"a": block(0.2, 0.2, size=0.08)}, "a").next_step()
+    assert step.kind == "no path"
+    assert "a is 0.01 too large for slot" in str(dict(step.pruned))
+
+
+def test_an_object_that_was_seen_before_is_named_with_the_time():
+    planner = planner_for("F (a leftof b)", {"a": block(0.6, 0.5), "b": block(0.4, 0.5)}, "a")
+    planner.observe(sr.Sample(300_000_000, {"a": block(0.6, 0.5), "b": block(0.4, 0.5)}))
+    planner.observe(sr.Sample(600_000_000, {"a": block(0.6, 0.5)}))
+    step = planner.next_step()
+    assert (step.kind, "b has not been seen since 0.300 s" in step.reason) == ("wait", True)
+
+
+def test_a_motion_whose_object_is_elsewhere_afterwards_is_named_with_its_place():
+    planner = planner_for("F (a leftof b)", {"a": block(0.6, 0.5), "b": block(0.4, 0.5)}, "a", attempts=2)
+    time_ns = 0
+    while (step := planner.next_step()).kind == "execute":
+        time_ns += 1
+        planner.observe(sr.Sample(time_ns, {"a": block(0.8, 0.2 + time_ns / 10), "b": block(0.4, 0.5)}))
+        planner.conclude(Outcome(True))
+    assert "moved, but then not at its target: a at (0.8, 0.4)" in step.reason
+
+
+def test_equal_objects_are_told_apart_by_their_order():
+    objects = {"b": block(0.4, 0.5), "a": block(0.6, 0.5)}
+    step = planner_for("F (a leftof b)", objects, "a", "b", skill="place").next_step()
+    assert step.target.name == "a"
+    assert "b could do it with as much robustness" in step.reason
+    assert "comes later in `movable`" in step.reason
+
+
+def test_alternatives_of_a_step_are_other_good_places():
+    step = planner_for("F (a leftof b)", {"a": block(0.6, 0.5), "b": block(0.4, 0.5)}, "a").next_step()
+    first, second, third = step.alternatives(3)
+    assert first.robustness >= second.robustness >= third.robustness > 0.0
+    assert (first.x, first.y) != (step.target.x, step.target.y)
+    planner = Planner(sr.parse_specification("F (a leftof b)"), Settings(AREA))
+    planner.observe(
+        sr.Sample(0, {"a": moved_object(block(0.6, 0.5), first.x, first.y), "b": block(0.4, 0.5)})
+    )
+    assert planner.is_accepting
+
+
+def call(*arguments):
+    result = CliRunner().invoke(application, [str(argument) for argument in arguments], standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+    return result.output.splitlines()
+
+
+def test_one_decision_is_shown_in_five_lines(tmp_path):
+    steps = write_usual_run(tmp_path / "run.mcap")
+    lines = call("info", tmp_path / "run.mcap", "--decisions", 0)
+    assert len(lines) == 5
+    assert lines[0].startswith(f"step 0 at {steps[0].time_ns / 1e9:.3f} s") and steps[0].reason in lines[0]
+    assert [line.split()[0] for line in lines[1:]] == ["wanted", "chosen", "instead", "done"]
+    with pytest.raises(sr.UsageError, match="has no decision 9; it has 0 to"):
+        call("info", tmp_path / "run.mcap", "--decisions", 9)
+    with pytest.raises(sr.UsageError, match="takes the number of a decision"):
+        call("info", "--decisions", tmp_path / "run.mcap")
+
+
+def test_a_place_that_was_not_chosen_is_explained_by_the_demands_that_fail_there(tmp_path):
+    log = tmp_path / "run.mcap"
+    write_usual_run(log)
+    lines = call("plan", "--why", log, "--step", 0, "--object", "red", "--at", "0.6,0.15")
+    assert "  red dist blue >= 0.03 fails by " in lines[1]
+    assert any(line.startswith("  blue is in the way: they overlap by ") for line in lines)
+    assert lines[-1].startswith("  possible instead: (")
+    for arguments, error in {
+        ("--object", "pink", "--at", "0.6,0.15"): "did not consider 'pink'; it considered: blue, green, red",
+        ("--object", "red", "--at", "9,9"): "outside the map of red",
+        ("--object", "red", "--at", "here"): "give two numbers",
+        ("--object", "red"): "give --step N, --object NAME and --at X,Y",
+    }.items():
+        with pytest.raises(sr.UsageError, match=error):
+            call("plan", "--why", log, "--step", 0, *arguments)
+
+
+def test_detours_after_failures_do_not_end_a_run_that_goes_on(tmp_path):
+    """Six objects are sorted by a robot that drops every third one beside its way."""
+    names = [f"o{number}" for number in range(6)]
+    objects = {name: block(0.1 + 0.15 * number, 0.2, size=0.05) for number, name in enumerate(names)}
+    goal = " and ".join(
+        f"{left} leftof {right}" for left, right in zip(names[::-1], names[-2::-1], strict=False)
+    )
+    planner = planner_for(f"F ({goal})", objects, *names, skill="place", margin=0.005)
+    time_ns = count = 0
+    while (step := planner.next_step()).kind == "execute":
+        count += 1
+        slips = count % 3 == 0
+        target, time_ns = step.target, time_ns + 1
+        x, y = target.waypoints[0] if slips else (target.x, target.y)
+        objects = {**objects, target.name: moved_object(objects[target.name], x, y + 0.1 * slips)}
+        planner.observe(sr.Sample(time_ns, objects))
+        planner.conclude(Outcome(not slips, "it slipped" if slips else ""))
+    assert step.kind == "hold", step.reason
