@@ -135,6 +135,25 @@ def test_bodies_in_a_state_of_mujoco_are_found_by_their_quaternions(
     assert mapping["fps"] is None
 
 
+def test_a_copy_that_lost_labels_and_poses_is_recognised(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    folder = lerobot(tmp_path / "copy", {"observation.state": (None, [0.0] * 4)})
+    info = json.loads((folder / "meta/info.json").read_text())
+    # as forge-robotics 0.2.0 writes it
+    info |= {"codebase_version": "v3.0", "chunks_size": 1}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    for number in range(2):
+        (folder / f"meta/episodes/chunk-{number:03d}").mkdir(parents=True)
+        table = pa.table({"episode_index": [number], "length": [3], "task_index": [0]})
+        pq.write_table(table, folder / f"meta/episodes/chunk-{number:03d}/file-000.parquet")
+    assert run(["info", str(folder)]) == 0
+    assert "it looks like a copy by forge-robotics, which leaves out labels" in capsys.readouterr().err
+
+
 def test_joints_and_pictures_are_no_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = lerobot(
         tmp_path / "arm", {"observation.state": (["shoulder_pan.pos", "gripper.pos"], [0.0] * 2)}

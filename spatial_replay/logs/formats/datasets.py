@@ -154,6 +154,11 @@ class _LeRobot(DataSet):
             remarks.append(
                 f"meta/info.json says {counted(total, 'episode')}, and meta has {len(self.episodes)}"
             )
+        if info.get("chunks_size") == 1 and _lacks_files(path):
+            remarks.append(
+                "it looks like a copy by forge-robotics, which leaves out labels, poses of objects and names"
+                " of numbers; use the original"
+            )
         self.remarks = tuple(remarks)
         # a file, the columns that were looked for in it, and those that it has
         self._loaded: tuple[object, frozenset[str], Mapping[str, Floats]] = (None, frozenset(), {})
@@ -253,6 +258,12 @@ class _LeRobot(DataSet):
         if unread:
             self._loaded = (key, names | wanted, {**table, **_read_columns(file, unread)})
         return self._loaded[2]
+
+
+def _lacks_files(path: Path) -> bool:
+    """Return whether the tables of episodes do not say in which files of data the episodes are."""
+    tables = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
+    return bool(tables) and "data/file_index" not in arrow().parquet.read_schema(tables[0]).names
 
 
 def _features(features: Mapping[str, Any]) -> Iterator[Feature]:
