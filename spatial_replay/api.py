@@ -443,7 +443,7 @@ def judge(
     from spatial_replay.batch.run import run_batch, workers_of
     from spatial_replay.batch.suite import Conditions
     from spatial_replay.judging.judgement import prepare_judgement
-    from spatial_replay.judging.pairs import SAME_START, compare_judgements
+    from spatial_replay.judging.pairs import judge_batch
     from spatial_replay.judging.stages import episode_stages, with_stages
 
     refuse_unknown(reading, Reading.__annotations__)
@@ -463,14 +463,8 @@ def judge(
         batch = run_batch(cases, folder if output is None else output, workers)
         for part in prepared:
             batch = part.explain(batch, workers, allowed)
-    judgement, *earlier = (part.judgement(batch, allowed) for part in prepared)
-    if stages:
-        judgement = with_stages(judgement, episode_stages(judgement, cases[0]))
-    if not earlier:
-        return judgement
-    distance = SAME_START if same_start is None else same_start
-    comparison = compare_judgements(judgement, earlier[0], conditions, distance)
-    return replace(judgement, comparison=comparison)
+    judgement = judge_batch(prepared, batch, allowed, same_start)
+    return with_stages(judgement, episode_stages(judgement, cases[0])) if stages else judgement
 
 
 def _suite(

@@ -1,10 +1,10 @@
-"""`spatial-replay judge`: success rates of episodes by a specification, beside their labels."""
+"""`spatial-replay judge`: success rates of episodes by a specification, next to their labels."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,9 +22,11 @@ from spatial_replay.cli.batch import (
 )
 from spatial_replay.cli.options import (
     ConditionArguments,
+    add_options,
     allow_option,
     check_outputs,
     condition_options,
+    gather,
     plugin_option,
     semantics_option,
 )
@@ -34,7 +36,54 @@ from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
+    from spatial_replay.annotate.stages import Stages
+    from spatial_replay.batch.workers import Workers
     from spatial_replay.judging.judgement import Judgement
+
+
+@dataclass(frozen=True, slots=True)
+class JudgeOutputs:
+    """Where results, the page, and the verdicts as labels go."""
+
+    output: str | None
+    html: Path | None
+    json_file: str | None
+    write_labels: Path | None
+    annotate: Path | None
+
+    @property
+    def need_reasons(self) -> bool:
+        """Whether the reasons of all violated episodes are written."""
+        return any((self.html, self.json_file, self.write_labels, self.annotate))
+
+
+_OUTPUTS = (
+    click.option(
+        "-o",
+        "--output",
+        metavar="RESULTS",
+        help="Folder for results, or address of one.  [default: NAME.results]",
+    ),
+    click.option(
+        "--html",
+        metavar="DIR",
+        type=click.Path(path_type=Path),
+        help="Folder for a page over all episodes, and a report of each disagreement.",
+    ),
+    click.option("--json", "json_file", metavar="FILE|-", help="Judgement to write, as one JSON object."),
+    click.option(
+        "--write-labels",
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="Table of the verdicts as labels: .parquet or .csv.",
+    ),
+    click.option(
+        "--annotate",
+        metavar="NEW",
+        type=click.Path(path_type=Path),
+        help="Copy of a LeRobot data set with verdicts, and with --stages stages.",
+    ),
+)
 
 
 @click.command()
@@ -50,31 +99,7 @@ if TYPE_CHECKING:
 )
 @plugin_option
 @semantics_option
-@click.option(
-    "-o",
-    "--output",
-    metavar="RESULTS",
-    help="Folder for results, or address of one.  [default: NAME.results]",
-)
-@click.option(
-    "--html",
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder for a page over all episodes, and a report of each disagreement.",
-)
-@click.option("--json", "json_file", metavar="FILE|-", help="Judgement to write, as one JSON object.")
-@click.option(
-    "--write-labels",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Table of the verdicts as labels: .parquet or .csv.",
-)
-@click.option(
-    "--annotate",
-    metavar="NEW",
-    type=click.Path(path_type=Path),
-    help="Copy of a LeRobot data set with verdicts, and with --stages stages.",
-)
+@lambda command: add_options(_OUTPUTS, gather("outputs", JudgeOutputs, command))
 @click.option(
     "--against",
     metavar="LOG",
@@ -110,11 +135,7 @@ def judge(
     labels: str | None,
     result: str | None,
     semantics: Semantics,
-    output: str | None,
-    html: Path | None,
-    json_file: str | None,
-    write_labels: Path | None,
-    annotate: Path | None,
+    outputs: JudgeOutputs,
     against: tuple[str, ...],
     same_start: float | None,
     failures: Path | None,
@@ -129,7 +150,7 @@ def judge(
     labels.csv next to the logs, or from the data set. An entry has `log` or `episode`, and `success`.
 
     The exit code is 0 for every rate. With --at-least it is 1 if the rate is too low, and 4 if undecided
-    episodes leave that open. It is 4 if no episode can be judged.
+    episodes leave that open, or if no episode can be judged.
 
     \b
     Examples:
@@ -140,69 +161,77 @@ def judge(
     # imported here so that --help stays fast
     from spatial_replay.batch.run import workers_of
     from spatial_replay.judging.judgement import prepare_judgement
-    from spatial_replay.judging.pairs import SAME_START, compare_judgements
+    from spatial_replay.judging.pairs import judge_batch
     from spatial_replay.judging.stages import episode_stages, with_stages
-    from spatial_replay.judging.writers import annotate_data_set, check_annotation, ending_of_labels
-    from spatial_replay.judging.writers import write_labels as write_label_table
 
     if same_start is not None and not against:
         raise UsageError("--same-start is about pairs; add --against LOG")
     if failures is not None and (not conditions.specs or failures in conditions.specs):
         raise UsageError("--failures has no spec that judges; give that with --spec")
-    has_failures = failures is not None
     specs = conditions.specs if failures is None else (failures, *conditions.specs)
-    evaluated = replace(conditions, specs=specs)
-    suite = suite_of_logs(logs, evaluated, semantics).allowing(allow)
-    prepared = [prepare_judgement(suite, labels, result, progress, has_failures=has_failures)]
-    if against:
-        earlier = suite_of_logs(against, evaluated, semantics).allowing(allow)
-        prepared.append(prepare_judgement(earlier, None, result, progress, has_failures=has_failures))
+    suites = [
+        suite_of_logs(episodes, replace(conditions, specs=specs), semantics).allowing(allow)
+        for episodes in (logs, against)
+        if episodes
+    ]
+    prepared = [
+        prepare_judgement(suite, file, result, progress, has_failures=failures is not None)
+        for suite, file in zip(suites, (labels, None), strict=False)
+    ]
     cases = [part.case for part in prepared]
     warnings = [warning for file in cases[0].files for warning in file.warnings]
     show_diagnostics({str(warning): warning for warning in warnings}.values())
-    inputs = [*inputs_of(suite), *prepared[0].labels.files]
-    outputs = {"--json": None if json_file == "-" else json_file, "--write-labels": write_labels}
-    check_outputs(outputs, inputs)
-    if write_labels is not None:
-        ending_of_labels(write_labels)
-    paths = [log.path for log in cases[0].logs]
-    data_set = None if annotate is None else check_annotation(paths, annotate)
-    folder = output or f"{prepared[0].name}.results"
+    inputs = [*inputs_of(suites[0]), *prepared[0].labels.files]
+    data_set = _check_outputs(outputs, inputs, [log.path for log in cases[0].logs])
+    folder = outputs.output or f"{prepared[0].name}.results"
     workers = workers_of(jobs or os.cpu_count() or 1)
     batch = evaluated_batch(cases, folder, workers)
-    is_exported = any((write_labels, annotate, html, json_file))
     for part in prepared:
-        batch = part.explain(batch, workers, allow, is_exported=is_exported, progress=progress)
-    judgement = prepared[0].judgement(batch, allow)
-    if against:
-        comparison = compare_judgements(
-            judgement,
-            prepared[1].judgement(batch, allow),
-            cases[0].case.conditions,
-            SAME_START if same_start is None else same_start,
-        )
-        judgement = replace(judgement, comparison=comparison)
+        batch = part.explain(batch, workers, allow, is_exported=outputs.need_reasons, progress=progress)
+    judgement = judge_batch(prepared, batch, allow, same_start)
     runs = episode_stages(judgement, cases[0], progress) if stages else {}
     if stages:
         judgement = with_stages(judgement, runs)
-    if write_labels is not None:
-        write_label_table(judgement, write_labels, inputs)
-    if annotate is not None and data_set is not None:
-        annotate_data_set(judgement, data_set, annotate, runs)
-    if html is not None:
-        from spatial_replay.batch.outputs import write_pages
-        from spatial_replay.judging.writers import labelled_batch
-
-        write_pages(labelled_batch(judgement), html, judgement.name, workers, progress=progress)
-    if json_file is not None:
-        write_json_lines([judgement.document], json_file, inputs)
-    if json_file != "-":
-        outputs_of_labels = [str(file) for file in (write_labels, annotate) if file is not None]
-        _print(judgement, [folder, *outputs_of_labels], conditions)
+    _write(judgement, outputs, inputs, workers, data_set, runs)
+    if outputs.json_file != "-":
+        files = [str(file) for file in (outputs.write_labels, outputs.annotate) if file is not None]
+        _print(judgement, [folder, *files], conditions)
     warn(*judgement.remarks, *judgement.batch.remarks)
     warn_of_names(judgement.batch.table)
     warn_of_damage(judgement.batch.table)
     return _exit_code(judgement, at_least)
+
+
+def _check_outputs(outputs: JudgeOutputs, inputs: Sequence[Path], logs: Sequence[str]) -> Path | None:
+    """Refuse outputs that cannot be written; return the data set that is copied, if one is."""
+    from spatial_replay.judging.writers import check_annotation, ending_of_labels
+
+    json_file = None if outputs.json_file == "-" else outputs.json_file
+    check_outputs({"--json": json_file, "--write-labels": outputs.write_labels}, inputs)
+    if outputs.write_labels is not None:
+        ending_of_labels(outputs.write_labels)
+    return None if outputs.annotate is None else check_annotation(logs, outputs.annotate)
+
+
+def _write(
+    judgement: Judgement,
+    outputs: JudgeOutputs,
+    inputs: Sequence[Path],
+    workers: Workers,
+    data_set: Path | None,
+    runs: Mapping[str, Stages],
+) -> None:
+    from spatial_replay.batch.outputs import write_pages
+    from spatial_replay.judging.writers import annotate_data_set, labelled_batch, write_labels
+
+    if outputs.write_labels is not None:
+        write_labels(judgement, outputs.write_labels, inputs)
+    if outputs.annotate is not None and data_set is not None:
+        annotate_data_set(judgement, data_set, outputs.annotate, runs)
+    if outputs.html is not None:
+        write_pages(labelled_batch(judgement), outputs.html, judgement.name, workers, progress=progress)
+    if outputs.json_file is not None:
+        write_json_lines([judgement.document], outputs.json_file, inputs)
 
 
 def _print(judgement: Judgement, outputs: Sequence[str], conditions: ConditionArguments) -> None:

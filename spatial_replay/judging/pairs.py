@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
 from math import dist, isfinite
 from typing import Any, Final, TypeAlias
 
 from spatial_replay.batch.rows import Task, opened_task
+from spatial_replay.batch.run import BatchResult
 from spatial_replay.batch.suite import Conditions
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.footprint import centres_of
-from spatial_replay.judging.judgement import JudgedEpisode, Judgement
+from spatial_replay.judging.judgement import JudgedEpisode, Judgement, PreparedJudgement
 from spatial_replay.judging.statistics import (
     EVIDENCE,
     SIGNIFICANCE,
@@ -106,6 +108,28 @@ class Comparison:
         }
 
 
+def judge_batch(
+    prepared: Sequence[PreparedJudgement],
+    batch: BatchResult,
+    allow: AbstractSet[str] = frozenset(),
+    same_start: float | None = None,
+) -> Judgement:
+    """Return the judgement of new episodes, compared with earlier ones if these are prepared, too.
+
+    Args:
+        prepared: the new episodes, and perhaps the earlier ones.
+        batch: the results of both.
+        allow: see `PreparedJudgement.judgement`.
+        same_start: see `compare_judgements`; 0.001 unless given.
+    """
+    judgement, *earlier = (part.judgement(batch, allow) for part in prepared)
+    if not earlier:
+        return judgement
+    distance = SAME_START if same_start is None else same_start
+    conditions = prepared[0].case.case.conditions
+    return replace(judgement, comparison=compare_judgements(judgement, earlier[0], conditions, distance))
+
+
 def compare_judgements(
     new: Judgement, old: Judgement, conditions: Conditions, same_start: float = SAME_START
 ) -> Comparison:
@@ -116,9 +140,9 @@ def compare_judgements(
         same_start: how far first places may be apart in each object.
     """
     by_seed = all(row.seed is not None for row in (*new.rows, *old.rows))
-    partners = dict(_keyed(old.rows, by_seed))
+    partners = dict(_rows_by_key(old.rows, by_seed))
     pairs, counts = [], Counter[str]()
-    for key, row in _keyed(new.rows, by_seed):
+    for key, row in _rows_by_key(new.rows, by_seed):
         partner = partners.pop(key, None)
         if partner is None:
             counts["alone"] += 1
@@ -133,7 +157,7 @@ def compare_judgements(
     return Comparison(new.name, old.name, old.rate, tuple(pairs), *numbers)
 
 
-def _keyed(
+def _rows_by_key(
     rows: Sequence[JudgedEpisode], by_seed: bool
 ) -> Iterator[tuple[tuple[object, ...], JudgedEpisode]]:
     """Yield each row with its key; of rows with one key, the first ones of both sides belong together."""
