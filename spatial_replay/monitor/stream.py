@@ -350,6 +350,8 @@ class LiveStream:
         self._runs = [evaluator.begin(is_live=True) for evaluator in self._evaluators]
         self._own_leaves = _ranges(len(program.leaves) for program in programs)
         self._is_online = semantics == "ltlf"
+        first_leaves = [own.start for own in self._own_leaves]
+        self._online_runs = list(zip(cast(list[OnlineRun], self._runs), first_leaves, strict=True))
         self._start_ns = start_ns
         self._first_ns: int | None = None
         self._position = -1
@@ -375,10 +377,8 @@ class LiveStream:
             return [None] * len(self._evaluators)
         leaves = self._leaves.values(samples)
         self._newest = leaves
-        return [
-            cast(OnlineRun, run).add_sample(leaves, own.start, sample.time_ns)
-            for run, own in zip(self._runs, self._own_leaves, strict=True)
-        ]
+        time_ns = sample.time_ns
+        return [run.add_sample(leaves, first_leaf, time_ns) for run, first_leaf in self._online_runs]
 
     def leaves(self, place: int) -> Floats:
         """Return the leaves (C, A, 1) of a formula in the newest evaluated sample.

@@ -300,7 +300,7 @@ def _is_hidden(plan: PlanArrays, rows: SampleRows, row: int) -> bool:
 @inlined
 def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats) -> None:
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
-    if len(values) == 0:  # signals alone
+    if len(values) == 0:
         return
     operands, required = len(plan.enlargement), len(plan.listed_start) - 1 - len(values)
     of_operands, measured = np.empty(operands + 1), np.empty((len(plan.geometric), 1))
@@ -432,13 +432,14 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats
         C, in how many channels they are.
     """
     plan = plan_at(whole, real)
-    rows, count = _rows_of_sample(plan, sample), len(plan.geometric) + len(plan.yaws)
-    members = np.empty((len(plan.is_group), 1), np.int8)
-    _members(plan, rows.classes, members)
+    count, members = len(plan.geometric) + len(plan.yaws), np.empty((len(plan.is_group), 1), np.int8)
     results, closest = np.empty((2, count, 1)), np.empty((len(plan.closest_enlargement), 4, 1))
     values, spreads = results[0], results[1]
-    _closest(plan, rows, closest)
-    _measure(plan, rows, values, spreads)
+    if count + len(members) + len(closest) > 0:  # not signals alone
+        rows = _rows_of_sample(plan, sample)
+        _members(plan, rows.classes, members)
+        _closest(plan, rows, closest)
+        _measure(plan, rows, values, spreads)
     signals = sample[plan.extent[0] : plan.extent[0] + plan.extent[3]].reshape((-1, 1))
     channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
     for t in range(1):  # as in `_measure`

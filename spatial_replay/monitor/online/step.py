@@ -306,6 +306,7 @@ class OnlineRun:
         series_at = NUMBERS * (parts + reports)
         self._numbers = self._work[NUMBERS * parts : series_at].reshape(reports, NUMBERS, shape[1])
         self._series = self._work[series_at : series_at + SERIES * reports].reshape(reports, SERIES, shape[1])
+        self._series_of_one = self._series[:, :, 0]
         self._newest = 0, [0, 0]  # where the numbers of the newest sample stand
         self._open = [
             (number, [_OpenPart(rows, room)])
@@ -376,8 +377,8 @@ class OnlineRun:
             leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
         self._make_room(1)
         self._add(leaves, first_leaf, time_ns, 0, 1)
-        numbers = self._series[:, :, 0].copy()
-        numbers.flags.writeable = False
+        numbers = self._series_of_one.copy()
+        numbers.setflags(write=False)
         return numbers
 
     def _add(self, leaves: Floats, first_leaf: int, times_ns: Integers | int, t: int, count: int) -> None:
@@ -390,7 +391,10 @@ class OnlineRun:
         if not self._program.keeps_history:
             self._offset = self._position
         begin = self._position - self._offset
-        self._stamps[begin : begin + count] = times_ns
+        if isinstance(times_ns, int):
+            self._stamps[begin] = times_ns
+        else:
+            self._stamps[begin : begin + count] = times_ns
         if self._position == 0:
             self._start_ns = int(self._stamps[begin])
         arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
