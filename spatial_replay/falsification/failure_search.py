@@ -191,30 +191,35 @@ class Falsification(Printed):
     @cached_property
     def coverage(self) -> tuple[Coverage, ...]:
         """The tried values of each parameter."""
-        return tuple(map(self._covered, self.parameters))
+        return tuple(map(self._coverage_of, self.parameters))
 
     def text_of(self, case: Case) -> str:
         """Return what is varied in a case: "noise 0.004 m, slip@3.2s, start.red 0.47,-0.09,0.4"."""
-        shown: dict[str, str] = {}
-        for each in self.parameters:
-            value = case[each.name]
-            if value is None or (value == each.rest and not each.is_drawn):
+        texts_by_group: dict[str, str] = {}
+        for parameter in self.parameters:
+            value = case[parameter.name]
+            if value is None or (value == parameter.rest and not parameter.is_drawn):
                 continue
             # those of one group are written as one
-            known = shown.get(each.group)
-            if each.group == each.name:
-                shown[each.group] = each.text_of(value)
+            text_before = texts_by_group.get(parameter.group)
+            if parameter.group == parameter.name:
+                texts_by_group[parameter.group] = parameter.text_of(value)
             else:
-                shown[each.group] = f"{each.group} {value:.12g}" if known is None else f"{known},{value:.12g}"
-        return ", ".join(shown.values()) or "nothing varied"
+                texts_by_group[parameter.group] = (
+                    f"{parameter.group} {value:.12g}"
+                    if text_before is None
+                    else f"{text_before},{value:.12g}"
+                )
+        return ", ".join(texts_by_group.values()) or "nothing varied"
 
     def lines(self) -> Iterator[str]:
         """Yield the failures, the worst first, or the lowest run; and the coverage."""
-        yield f"run 1, with nothing varied: {_judged(self.first)}"
-        for each in self.parameters:
-            if each.unit == "s" and self.first.seconds < each.high < math.inf:
+        yield f"run 1, with nothing varied: {_verdict_text(self.first)}"
+        for parameter in self.parameters:
+            if parameter.unit == "s" and self.first.seconds < parameter.high < math.inf:
+                span = f"{parameter.low:g}s:{parameter.high:g}s"
                 yield (
-                    f"{each.name}@{each.low:g}s:{each.high:g}s goes on after the end of that run, at"
+                    f"{parameter.name}@{span} goes on after the end of that run, at"
                     f" {self.first.seconds:g} s: from there on nothing happens"
                 )
         if self.first.is_violated:
@@ -231,7 +236,8 @@ class Falsification(Printed):
         else:
             lowest = self.lowest
             yield f"{runs} of {self.name}: none violated{doubt}"
-            yield f"  the lowest: run {lowest.number}, {_judged(lowest)}, with {self.text_of(lowest.case)}"
+            case = self.text_of(lowest.case)
+            yield f"  the lowest: run {lowest.number}, {_verdict_text(lowest)}, with {case}"
             if len({run.robustness for run in self.runs}) == 1 < len(self.runs):
                 yield "  it is the same in every run: what is varied does not change it"
             elif not self.is_exhausted:
@@ -245,7 +251,7 @@ class Falsification(Printed):
             yield f"  {counted(self.impossible, 'case')} left out, in which objects would lie in each other"
         if self.simulations:
             yield f"{counted(self.simulations, 'more run')} made the failures smaller"
-        worst = min(self.failures, key=lambda each: each.smaller.robustness, default=None)
+        worst = min(self.failures, key=lambda failure: failure.smaller.robustness, default=None)
         if worst is not None and worst.command is not None:
             less = " with less" if worst.is_smaller else ""
             yield f"the worst again, run {worst.run.number}{less}: {worst.command}"
@@ -288,7 +294,7 @@ class Falsification(Printed):
             "covered": json_value(self.coverage),
         }
 
-    def _covered(self, parameter: Parameter) -> Coverage:
+    def _coverage_of(self, parameter: Parameter) -> Coverage:
         # the first run varies nothing, and what is left out has no place in a range
         values = [
             (value, run.robustness)
@@ -304,7 +310,7 @@ class Falsification(Printed):
             parameter.high,
             parameter.unit,
             tuple(map(len, tenths)),
-            tuple(min(each, default=None) for each in tenths),
+            tuple(min(robustnesses, default=None) for robustnesses in tenths),
         )
 
 
@@ -312,17 +318,20 @@ def _relative(path: Path) -> str:
     return f"{path.parent.name}/{path.name}"
 
 
-def _judged(run: SearchedRun) -> str:
+def _verdict_text(run: SearchedRun) -> str:
     return f"{run.verdict}, {run.spec} {with_unit(run.robustness, run.unit)}"
 
 
 def _table(covered: tuple[Coverage, ...]) -> Iterator[str]:
-    names = max(len(each.parameter) for each in covered)
-    spans = [f"{each.low:g} to {each.high:g}{f' {each.unit}' if each.unit else ''}" for each in covered]
+    names = max(len(coverage.parameter) for coverage in covered)
+    spans = [
+        f"{coverage.low:g} to {coverage.high:g}{f' {coverage.unit}' if coverage.unit else ''}"
+        for coverage in covered
+    ]
     width = max(map(len, spans))
-    for each, span in zip(covered, spans, strict=True):
-        counts = " ".join(f"{count:3}" for count in each.runs)
-        yield f"  {each.parameter:<{names}}  {span:<{width}}  {counts}"
+    for coverage, span in zip(covered, spans, strict=True):
+        counts = " ".join(f"{count:3}" for count in coverage.runs)
+        yield f"  {coverage.parameter:<{names}}  {span:<{width}}  {counts}"
 
 
 # --------------------------------------------------------------------------------------------------- descents
@@ -432,23 +441,23 @@ class Descents:
         expected = expected_costs(
             np.array(self._points),
             np.array(self._costs),
-            np.array([each[: self._size] for each in self._drawn]),
+            np.array([point[: self._size] for point in self._drawn]),
         )
         count = min(-(-size // _PARTS), size - len(self._generation))
         order = np.argsort(expected, kind="stable").tolist()
-        chosen = [self._drawn[place] for place in order[:count]]
+        promising = [self._drawn[place] for place in order[:count]]
         self._drawn = [self._drawn[place] for place in sorted(order[count:])]
-        return chosen
+        return promising
 
     def _remember(self, costs: Sequence[float]) -> None:
         """Keep the newest points, and the best of those before them."""
-        self._points += [each[: self._size] for each in self._asked]
+        self._points += [point[: self._size] for point in self._asked]
         self._costs += costs
         older = len(self._costs) - _KNOWN // 2
         best = sorted(sorted(range(max(older, 0)), key=lambda place: self._costs[place])[: _KNOWN // 2])
-        kept = [*best, *range(max(older, 0), len(self._costs))]
-        self._points = [self._points[place] for place in kept]
-        self._costs = [self._costs[place] for place in kept]
+        places = [*best, *range(max(older, 0), len(self._costs))]
+        self._points = [self._points[place] for place in places]
+        self._costs = [self._costs[place] for place in places]
 
     def _descent(self, start: NDArray[np.float64]) -> Any:
         options = {
@@ -477,20 +486,20 @@ def expected_costs(
     """
     # a case that is impossible, or a cost that is infinite, is as bad as the worst one that is neither
     finite = costs[costs < LARGEST_COST]
-    known = np.minimum(costs, finite.max()) if finite.size else np.zeros_like(costs)
-    known = known - known.mean()
+    centred = np.minimum(costs, finite.max()) if finite.size else np.zeros_like(costs)
+    centred = centred - centred.mean()
     among, between = _squares(points, points), _squares(others, points)
-    best, found = -np.inf, np.zeros(len(others))
+    best, expected = -np.inf, np.zeros(len(others))
     for length in _LENGTHS:
         scale = -0.5 / (length * length * points.shape[1])
         lower = np.linalg.cholesky(np.exp(scale * among) + _NOISE * np.eye(len(points)))
-        weights = np.linalg.solve(lower.T, np.linalg.solve(lower, known))
+        weights = np.linalg.solve(lower.T, np.linalg.solve(lower, centred))
         # the variance of the costs is the likeliest one
-        variance = max(float(known @ weights) / len(points), np.finfo(float).tiny)
+        variance = max(float(centred @ weights) / len(points), np.finfo(float).tiny)
         likelihood = -0.5 * len(points) * np.log(variance) - np.log(np.diag(lower)).sum()
         if likelihood > best:
-            best, found = likelihood, np.exp(scale * between) @ weights
-    return found
+            best, expected = likelihood, np.exp(scale * between) @ weights
+    return expected
 
 
 def _squares(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -594,8 +603,8 @@ def simulate_rounds(
         LogError: the file is damaged.
         OutputError: a file cannot be written, or a worker died.
     """
-    with closing(RunFile(file)) as known:
-        queue = _Queue(rounds, known, advance, logs)
+    with closing(RunFile(file)) as earlier_runs:
+        queue = _Queue(rounds, earlier_runs, advance, logs)
         for task, run in workers.results(partial(_simulate, simulation), queue):
             if isinstance(run, WorkerLost):
                 raise lost(run)
@@ -751,18 +760,20 @@ def falsify(
     if isinstance(specifications, Specification | str | PathLike):
         specifications = [specifications]
     files = [
-        each if isinstance(each, Specification) else load_specifications([local_copy(each)])[0]
-        for each in specifications
+        specification
+        if isinstance(specification, Specification)
+        else load_specifications([local_copy(specification)])[0]
+        for specification in specifications
     ]
     if isinstance(simulation, str):
         if isinstance(vary, Mapping):
             raise UsageError('what is varied in a scenario is a list of texts, such as ["noise=0:0.01"]')
-        chosen, parameters = scenario_simulation(simulation, files, vary, is_planned=planned)
+        simulated, parameters = scenario_simulation(simulation, files, vary, is_planned=planned)
     elif planned:
         raise UsageError("planned is for scenarios; let the planner act within the simulation")
     else:
-        chosen, parameters = own_simulation(simulation, files, vary, jobs)
-    return search_failures(chosen, parameters, output, workers_of(jobs), budget=budget, seed=seed)
+        simulated, parameters = own_simulation(simulation, files, vary, jobs)
+    return search_failures(simulated, parameters, output, workers_of(jobs), budget=budget, seed=seed)
 
 
 def search_failures(
@@ -809,7 +820,7 @@ def search_failures(
 
 
 def _distinct(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    names = [each.name for each in parameters]
+    names = [parameter.name for parameter in parameters]
     if not names:
         raise UsageError("nothing is varied; name at least one parameter with its range")
     for name in names:
@@ -825,7 +836,9 @@ def _identity(simulation: Simulation, space: Space, seed: int) -> dict[str, Any]
         "version": __version__,
         "simulation": simulation.name,
         "specifications": list(map(meaning_hash, simulation.files)),
-        "varied": {each.name: [each.low, json_number(each.high)] for each in space.parameters},
+        "varied": {
+            parameter.name: [parameter.low, json_number(parameter.high)] for parameter in space.parameters
+        },
         "seed": seed,
         **simulation.identity,
     }
@@ -845,26 +858,26 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
         return
     try:
         (content,) = files.read([_SEARCH])
-        other = json.loads(content)
-        key = next((key for key in identity if other.get(key) != identity[key]), None)
-        varied = [_varied_text(each["varied"]) for each in (other, identity) if key == "varied"]
+        stored_identity = json.loads(content)
+        key = next((key for key in identity if stored_identity.get(key) != identity[key]), None)
+        varied = [_varied_text(stored["varied"]) for stored in (stored_identity, identity) if key == "varied"]
     except (AttributeError, LookupError, TypeError, ValueError):
         raise LogError(f"{files.path / _SEARCH} is damaged; delete {files}, or give another folder") from None
     if key is not None:
         what = {
-            "seed": f"its seed is {other.get('seed')}",
-            "simulation": f"it is of {other.get('simulation')}",
+            "seed": f"its seed is {stored_identity.get('seed')}",
+            "simulation": f"it is of {stored_identity.get('simulation')}",
             "varied": f"it varies {', and this one '.join(varied)}",
             "specifications": "it has other specifications",
-            "version": f"it is of version {other.get('version')}",
-        }.get(key, f"its {key} is {other.get(key)}")
+            "version": f"it is of version {stored_identity.get('version')}",
+        }.get(key, f"its {key} is {stored_identity.get(key)}")
         raise UsageError(f"{files} holds another search: {what}; give another folder, or delete it")
 
 
 def _varied_text(varied: Mapping[str, Sequence[Any]]) -> str:
     """Return what a search varies: "speed from 0.6 to 1.4, slip from 0.0 to the end of the run"."""
     ranges = (f"{name} from {low} to {high}" for name, (low, high) in varied.items())
-    return ", ".join(each.replace("to inf", "to the end of the run") for each in ranges)
+    return ", ".join(range_text.replace("to inf", "to the end of the run") for range_text in ranges)
 
 
 class _Search:
@@ -883,18 +896,20 @@ class _Search:
     def run(self, budget: int, seed: int) -> Falsification:
         """Search, make what fails smaller, and cut clips of that."""
         with self._progress("runs", budget) as advance:
-            runs = self._simulated(self._descend(budget, seed), "runs", advance, self._folder / "runs")
+            runs = self._simulate_rounds(self._descend(budget, seed), "runs", advance, self._folder / "runs")
         failing = sorted(
             (run for run in runs if run.is_violated), key=lambda run: (run.robustness, run.number)
         )
-        known = {key_of(run.case): run for run in runs}
+        runs_by_case = {key_of(run.case): run for run in runs}
         with self._progress("smaller runs", None) as advance:
-            smaller, simulations = self._simulated(self._shrink(failing, known), "smaller", advance)
+            smaller, simulations = self._simulate_rounds(
+                self._shrink(failing, runs_by_case), "smaller", advance
+            )
         failures = tuple(self._failure(run, least) for run, least in zip(failing, smaller, strict=True))
         with self._progress("clips", len(failures)) as advance:
-            for _, done in self._workers.results(partial(_finish, self._simulation), failures):
-                if isinstance(done, WorkerLost):
-                    raise lost(done)
+            for _, finished in self._workers.results(partial(_finish, self._simulation), failures):
+                if isinstance(finished, WorkerLost):
+                    raise lost(finished)
                 advance(1)
         result = Falsification(
             self._simulation.name,
@@ -908,7 +923,7 @@ class _Search:
         self._files.write("failures.json", json.dumps(result.document, indent=1).encode() + b"\n")
         return result
 
-    def _simulated(
+    def _simulate_rounds(
         self, rounds: Rounds[_Result], name: str, advance: Callable[[int], None], logs: Path | None = None
     ) -> _Result:
         file = self._folder / f"{name}.jsonl"
@@ -920,7 +935,12 @@ class _Search:
         runs = [replace(first, number=1)]
         self._space = space = self._space.ending_at(first.seconds)
         late = next(
-            (each for each in space.parameters if each.unit == "s" and each.low >= first.seconds), None
+            (
+                parameter
+                for parameter in space.parameters
+                if parameter.unit == "s" and parameter.low >= first.seconds
+            ),
+            None,
         )
         if late is not None and not first.is_violated:
             raise UsageError(
@@ -933,12 +953,12 @@ class _Search:
         best: tuple[float, list[float]] | None = None
         while len(runs) < budget and barren < _BARREN and not first.is_violated:
             points: Sequence[Any] = descents.ask() if descents is not None else [()] * _DRAWN
-            drawn = [
+            draws = [
                 # the seed that came nearest so far, or another one
                 best[1] if best is not None and random.random() < 0.5 else space.draw(random)
                 for _ in points
             ]
-            cases = [space.case_at(point, each) for point, each in zip(points, drawn, strict=True)]
+            cases = [space.case_at(point, draw) for point, draw in zip(points, draws, strict=True)]
             new: dict[str, Case] = {}
             for case in cases:
                 key = key_of(case)
@@ -961,7 +981,7 @@ class _Search:
             if is_found:
                 best = None
             elif best is None or reported[least] < best[0]:
-                best = reported[least], drawn[least]
+                best = reported[least], draws[least]
             if descents is not None:
                 descents.take(reported, is_found=is_found)
         self._is_exhausted = barren == _BARREN

@@ -117,54 +117,58 @@ class Space:
     @property
     def ordered(self) -> tuple[Parameter, ...]:
         """The parameters that an optimiser can descend along."""
-        return tuple(each for each in self.parameters if not each.is_drawn)
+        return tuple(parameter for parameter in self.parameters if not parameter.is_drawn)
 
     @property
     def groups(self) -> tuple[str, ...]:
         """The groups: mishaps first, then numbers, then starts; not seeds, of which none is smaller."""
-        places = sorted(self.ordered, key=lambda each: (each.unit != "s", each.rest is None))
-        return tuple(dict.fromkeys(each.group for each in places))
+        places = sorted(self.ordered, key=lambda parameter: (parameter.unit != "s", parameter.rest is None))
+        return tuple(dict.fromkeys(parameter.group for parameter in places))
 
     def at_rest(self, case: Case | None = None, group: str | None = None) -> dict[str, float | None]:
         """Return a case with one group at rest, or all of it."""
         return {
-            each.name: each.rest if case is None or each.group == group else case[each.name]
-            for each in self.parameters
+            parameter.name: parameter.rest
+            if case is None or parameter.group == group
+            else case[parameter.name]
+            for parameter in self.parameters
         }
 
     def nearer(self, case: Case, group: str) -> dict[str, float | None] | None:
         """Return a case with a group half way to rest; None for one that is left out there, or is there."""
         values = dict(case)
-        for each in self.parameters:
-            value = case[each.name]
-            if each.group == group:
-                if each.rest is None or value is None:
+        for parameter in self.parameters:
+            value = case[parameter.name]
+            if parameter.group == group:
+                if parameter.rest is None or value is None:
                     return None
-                values[each.name] = round((value + each.rest) / 2, each.digits)
+                values[parameter.name] = round((value + parameter.rest) / 2, parameter.digits)
         return None if values == dict(case) else values
 
     def case_at(self, shares: Iterable[float], drawn: Sequence[float]) -> dict[str, float | None]:
         """Return the case at shares of the ordered parameters' ranges, with values for the others."""
         coming, others = iter(shares), iter(drawn)
         return {
-            each.name: next(others) if each.is_drawn else each.value_at(float(next(coming)))
-            for each in self.parameters
+            parameter.name: next(others) if parameter.is_drawn else parameter.value_at(float(next(coming)))
+            for parameter in self.parameters
         }
 
     def draw(self, random: np.random.Generator) -> list[float]:
         """Return values of the parameters that are drawn."""
         return [
-            float(random.integers(int(each.low), int(each.high), endpoint=True))
-            for each in self.parameters
-            if each.is_drawn
+            float(random.integers(int(parameter.low), int(parameter.high), endpoint=True))
+            for parameter in self.parameters
+            if parameter.is_drawn
         ]
 
     def ending_at(self, seconds: float) -> Space:
         """Return this space once it is known how long a run takes."""
         return Space(
             tuple(
-                replace(each, high=round(seconds, each.digits)) if math.isinf(each.high) else each
-                for each in self.parameters
+                replace(parameter, high=round(seconds, parameter.digits))
+                if math.isinf(parameter.high)
+                else parameter
+                for parameter in self.parameters
             )
         )
 
@@ -231,11 +235,11 @@ def scenario_simulation(
         UsageError: there is no such scenario, no simulator, or what cannot be varied.
         SpecificationError: names that the world does not have.
     """
-    chosen = tuple(files) or (default_specification(scenario),)
+    specifications = tuple(files) or (default_specification(scenario),)
     with closing(make_world(scenario)) as world:
-        refuse_unknown_names(chosen, world.sample())
-    refuse_templates(chosen)
-    runs = ScenarioRuns(scenario, chosen, tuple(options), is_planned)
+        refuse_unknown_names(specifications, world.sample())
+    refuse_templates(specifications)
+    runs = ScenarioRuns(scenario, specifications, tuple(options), is_planned)
     texts = [vary] if isinstance(vary, str) else vary or ["start"]
     return runs, tuple(parameter for text in texts for parameter in runs.parameters(text))
 
@@ -272,7 +276,7 @@ def own_simulation(
             raise UsageError(
                 f"{name} cannot be sent to other processes ({error}); define it in a module, or take jobs=1"
             ) from None
-    return runs, tuple(Parameter.of_range(each, *span) for each, span in vary.items())
+    return runs, tuple(Parameter.of_range(name_of_range, *span) for name_of_range, span in vary.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,11 +311,11 @@ class OwnSimulation:
         """
         values = {name: value for name, value in case.items() if value is not None}
         samples = list(self.simulate(values))
-        if not samples or not all(isinstance(each, Sample) for each in samples):
+        if not samples or not all(isinstance(sample, Sample) for sample in samples):
             what = f"{type(samples[0]).__name__} objects" if samples else "nothing"
             raise UsageError(f"{self.name} returns {what}; a simulation returns one Sample or more")
         about = {"source": self.name, "options": json.dumps(values)}
-        return _simulated(samples, self.files, about)
+        return _simulated_case(samples, self.files, about)
 
     def command(self, case: Case) -> None:
         """Return the command that repeats the run of a case; None if there is none."""
@@ -340,31 +344,34 @@ class ScenarioRuns:
         """See `OwnSimulation`."""
         starts = {start.name: start for start in _conditions(case)["starts"]}
         scenario = scenario_of(self.name)
-        outlines = {each: _outline(each, starts, scenario.scatter_m) for each in scenario.placements}
+        outlines = {
+            placement: _outline(placement, starts, scenario.scatter_m) for placement in scenario.placements
+        }
         return all(
-            least_distance(outlines[one], [outlines[other]]) > 0
-            for one, other in combinations(scenario.placements, 2)
-            if (one.body.name in starts or other.body.name in starts) and _is_beside(one, other)
+            least_distance(outlines[placement_a], [outlines[placement_b]]) > 0
+            for placement_a, placement_b in combinations(scenario.placements, 2)
+            if (placement_a.body.name in starts or placement_b.body.name in starts)
+            and _is_beside(placement_a, placement_b)
         )
 
     def run(self, case: Case) -> SimulatedCase:
         """See `OwnSimulation`."""
-        given = _conditions(case)
+        conditions = _conditions(case)
         if self.is_planned:
-            return self._plan(given)
-        samples = simulate_script(self.name, **given)
-        about = about_run(self.name, **given)
-        return _simulated(samples, self.files, about, unit="m")
+            return self._plan(conditions)
+        samples = simulate_script(self.name, **conditions)
+        about = about_run(self.name, **conditions)
+        return _simulated_case(samples, self.files, about, unit="m")
 
     def command(self, case: Case) -> str:
         """See `OwnSimulation`."""
-        given = _conditions(case)
-        options = ["--seed", str(given["seed"])]
-        if given["noise_m"]:
-            options += ["--noise", f"{given['noise_m']:.12g}"]
-        for each in given["injections"]:
-            options += ["--inject", str(each)]
-        for start in given["starts"]:
+        conditions = _conditions(case)
+        options = ["--seed", str(conditions["seed"])]
+        if conditions["noise_m"]:
+            options += ["--noise", f"{conditions['noise_m']:.12g}"]
+        for injection in conditions["injections"]:
+            options += ["--inject", str(injection)]
+        for start in conditions["starts"]:
             options += ["--start", str(start)]
         # what the planner knows nothing of
         others = ["--also" if word == "--spec" else word for word in self.spec_options]
@@ -373,8 +380,8 @@ class ScenarioRuns:
         return shlex.join(words)
 
     def _plan(self, given: Conditions) -> SimulatedCase:
-        own = default_specification(self.name)
-        task, also = own, [each for each in self.files if each != own]
+        specification = default_specification(self.name)
+        task, also = specification, [file for file in self.files if file != specification]
         if self.spec_options and "--spec" not in self.spec_options:
             # values of the constants of the scenario's own specification
             (task,), also = self.files, []
@@ -439,26 +446,30 @@ class ScenarioRuns:
     def _starts(self, text: str) -> list[Parameter]:
         name, equals, metres = (part.strip() for part in text.partition("="))
         scenario = scenario_of(self.name)
-        bodies = [each.body.name for each in scenario.placements]
-        wanted = name.removeprefix("start").removeprefix(".")
-        if wanted and wanted not in bodies:
-            hint = nearest_hint(wanted, bodies) or f"there are {', '.join(bodies)}"
-            raise UsageError(f"--vary {text}: {self.name} has no {wanted!r}; {hint}")
+        bodies = [placement.body.name for placement in scenario.placements]
+        body_name = name.removeprefix("start").removeprefix(".")
+        if body_name and body_name not in bodies:
+            hint = nearest_hint(body_name, bodies) or f"there are {', '.join(bodies)}"
+            raise UsageError(f"--vary {text}: {self.name} has no {body_name!r}; {hint}")
         off = number_from(metres, name) if equals else scenario.scatter_m
         if not (math.isfinite(off) and off > 0):
             raise UsageError(
                 f"--vary {text}: write how far an object may be from its place, such as {name}=0.02"
             )
-        found = []
-        for each in scenario.placements:
-            if wanted in ("", each.body.name):
-                group = f"start.{each.body.name}"
-                centres = {"x": (each.x, off), "y": (each.y, off), "turn": (each.yaw, scenario.scatter_rad)}
+        parameters = []
+        for placement in scenario.placements:
+            if body_name in ("", placement.body.name):
+                group = f"start.{placement.body.name}"
+                centres = {
+                    "x": (placement.x, off),
+                    "y": (placement.y, off),
+                    "turn": (placement.yaw, scenario.scatter_rad),
+                }
                 for axis, (centre, wide) in centres.items():
                     digits, unit = (3, "rad") if axis == "turn" else (4, "m")
                     ends = round(centre - wide, digits), round(centre + wide, digits)
-                    found.append(Parameter(f"{group}.{axis}", *ends, digits, None, group, unit))
-        return found
+                    parameters.append(Parameter(f"{group}.{axis}", *ends, digits, None, group, unit))
+        return parameters
 
 
 Simulation: TypeAlias = OwnSimulation | ScenarioRuns
@@ -496,7 +507,7 @@ def _is_beside(one: Placement, other: Placement) -> bool:
     )
 
 
-def _simulated(
+def _simulated_case(
     samples: Sequence[Sample], files: Sequence[Specification], about: Mapping[str, str], unit: str = ""
 ) -> SimulatedCase:
     def write(output: Path) -> None:

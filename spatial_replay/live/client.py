@@ -92,8 +92,8 @@ def decoded(raw: str | bytes) -> Frame | None:
 
 def subscribe(numbers: Iterable[int]) -> str:
     """Return the request to subscribe to channels, each under its own number."""
-    wanted = [{"id": number, "channelId": number} for number in numbers]
-    return json.dumps({"op": "subscribe", "subscriptions": wanted})
+    subscriptions = [{"id": number, "channelId": number} for number in numbers]
+    return json.dumps({"op": "subscribe", "subscriptions": subscriptions})
 
 
 def _decoded_text(raw: str) -> Frame | None:
@@ -106,7 +106,7 @@ def _decoded_text(raw: str) -> Frame | None:
             case {"op": "serverInfo"}:
                 return Connected(str(frame.get("name", ""))[:_LONGEST_TEXT])
             case {"op": "advertise", "channels": channels}:
-                return Advertised({_number(each["id"]): _channel(each) for each in channels})
+                return Advertised({_number(offer["id"]): _channel(offer) for offer in channels})
             case {"op": "unadvertise", "channelIds": numbers}:
                 return Unadvertised(tuple(map(_number, numbers)))
             case {"op": "status", "message": text}:
@@ -129,9 +129,9 @@ def _number(value: object) -> int:
 def _channel(described: Any) -> Channel:
     topic, encoding = described["topic"], described["encoding"]
     name, text = described.get("schemaName") or "", described.get("schema") or ""
-    for each in (topic, encoding, name, text):
-        if not isinstance(each, str):
-            raise ValueError(f"{each!r:.40} in a channel is not a text")
+    for part in (topic, encoding, name, text):
+        if not isinstance(part, str):
+            raise ValueError(f"{part!r:.40} in a channel is not a text")
     schema_encoding = described.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, "")
     if not name and not text:
         return Channel(topic, encoding, None)
@@ -238,13 +238,13 @@ class Inbox:
 
     def take(self) -> list[Item]:
         """Return all that waits."""
-        taken = [*self._others, *self._items]
+        items = [*self._others, *self._items]
         self._items.clear()
         self._others.clear()
         self._offered = None
         self._messages = self._bytes = 0
         self.filled.clear()
-        return taken
+        return items
 
     def _drop(self) -> None:
         while not isinstance(oldest := self._items.popleft(), Received):
@@ -280,7 +280,7 @@ class Client:
             try:
                 async with connect(
                     self.address,
-                    subprotocols=[Subprotocol(each) for each in SUBPROTOCOLS],
+                    subprotocols=[Subprotocol(protocol) for protocol in SUBPROTOCOLS],
                     compression=None,
                     max_size=LARGEST_FRAME,
                     max_queue=_FRAMES,
@@ -344,7 +344,7 @@ class Client:
                             return (
                                 f"its channels have more than {_MOST_DEFINITION_BYTES} bytes of definitions"
                             )
-                        new = {n: each for n, each in channels.items() if self.wants(each.topic)}
+                        new = {n: channel for n, channel in channels.items() if self.wants(channel.topic)}
                         if new:
                             subscribed |= new
                             await connection.send(subscribe(new))
@@ -364,8 +364,8 @@ class Client:
 
 
 def _definition_bytes(channel: Channel) -> int:
-    own = len(channel.topic) + len(channel.encoding)
-    return own if channel.schema is None else own + len(channel.schema.name) + len(channel.schema.data)
+    size = len(channel.topic) + len(channel.encoding)
+    return size if channel.schema is None else size + len(channel.schema.name) + len(channel.schema.data)
 
 
 def _closing_reason(closed: ConnectionClosed) -> str:

@@ -74,17 +74,17 @@ class ObjectsAssembler:
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
         """Add messages as they came; return their samples. Late and repeated samples are left out."""
-        kept: list[Message] = []
+        new_messages: list[Message] = []
         for message in messages:
             if message.log_time_ns < self._newest_ns - DISORDER_NS:
                 self.is_finished = True
             if self.is_finished:
                 break
             if message.log_time_ns > self._newest_ns:
-                kept.append(message)
+                new_messages.append(message)
                 self._newest_ns = message.log_time_ns
-        times_ns = np.array([message.log_time_ns for message in kept], np.int64)
-        trace, faults = decode_objects([message.payload for message in kept], times_ns)
+        times_ns = np.array([message.log_time_ns for message in new_messages], np.int64)
+        trace, faults = decode_objects([message.payload for message in new_messages], times_ns)
         for fault in faults:
             self._faults.add(f"{self._name}: {fault}")
         if len(trace):
@@ -192,7 +192,7 @@ class LiveUpdate:
     @property
     def verdict(self) -> Verdict:
         """The worst of the specs'."""
-        return worst_verdict(each.verdict for each in self.updates)
+        return worst_verdict(update.verdict for update in self.updates)
 
     @property
     def specs(self) -> tuple[SpecUpdate, ...]:
@@ -202,7 +202,7 @@ class LiveUpdate:
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
         """Permanent violations; see `Update.violations`."""
-        return tuple(each for update in self.updates for each in update.violations)
+        return tuple(violation for update in self.updates for violation in update.violations)
 
     def node(self, name: str) -> NodeUpdate:
         """Return the root node of a named spec, wherever it occurs.
@@ -213,8 +213,8 @@ class LiveUpdate:
         for update in self.updates:
             if name in update.places:
                 return update.node(name)
-        known = sorted(each for update in self.updates for each in update.places)
-        raise UsageError(no_such_node(name, known))
+        names = sorted(node_name for update in self.updates for node_name in update.places)
+        raise UsageError(no_such_node(name, names))
 
 
 MAX_DELAY_S: Final = 0.2
@@ -285,7 +285,7 @@ class LiveSession:
         )
         self._recorders = recorders
         # viewers may miss samples, a log may not
-        self._logs = [each for each in recorders if isinstance(each, Recorder)]
+        self._logs = [recorder for recorder in recorders if isinstance(recorder, Recorder)]
         self._topics = tuple(topics)
         self._max_delay_s, self._topic_timeout_s = max_delay_s, topic_timeout_s
         units = {} if self._mapping is None else self._mapping.axes.units
@@ -431,7 +431,7 @@ class LiveSession:
                     yield update
             if self._assembler is not None:
                 trace = self._assembler.finish()
-                async for update in self._evaluated(trace, time.monotonic(), self._ends.finish):
+                async for update in self._evaluate(trace, time.monotonic(), self._ends.finish):
                     yield update
                 self._conclude(self._assembler)
         finally:
@@ -511,7 +511,7 @@ class LiveSession:
                 messages.append(Message(topic, item.time_ns, item.time_ns, 0, item.payload))
                 continue
             # what came before is evaluated first: afterwards it may be unknown
-            async for update in self._evaluated(self._add(messages), arrived_s):
+            async for update in self._evaluate(self._add(messages), arrived_s):
                 yield update
             messages, arrived_s = [], math.inf
             match item:
@@ -535,28 +535,28 @@ class LiveSession:
                         self._early = Inbox()
                     else:
                         trace = self._assembler.flush()
-                        async for update in self._evaluated(trace, at_s, self._ends.release):
+                        async for update in self._evaluate(trace, at_s, self._ends.release):
                             yield update
                     self._notes.append(
                         f"the connection to {self._address} is lost: {reason}; everything is unknown until"
                         " it is back"
                     )
                     lost = self._lose(list(self._planned), "connection lost")
-                    async for update in self._evaluated(lost, at_s, self._ends.release):
+                    async for update in self._evaluate(lost, at_s, self._ends.release):
                         yield update
-        async for update in self._evaluated(self._add(messages), arrived_s):
+        async for update in self._evaluate(self._add(messages), arrived_s):
             yield update
         now_s = time.monotonic()
         if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
             self._begin(inbox, now_s)
         if silent := self._silent_topics(now_s):
             self._silent |= {topic: self._last_s[topic] for topic in silent}
-            listed = ", ".join(silent)
+            topic_names = ", ".join(silent)
             self._notes.append(
-                f"no message on {listed} for {self._topic_timeout_s:g} s: what it reports is unknown"
+                f"no message on {topic_names} for {self._topic_timeout_s:g} s: what it reports is unknown"
             )
-            lost = self._lose(silent, f"silence on {listed}")
-            async for update in self._evaluated(lost, now_s, self._ends.release):
+            lost = self._lose(silent, f"silence on {topic_names}")
+            async for update in self._evaluate(lost, now_s, self._ends.release):
                 yield update
 
     def _note_return(self, topic: str, arrived_s: float) -> None:
@@ -609,7 +609,7 @@ class LiveSession:
         if self._topic_timeout_s is None or self._assembler is None or not self._is_connected:
             return []
         watched = [topic for topic in self._assembler.topics if topic not in self._silent]
-        return [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._topic_timeout_s]
+        return [topic for topic in watched if now_s - self._last_s.get(topic, now_s) >= self._topic_timeout_s]
 
     # -------------------------------------------------------------------------------- planning
 
@@ -630,11 +630,13 @@ class LiveSession:
             self._missing = tuple(topic for topic in self._planned if topic not in offered)
             return
         if self._mapping is None:
-            wanted = [OBJECTS]
+            needed_topics = [OBJECTS]
         else:
-            wanted = [entry.topic for entry in self._mapping.topics if not entry.optional]
-            wanted += [each for each in [self._mapping.sampling.topic] if each is not None]
-        self._missing = tuple(topic for topic in dict.fromkeys(wanted) if topic not in offered)
+            needed_topics = [entry.topic for entry in self._mapping.topics if not entry.optional]
+            needed_topics += [
+                sampled_topic for sampled_topic in [self._mapping.sampling.topic] if sampled_topic is not None
+            ]
+        self._missing = tuple(topic for topic in dict.fromkeys(needed_topics) if topic not in offered)
         # transforms and optional topics are often offered a little later
         self._settled_s = math.inf if self._missing else time.monotonic() + _SETTLE_S
 
@@ -699,7 +701,7 @@ class LiveSession:
 
     # ------------------------------------------------------------------------------ evaluating
 
-    async def _evaluated(
+    async def _evaluate(
         self, trace: Trace | None, arrived_s: float, remaining: Callable[[], list[Trace]] | None = None
     ) -> AsyncIterator[LiveUpdate]:
         """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait.
@@ -742,10 +744,11 @@ class LiveSession:
         if ends.begin_ns is not None:
             self._notes += counted_from(ends.remarks[len(remarks) :], ends.begin_ns)
             if ends.late and not had_begun:
-                listed = ", ".join(ends.late)
+                topic_names = ", ".join(ends.late)
                 self._notes.append(
-                    f"the run begins although {listed} cannot be judged yet: until then, what it reports is"
-                    " unknown, and groups lack its objects; --start-within (start_within_s) waits longer"
+                    f"the run begins although {topic_names} cannot be judged yet: until then, what it"
+                    " reports is unknown, and groups lack its objects; --start-within (start_within_s)"
+                    " waits longer"
                 )
         return counting[0] if len(counting) == 1 else Trace.concatenate(counting)
 
@@ -763,10 +766,12 @@ class LiveSession:
         updates = tuple(monitor.update(sample) for monitor in self._monitors)
         for monitor in self._monitors:
             monitor.note_unknown()
-        for each in itertools.chain.from_iterable(update.remarks for update in updates):
-            if each not in self._remarked:
-                self._remarked.add(each)
-                self._notes.append(f"{each.filename}:{each.line}:{each.column}: {each.message}; {each.hint}")
+        for remark in itertools.chain.from_iterable(update.remarks for update in updates):
+            if remark not in self._remarked:
+                self._remarked.add(remark)
+                self._notes.append(
+                    f"{remark.filename}:{remark.line}:{remark.column}: {remark.message}; {remark.hint}"
+                )
         self._samples += 1
         if self._samples >= self._next_doubts:
             self._note_doubts()
@@ -820,11 +825,11 @@ def open_recorders(
                     about=about,
                     waiting=_WAITING,
                     block=False,
-                    trigger=own,
+                    trigger=trigger_of_path,
                     overwrite=overwrite,
                 )
             )
-            for path, own in ((output, None), (clips, trigger))
+            for path, trigger_of_path in ((output, None), (clips, trigger))
             if path is not None
         ]
         yield recorders
@@ -879,8 +884,8 @@ async def monitor(
     files = listed_specifications(specifications)
     if mapping is not None and not isinstance(mapping, LogMapping):
         mapping = load_mapping(mapping)
-    written = None if output is None else Path(output), trigger, None if clips is None else Path(clips)
-    with open_recorders(files, mapping, *written, overwrite=overwrite) as recorders:
+    outputs = None if output is None else Path(output), trigger, None if clips is None else Path(clips)
+    with open_recorders(files, mapping, *outputs, overwrite=overwrite) as recorders:
         session = LiveSession(
             address,
             files,
@@ -936,8 +941,8 @@ class _ViewerLog(RecorderLog):
         self._publish()
 
     def _publish(self) -> None:
-        for made in self._sink.messages:
-            self._server.publish(made)
+        for message in self._sink.messages:
+            self._server.publish(message)
         self._sink.messages.clear()
 
 

@@ -410,16 +410,16 @@ class Session:
         """
         with self._requested:
             before = self.edited
-            written = before.loaded.constants
-            kept = {
+            constants_before = before.loaded.constants
+            values_from_viewers = {
                 name: value
                 for name, value in before.given.items()
                 if name in loaded.constants
                 # what a viewer set while a former value of it was being written is newer than the file
-                and (loaded.constants[name] == written[name] or loaded.was_written(name))
+                and (loaded.constants[name] == constants_before[name] or loaded.was_written(name))
             }
             try:
-                edited = loaded.edit(kept)
+                edited = loaded.edit(values_from_viewers)
             except SpatialReplayError:
                 edited = loaded.edit({})
             self._pending.edited = self.edited = edited
@@ -572,24 +572,24 @@ class PlaybackThinning:
         """Return what to send of the messages that came in a turn of so many seconds."""
         self._passed_s += elapsed_s
         most = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
-        kept = np.ones(len(messages), np.bool_)
+        is_sent = np.ones(len(messages), np.bool_)
         payloads: dict[int, bytes] = {}
-        for channel, own in messages.by_channel():
+        for channel, rows in messages.by_channel():
             if channel.topic in _NEVER_THINNED:
                 continue
-            times_ns, which = np.unique(messages.log_time_ns[own], return_inverse=True)
+            times_ns, which = np.unique(messages.log_time_ns[rows], return_inverse=True)
             # one time more than that comes by chance
             count = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most
             if len(times_ns) <= count + (not _is_drawn(channel)):
                 continue
-            chosen = np.zeros(len(times_ns), np.bool_)
-            chosen[np.linspace(len(times_ns) - 1, 0, count, endpoint=False).astype(np.int64)] = True
-            kept[own] = chosen[which]
+            is_chosen = np.zeros(len(times_ns), np.bool_)
+            is_chosen[np.linspace(len(times_ns) - 1, 0, count, endpoint=False).astype(np.int64)] = True
+            is_sent[rows] = is_chosen[which]
             if channel.topic == SCENE:
-                payloads |= _with_deletions(messages.payloads, own, kept)
-        if kept.all():
+                payloads |= _with_deletions(messages.payloads, rows, is_sent)
+        if is_sent.all():
             return messages
-        places = np.flatnonzero(kept)
+        places = np.flatnonzero(is_sent)
         sent = select(messages, places)
         if not payloads:
             return sent

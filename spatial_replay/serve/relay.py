@@ -71,8 +71,8 @@ class Gate:
         if not all(self._is_allowed(value) for name, value in fields if name == "origin"):
             return "403 Origin Not Allowed"
         if self.token is not None:
-            given = parse_qs(urlsplit(words[1]).query).get("token", [""])[0]
-            if not hmac.compare_digest(given.encode(), self.token.encode()):
+            token = parse_qs(urlsplit(words[1]).query).get("token", [""])[0]
+            if not hmac.compare_digest(token.encode(), self.token.encode()):
                 return "401 Token Missing Or Wrong"
         return None
 
@@ -177,7 +177,9 @@ class Relay:
             await writer.wait_closed()
             return
         request = b"GET / HTTP/1.1\r\n" + request.partition(b"\r\n")[2]
-        offered = {each.strip() for found in _OFFER.findall(request) for each in found.decode().split(",")}
+        offered = {
+            protocol.strip() for header in _OFFER.findall(request) for protocol in header.decode().split(",")
+        }
         is_old = OLD_PROTOCOL in offered
         if is_old and PROTOCOL not in offered:
             request = _OFFER.sub(f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n".encode(), request)
@@ -191,7 +193,7 @@ class Relay:
             viewer = _Viewer(understands_state=not is_old)
             await _until_one_ends(_from_viewer(reader, outer, viewer), _to_viewer(inner, writer, viewer))
             # what the server said last, such as why it closes
-            await _drained(writer)
+            await _drain(writer)
         finally:
             outer.transport.abort()
 
@@ -204,10 +206,10 @@ class _Viewer:
 
 
 async def _until_one_ends(*both: Coroutine[Any, Any, None]) -> None:
-    tasks = [asyncio.create_task(each) for each in both]
+    tasks = [asyncio.create_task(direction) for direction in both]
     try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
+        finished, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in finished:
             with suppress(OSError, EOFError, TimeoutError):
                 task.result()
     finally:
@@ -223,9 +225,9 @@ async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWrite
         viewer.understands_state |= frame.kind == (_BINARY, _CONTROL_REQUEST)
         if frame.is_whole_text and frame.rest < _MOST_TEXT:
             mask, first = frame.begin[-5:-1], frame.begin[-1:]
-            text = _unmasked(first + await reader.readexactly(frame.rest), mask)
+            text = _unmask(first + await reader.readexactly(frame.rest), mask)
             writer.write(_text_frame(with_exact_numbers(text)))
-            await _drained(writer)
+            await _drain(writer)
         else:
             await _pass_on(frame, reader, writer)
 
@@ -249,7 +251,7 @@ def _exact_integer(number: str) -> int | str:
     return int(number) if len(number) <= _EXACT_DIGITS else float(number).hex()
 
 
-def _unmasked(content: bytes, mask: bytes) -> bytes:
+def _unmask(content: bytes, mask: bytes) -> bytes:
     return bytes(byte ^ mask[place % 4] for place, byte in enumerate(content))
 
 
@@ -314,15 +316,15 @@ async def _pass_on(frame: _Frame, reader: asyncio.StreamReader, writer: asyncio.
         left -= len(piece)
         if writer is not None:
             writer.write(piece)
-            await _drained(writer)
+            await _drain(writer)
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     while piece := await reader.read(_PIECE):
         writer.write(piece)
-        await _drained(writer)
+        await _drain(writer)
 
 
-async def _drained(writer: asyncio.StreamWriter) -> None:
+async def _drain(writer: asyncio.StreamWriter) -> None:
     async with asyncio.timeout(_PATIENCE_S):
         await writer.drain()

@@ -99,12 +99,15 @@ def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, A
 def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Write what viewers changed, and what the request gives, into the files of the specifications."""
     values = {**evaluated.edited.given, **_constants_in(request, evaluated)}
-    written = evaluated.loaded.write_constants(values)
-    return {"written": _in_seconds(written), "constants": _constants_of(evaluated) | _in_seconds(values)}
+    changed_names = evaluated.loaded.write_constants(values)
+    return {
+        "written": _in_seconds(changed_names),
+        "constants": _constants_of(evaluated) | _in_seconds(values),
+    }
 
 
 def _constants_in(request: Mapping[str, Any], evaluated: Evaluated) -> Values:
-    return _as_written(request.get("constants", {}), constant_values(evaluated.edited.constants))
+    return _as_stored(request.get("constants", {}), constant_values(evaluated.edited.constants))
 
 
 def _constants_of(evaluated: Evaluated) -> dict[str, float]:
@@ -212,7 +215,7 @@ def asset(evaluated: Evaluated, uri: str) -> bytes | None:
         return {file.filename: file.source.encode() for file in evaluated.edited.files}.get(name)
     if kind == "automaton" and name.endswith(".dot"):
         automata = automata_attachments(evaluated.evaluation.automata, "")
-        return {each.name.rpartition("/")[2]: each.data for each in automata}.get(name)
+        return {automaton.name.rpartition("/")[2]: automaton.data for automaton in automata}.get(name)
     return None
 
 
@@ -320,15 +323,15 @@ class PublishingServer:
 
     def publish(self, messages: Messages) -> None:
         """Send messages to the viewers that have subscribed to their topics."""
-        wanted = {
+        subscribed = {
             number: sent
             for number, channel in messages.channels.items()
             if (sent := self._channels.get(channel)) is not None and sent.has_sinks()
         }
         numbers, times_ns = messages.channel.tolist(), messages.log_time_ns.tolist()
         for number, time_ns, payload in zip(numbers, times_ns, messages.payloads, strict=True):
-            if number in wanted:
-                wanted[number].log(payload, log_time=time_ns)
+            if number in subscribed:
+                subscribed[number].log(payload, log_time=time_ns)
 
     def send_time(self, time_ns: int) -> None:
         """Send the present time of the log."""
@@ -442,7 +445,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
         """Set a parameter of the playback; return its state."""
         self.send_state(self._session.steer({name: value}))
         self.send_playback()
-        return {key.partition(".")[2]: each for key, each in self._session.playback.items()}
+        return {key.partition(".")[2]: value for key, value in self._session.playback.items()}
 
     def _options(self) -> dict[str, Any]:
         return {
@@ -472,8 +475,12 @@ class LiveServer(PublishingServer, protocol.ServerListener):
     def on_get_parameters(
         self, client: protocol.Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        chosen = [*_parameters(self.steering), *_constants(self._session.values)]
-        return [each for each in chosen if each.name in param_names] if param_names else chosen
+        parameters = [*_parameters(self.steering), *_constants(self._session.values)]
+        return (
+            [parameter for parameter in parameters if parameter.name in param_names]
+            if param_names
+            else parameters
+        )
 
     def on_set_parameters(
         self, client: protocol.Client, parameters: list[Parameter], request_id: str | None = None
@@ -481,7 +488,9 @@ class LiveServer(PublishingServer, protocol.ServerListener):
         self.remove_note(CONSTANTS)
         self.remove_note(ARROW)
         try:
-            values = {each.name: _value(each) for each in parameters if each.name != _REJECTED}
+            values = {
+                parameter.name: _value(parameter) for parameter in parameters if parameter.name != _REJECTED
+            }
             playback = {name: value for name, value in values.items() if name in PLAYBACK}
             constants = {
                 name: value for name, value in values.items() if name not in PLAYBACK and name != ARROW
@@ -489,7 +498,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             if ARROW in values:
                 self._session.point_at(values[ARROW])
             if constants:
-                self._session.set_constants(_as_written(constants, self._session.values))
+                self._session.set_constants(_as_stored(constants, self._session.values))
             if playback:
                 self.send_state(self._session.steer(playback))
         except SpatialReplayError as error:
@@ -535,10 +544,10 @@ class RunServer(PublishingServer, protocol.ServerListener):
             if channel not in self._channels:
                 self._advertise(channel)
         super().publish(messages)
-        for channel, own in messages.by_channel():
+        for channel, rows in messages.by_channel():
             if channel in self._channels and _is_state(channel):
-                time_ns = int(messages.log_time_ns[own[-1]])
-                newest = own[messages.log_time_ns[own] == time_ns].tolist()
+                time_ns = int(messages.log_time_ns[rows[-1]])
+                newest = rows[messages.log_time_ns[rows] == time_ns].tolist()
                 sent = self._channels[channel]
                 self._latest[sent.id()] = sent, time_ns, [messages.payloads[place] for place in newest]
 
@@ -574,10 +583,10 @@ def _is_state(channel: Channel) -> bool:
 def _trigger_service(fire: Callable[[str], None]) -> Service:
     def handle(request: ServiceRequest) -> bytes:
         try:
-            given = json.loads(request.payload or b"{}")
+            arguments = json.loads(request.payload or b"{}")
         except (ValueError, RecursionError):
-            given = {}
-        reason = given.get("reason") if isinstance(given, dict) else None
+            arguments = {}
+        reason = arguments.get("reason") if isinstance(arguments, dict) else None
         fire(reason[:_LONGEST_TEXT] if isinstance(reason, str) and reason else "service call")
         return b'{"fired": true}'
 
@@ -657,21 +666,21 @@ def _value(parameter: Parameter) -> float | str | bool:
     raise _misfit(parameter.name, value)
 
 
-def _as_written(values: Mapping[str, float | str | bool], present: Values) -> Values:
+def _as_stored(values: Mapping[str, float | str | bool], present: Values) -> Values:
     """Return values of constants as a specification has them: seconds of a duration as a text.
 
     Raises:
         UsageError: one is true or false.
     """
-    written: dict[str, float | str] = {}
+    values_by_name: dict[str, float | str] = {}
     for name, value in values.items():
         if isinstance(value, bool):
             raise _misfit(name, value)
         is_seconds = (
             isinstance(present.get(name), str) and not isinstance(value, str) and 0 <= value < _MOST_S
         )
-        written[name] = format_duration(round(float(value) * 1e9)) if is_seconds else value
-    return written
+        values_by_name[name] = format_duration(round(float(value) * 1e9)) if is_seconds else value
+    return values_by_name
 
 
 def _misfit(name: str, value: object) -> UsageError:
@@ -681,9 +690,9 @@ def _misfit(name: str, value: object) -> UsageError:
 
 def _inner_host() -> str:
     """Return an address for the SDK behind the relay, where no page that tries ports finds it."""
-    drawn = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
+    address = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
     # of the loopback network, some systems have one address alone
-    return drawn if _is_own(drawn) else "127.0.0.1"
+    return address if _is_own(address) else "127.0.0.1"
 
 
 def _is_v6(host: str) -> bool:

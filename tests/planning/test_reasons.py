@@ -46,7 +46,7 @@ def test_a_motion_whose_object_is_elsewhere_afterwards_is_named_with_its_place()
     assert "moved, but then not at its target: a at (0.8, 0.4)" in step.reason
 
 
-def test_equal_objects_are_told_apart_by_their_order():
+def test_equal_objects_are_taken_by_their_order():
     objects = {"b": block(0.4, 0.5), "a": block(0.6, 0.5)}
     step = planner_for("F (a leftof b)", objects, "a", "b", skill="place").next_step()
     assert step.target.name == "a"
