@@ -106,7 +106,7 @@ def _place_on_way(
     return x + place[0] - foot[0], y + place[1] - foot[1]
 
 
-def _way_left(
+def _way_from(
     waypoints: Sequence[tuple[float, float]], tracked: TrackedObject
 ) -> tuple[tuple[float, float], ...]:
     """Return the part of a way that an object has not passed yet, from where it is."""
@@ -214,7 +214,7 @@ class Lookout:
             return None
         name, tracked = target.name, sample.objects[target.name]
         start, about = centre_of(tracked.footprint), (sample, states, others, target.name)
-        ways: list[Sequence[tuple[float, float]]] = [_way_left(target.waypoints, tracked), (start,)]
+        ways: list[Sequence[tuple[float, float]]] = [_way_from(target.waypoints, tracked), (start,)]
         going, staying = self._prospects(*about, ways, pace)
         if going.perhaps == math.inf:
             return None

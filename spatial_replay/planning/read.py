@@ -286,8 +286,8 @@ def why_not_there(
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
     yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, settings))
     if target is not None:
-        chosen = "chosen" if candidate.is_chosen else "possible"
-        yield f"  {chosen} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
+        how = "chosen" if candidate.is_chosen else "possible"
+        yield f"  {how} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
 
 
 def _blocking_texts(
