@@ -723,7 +723,15 @@ def read_blocks(
 
 
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
-    """Yield the same blocks, each read while the previous one is processed."""
+    """Yield the same blocks, from the third on each read while the previous one is processed.
+
+    A short log has one or two, and starting a thread takes longer than reading them.
+    """
+    for _ in range(2):
+        first = next(blocks, None)
+        if first is None:
+            return
+        yield first
     for block in each_ahead(lambda _: next(blocks, None), repeat(None)):
         if block is None:
             return

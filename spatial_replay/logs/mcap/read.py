@@ -167,7 +167,10 @@ def iter_records(
         except DamageError as damage:
             return damage
 
-    records = each_ahead(read, places, cores(), _AHEAD_BYTES, lambda place: max(place.length, place.size))
+    # a short log has one chunk, which no thread is needed for
+    records: Iterator[bytes | DamageError] = map(read, places)
+    if len(places) > 1:
+        records = each_ahead(read, places, cores(), _AHEAD_BYTES, lambda place: max(place.length, place.size))
     try:
         yield from zip(places, records, strict=True)
     finally:
