@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -144,7 +143,7 @@ def find_vacuous(
     """
     instance = evidence.instance
     nodes = nodes_of(instance.formula)
-    implications = _with_implications(instance.formula)
+    implications = _implications_of(instance.formula)
     windows, held = _Windows(times_ns), _Holding(instance, leaves, times_ns)
     scopes = _scopes(instance.formula, windows, held)
     active = _scopes(implications.formula, windows, held, is_conditional=True)
@@ -203,12 +202,6 @@ class _Implications(NamedTuple):
         for node, scope in zip(self.nodes, scopes, strict=True):
             joined[node] |= scope
         return joined
-
-
-@lru_cache(maxsize=256)
-def _with_implications(formula: Formula) -> _Implications:
-    """Return `_implications_of` a whole formula; many logs are evaluated with the same one."""
-    return _implications_of(formula)
 
 
 def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
@@ -587,7 +580,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
         return formula
 
     both = joined_channels([unknown, known], axis=1)
-    formula = tested(_with_implications(instance.formula).formula)
+    formula = tested(_implications_of(instance.formula).formula)
     done = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
     return final_verdict(*done.interval(0)) is verdict
 
