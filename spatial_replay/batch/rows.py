@@ -174,6 +174,11 @@ def rows_from_task(
     return tuple(tuple(replace(row, seconds=seconds, source=name) for row in each) for each in rows)
 
 
+def rows_from_tasks(tasks: tuple[Task, ...]) -> list[tuple[tuple[ResultRow, ...], ...]]:
+    """Return the rows of each of several logs."""
+    return [rows_from_task(task) for task in tasks]
+
+
 def rows_with_explanations(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
     """Return the rows of a log, each with its explanation (see `rows_from_task`)."""
     return rows_from_task(task, None)

@@ -25,6 +25,7 @@ from spatial_replay.batch.rows import (
     error_rows,
     parsed_specifications,
     rows_from_task,
+    rows_from_tasks,
     spec_lines,
 )
 from spatial_replay.batch.store import FORMAT, SOURCE, ResultsFolder, run_columns, table_of
@@ -652,9 +653,7 @@ def run_batch(
         tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
-            for task, result in workers.results(rows_from_task, tasks) if tasks else ():
-                if isinstance(result, WorkerLost):
-                    result = error_rows(task, str(result), "machine")
+            for task, result in _evaluated_tasks(workers, list(tasks)) if tasks else ():
                 # a log that changed during the run has another key; at an address, readers see to that
                 is_same = is_address(task.log) or _state(task.log) == states[task.log]
                 for key, rows in zip(tasks[task], result, strict=True):
@@ -673,6 +672,29 @@ def run_batch(
     # a log that cannot be read was tried, and is not known
     evaluated = {task.log for task in tasks} | {request.log.path for request in wanted if request.key is None}
     return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
+
+
+_LEAST_GROUPS: Final = 64
+_MOST_IN_GROUP: Final = 16
+"""Logs that a worker is given at once: handing out one takes longer than evaluating a short one."""
+
+
+def _evaluated_tasks(
+    workers: Workers, tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Sequence[Sequence[ResultRow]]]]:
+    """Yield each task with its rows. The logs of a worker that died are evaluated again, one by one."""
+    size = max(1, min(len(tasks) // _LEAST_GROUPS, _MOST_IN_GROUP))
+    groups = [tuple(tasks[begin : begin + size]) for begin in range(0, len(tasks), size)]
+    while groups:
+        again: list[tuple[Task, ...]] = []
+        for group, rows in workers.results(rows_from_tasks, groups):
+            if not isinstance(rows, WorkerLost):
+                yield from zip(group, rows, strict=True)
+            elif len(group) > 1:
+                again += [(task,) for task in group]
+            else:
+                yield group[0], error_rows(group[0], str(rows), "machine")
+        groups = again
 
 
 def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -132,6 +133,38 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(fleet: Path, processes: 
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in said) == (130, False), said
+
+
+def test_a_log_that_ends_its_worker_takes_none_of_its_group_with_it(fleet: Path) -> None:
+    # so many that a worker is given two at once
+    shutil.rmtree("logs")
+    write_fleet(fleet, [9.0 if number == 77 else 0.5 for number in range(140)])
+    Path("cell.py").write_text(
+        "import os\n"
+        "def crowd(sample):\n"
+        "    if sample.objects['person'].footprint.parts[0].vertices[:, 1].max() > 5:\n"
+        "        os._exit(9)\n"
+        "    return 1.0\n"
+        "SIGNALS = {'crowd': crowd}\n"
+    )
+    Path("few.spatial").write_text("use cell\nspec few = G (crowd <= 3)\n")
+    arguments = [
+        "batch",
+        "logs",
+        "--spec",
+        "few.spatial",
+        "--plugin",
+        "cell.py",
+        "--jobs",
+        "2",
+        "--json",
+        "-",
+    ]
+    # in a process of its own: the server of workers has what was allowed when it started
+    reply = subprocess.run([*PROGRAM, *arguments], env=environment(), capture_output=True, text=True)
+    rows = [json.loads(line) for line in reply.stdout.splitlines()]
+    assert [row["log"] for row in rows if row["verdict"] is None] == ["logs/run-77.jsonl"]
+    assert len(rows) == 140
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
