@@ -79,6 +79,11 @@ class Compiler:
         """Whether this thread interprets what a child process compiles."""
         return bool(self.trials) and threading.get_ident() not in self._loading
 
+    @property
+    def has_compiler(self) -> bool:
+        """Whether the compiler is loaded."""
+        return self._compiler is not None
+
     @cached_property
     def _cached(self) -> frozenset[str]:
         """The kernels whose machine code earlier processes have left in the cache."""
@@ -195,6 +200,8 @@ _Result = TypeVar("_Result")
 
 _PATIENCE_S: Final = 0.8
 """How long a process interprets kernels in any case: loading the compiler and machine code takes as long."""
+_FIRST_S: Final = 1.5
+"""The same for a kernel that was never run, before any code is loaded: most take a tenth of the guess."""
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.03
 """How long each kernel may be interpreted after that before it is compiled, or loaded from the cache."""
@@ -479,7 +486,9 @@ class _Kernel(Generic[_Arguments, _Result]):
             return _process.is_awaiting
         guess = _GUESS_S * self.times if self._element_s is None else self._element_s
         cost = elements * guess
-        if _process.spent_s + cost <= _PATIENCE_S or self._spent_s + cost <= _WARM_S:
+        is_guess = self._element_s is None and not _process.has_compiler
+        patience_s = _FIRST_S if is_guess else _PATIENCE_S
+        if _process.spent_s + cost <= patience_s or self._spent_s + cost <= _WARM_S:
             return True
         # asked last, since looking for the cache takes its time, too
         return self._spent_s + cost <= _COLD_S and not _process.holds(self.__wrapped__)
