@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
+import random
 import resource
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,13 @@ from spatial_replay.recording.recorder import record_source
 
 LOGS, FEW_LOGS, BARE_LOGS = 1_000, 16, 400
 ROWS = 100_000
+SHORT_LOGS = 100
+FOUR_SPECS = """\
+spec stays   = F (G (a dist b <= 0.3))
+spec apart   = G (a dist c >= 0.001)
+spec near    = F[0,5s] (b dist c <= 0.4)
+spec answers = G ((a dist b <= 0.2) -> F (a leftof c or c leftof a))
+"""
 TWO_MORE = "spec apart = G (red1 dist blue1 >= -20)\nspec near = F (red1 dist blue1 <= 400)\n"
 
 
@@ -78,6 +87,71 @@ def bench_batch(bench: Any) -> None:
         bench.quantile("two workers", [two_s / count], 0.5, unit="log")
         bench.ratio("two workers to half of one", 2.0 * two_s / worker_s, 2.0 / 1.8)
         bench.quantile("nothing new", [run(LocalProcesses(2), "two")], 0.5, unit="run", limit_s=2.0)
+
+
+def bench_short_logs(bench: Any) -> None:
+    """Logs of 200 samples of three boxes under four specs, in this process."""
+    rng = random.Random(1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "four.spatial").write_text(FOUR_SPECS)
+        for number in range(SHORT_LOGS):
+            write_short_log(folder / f"logs/{number:04}.jsonl.gz", rng)
+        runs = iter(range(1_000))
+
+        def run(_: Any) -> None:
+            logs = Suite.of_logs(["logs"], [folder / "four.spatial"]).cases
+            run_batch(prepare(Suite("logs", folder, logs)), folder / f"results-{next(runs)}", ThisProcess())
+
+        bench.measure("batch, nothing explained", run, per=SHORT_LOGS, unit="log", runs=5, warmups=3)
+
+
+def write_short_log(path: Path, rng: random.Random) -> None:
+    """Write a log in which three boxes move to random places."""
+    starts, goals = ([[rng.uniform(-0.3, 0.3) for _ in range(2)] for _ in range(3)] for _ in range(2))
+    lines = []
+    for step in range(200):
+        share = min(1.0, step / 150)
+        objects = []
+        for box, start, goal in zip("abc", starts, goals, strict=True):
+            x, y = (begin + (end - begin) * share for begin, end in zip(start, goal, strict=True))
+            corners = [[x + dx, y + dy] for dx, dy in ((0.0, 0.0), (0.06, 0.0), (0.06, 0.06), (0.0, 0.06))]
+            objects.append({"name": box, "polygon": corners})
+        lines.append(json.dumps({"time_ns": step * 50_000_000, "objects": objects}))
+    path.parent.mkdir(exist_ok=True)
+    with gzip.open(path, "wt") as stream:
+        stream.write("\n".join(lines))
+
+
+def bench_evaluate_many(bench: Any) -> None:
+    """Traces of 200 samples under four specs: all of a result, one by one and together."""
+    try:
+        from spatial_replay.monitor.result import evaluate_many
+    except ImportError:
+        bench.remark("this package has no evaluate_many")
+        return
+    rng = random.Random(1)
+    specification = sr.parse_specification(FOUR_SPECS)
+    with tempfile.TemporaryDirectory() as folder:
+        logs = [Path(folder) / f"logs/{number}.jsonl.gz" for number in range(SHORT_LOGS)]
+        for log in logs:
+            write_short_log(log, rng)
+        traces = [sr.read_trace(log) for log in logs]
+
+    def outcomes(evaluations: Iterable[sr.Evaluation]) -> list[object]:
+        return [(result.robustness, result.tested) for results in evaluations for result in results]
+
+    def one_by_one(_: Any) -> list[object]:
+        return outcomes(sr.evaluate(specification, replace(trace)) for trace in traces)
+
+    def together(_: Any) -> list[object]:
+        return outcomes(evaluate_many(specification, map(replace, traces)))
+
+    options: dict[str, Any] = {"per": SHORT_LOGS, "unit": "log", "runs": 5, "warmups": 4}
+    with only("compiled"):
+        single = bench.measure("one by one", one_by_one, **options)
+        joint = bench.measure("together", together, **options)
+    bench.ratio("together to one by one", joint.median_s / single.median_s, 0.65)
 
 
 def bench_results(bench: Any) -> None:
