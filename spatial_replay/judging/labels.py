@@ -76,7 +76,9 @@ def read_labels(
         address = data_set_address(log.path)
         data_set = None if address is None else open_data_set(address[0])
         if address is not None and data_set is not None:
-            by_path[log.path] = _stored_label(data_set, address[1], reading)
+            label = _stored_label(data_set, address[1], reading)
+            # a file replaces all labels of the data set: a mixture would be nobody's rate
+            by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
         elif not is_address(log.path):
@@ -84,7 +86,10 @@ def read_labels(
     near = [folder / name for folder in folders for name in LABEL_FILES]
     files = [Path(labels or "")] if is_file else [file for file in near if file.is_file()]
     for file in files:
-        for path, success in _labels_of(file, logs).items():
+        successes = _labels_of(file, logs)
+        if is_file and not successes:
+            raise UsageError(f"--labels {file}: it has no entry for a judged episode; give another file")
+        for path, success in successes.items():
             by_path[path] = by_path.get(path, SuccessLabel(None))._replace(success=success, is_unstored=False)
     return Labels(by_path, tuple(files))
 

@@ -290,6 +290,26 @@ def test_a_field_or_a_file_gives_the_labels_instead() -> None:
     assert "label     4 of 4" in judge_set("push_v3")
     Path("mine.csv").write_text("episode,success\n0,0\n1,0\n2,1\n3,0\n")
     assert "agreement 3 of 4" in judge_set("push_v3", "--labels", "mine.csv")
+    Path("mine.csv").write_text("episode,success\n0,1\n1,1\n")
+    text = judge_set("push_v3", "--labels", "mine.csv")
+    assert "label     2 of 2" in text and "without a label 2" in text
+
+
+@pytest.mark.usefixtures("push")
+def test_labels_of_other_episodes_are_refused() -> None:
+    Path("other").mkdir()
+    Path("other/000.jsonl").write_text("")
+    write = Path("other/labels.json").write_text
+    for entries in ([], [{"log": "000.jsonl", "success": True}]):
+        write(json.dumps(entries))
+        text = judge_set("push_v3", "--labels", "other/labels.json", code=2)
+        assert "--labels other/labels.json: it has no entry for a judged episode" in text
+
+
+@pytest.mark.usefixtures("push")
+def test_a_shaped_reward_is_no_label() -> None:
+    text = judge_set("push_v3", "--labels", "next.reward", code=2)
+    assert re.search(r"push_v3: next\.reward is no label: it has 0\.\d+; a label has 0 and 1", text)
 
 
 @pytest.mark.usefixtures("push")

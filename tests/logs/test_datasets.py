@@ -128,3 +128,11 @@ def test_an_address_names_an_episode(tmp_path: Path) -> None:
     assert data_set_address(f"{folder}") is None
     (tmp_path / "set#17").write_text("")
     assert data_set_address(f"{folder}#17") is None
+
+
+def test_a_damaged_description_of_lerobot_is_named(tmp_path: Path) -> None:
+    (tmp_path / "push/meta").mkdir(parents=True)
+    for text, message in (("{", "info.json is not JSON"), ("{}", "push is LeRobot without codebase_version")):
+        (tmp_path / "push/meta/info.json").write_text(text)
+        with pytest.raises((LogError, UsageError), match=message):
+            open_data_set(tmp_path / "push")

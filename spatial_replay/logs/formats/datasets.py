@@ -29,6 +29,7 @@ from spatial_replay.logs.formats.episodes import (
     EpisodeReading,
     Feature,
     Label,
+    as_label,
     frame_times_ns,
 )
 from spatial_replay.logs.formats.hdf5 import is_hdf5, open_hdf5
@@ -123,7 +124,7 @@ _TIME_ERROR_S: Final = 1e-3
 
 
 def _is_lerobot(path: Path) -> bool:
-    return path.is_dir() and b'"codebase_version"' in read_head(path / "meta" / "info.json")
+    return path.is_dir() and (path / "meta" / "info.json").is_file()
 
 
 class _LeRobot(DataSet):
@@ -131,7 +132,7 @@ class _LeRobot(DataSet):
 
     def __init__(self, path: Path) -> None:
         info = read_json(path / "meta" / "info.json")
-        version = str(info["codebase_version"])
+        version = str(info.get("codebase_version") or "without codebase_version")
         if not re.match(r"v[23]\.", version):
             raise UsageError(
                 f"{path.name} is LeRobot {version}; v2.0 to v3.x are read; convert it with lerobot's script"
@@ -191,7 +192,9 @@ class _LeRobot(DataSet):
         return EpisodeColumns(
             frame_times_ns(frames.astype(np.int64), fps),
             {name: whole[name] for name in features if name in whole},
-            success=None if label is None or label not in whole else whole[label].reshape(-1) > 0,
+            success=None
+            if label is None or label not in whole
+            else as_label(whole[label], f"{self.name}: {label}"),
             remarks=tuple(remarks),
             unjudged=unjudged,
         )
@@ -463,7 +466,9 @@ class _Npz(DataSet):
         rows = slice(self._bounds[number], self._bounds[number + 1])
         names = [feature.name for feature in self.features] if features is None else features
         frames: Integers = np.arange(rows.stop - rows.start, dtype=np.int64)
-        success = None if reading.label is None else self._array(reading.label)[rows].reshape(-1) > 0
+        success = None
+        if reading.label is not None:
+            success = as_label(self._array(reading.label)[rows], f"{self.name}: {reading.label}")
         bodies, remarks = list[Body](), tuple[str, ...]()
         if reading.model is not None:
             model = model_from_file(reading.model, reading.assets)

@@ -246,3 +246,18 @@ def natural_key(name: str) -> tuple[Any, ...]:
     """Return a key that sorts `demo_2` before `demo_10`."""
     digits = name[len(name.rstrip("0123456789")) :]
     return (name[: len(name) - len(digits)], int(digits or -1), name)
+
+
+def as_label(values: Floats, place: str) -> Booleans:
+    """Return the label (T,) of each row of a column (T, …): whether it holds a number above 0.
+
+    Raises:
+        UsageError: the column has negative numbers, or several above 0, as a shaped reward does.
+    """
+    rows = np.nan_to_num(values.reshape(len(values), -1))
+    wrong = rows[(rows < 0) | (rows != rows.max(initial=0.0)) & (rows > 0)]
+    if wrong.size:
+        raise UsageError(
+            f"{place} is no label: it has {wrong[0]:.4g}; a label has 0 and 1, or true and false"
+        )
+    return np.asarray((rows > 0).any(axis=1))

@@ -28,6 +28,7 @@ from spatial_replay.logs.formats.episodes import (
     EpisodeColumns,
     EpisodeReading,
     Feature,
+    as_label,
     natural_key,
 )
 from spatial_replay.text import counted, listed, nearest_hint
@@ -170,7 +171,7 @@ def success_of_states(labels: Floats, count: int, place: str) -> Booleans:
     Raises:
         LogError: there are neither as many labels as states, nor one less.
     """
-    is_success = np.asarray(np.nan_to_num(labels.reshape(len(labels), -1)).max(axis=1) > 0)
+    is_success = as_label(labels, place)
     if len(labels) == count - 1:
         return np.concatenate([[False], is_success])
     if len(labels) != count:

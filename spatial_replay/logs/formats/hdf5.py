@@ -34,6 +34,7 @@ from spatial_replay.logs.formats.episodes import (
     EpisodeReading,
     Feature,
     Label,
+    as_label,
     frame_times_ns,
     natural_key,
 )
@@ -416,7 +417,9 @@ class _D4rl(DataSet):
         with open_archive(self.path) as file:
             values = {name: self._array(file, name, rows) for name in names}
             label, bodies, remarks = reading.label, list[Body](), tuple[str, ...]()
-            success = None if label is None else self._array(file, label, rows).reshape(-1) > 0
+            success = None
+            if label is not None:
+                success = as_label(self._array(file, label, rows), f"{self.name}: {label}")
             if reading.model is not None:
                 name = "infos/qpos" if self.feature("infos/qpos") else "qpos"
                 model = model_from_file(reading.model, reading.assets)
