@@ -397,3 +397,11 @@ def test_files_of_no_known_layout_are_named(tmp_path: Path, content: bytes | Non
         path.write_bytes(content)
     with pytest.raises((LogError, UsageError), match=reason):
         open_data_set(path)
+
+
+def test_an_episode_that_claims_terabytes_is_refused_before_its_times_are_counted(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "set.hdf5", "w") as file:
+        poses = {"shape": (10**10, 7), "dtype": "f8", "chunks": (1000, 7)}
+        file.create_dataset("data/demo_0/states/rigid_object/a/root_pose", **poses)
+    with pytest.raises(LogError, match="claims 560,000,000,000 bytes"):
+        opened(tmp_path / "set.hdf5").columns(0, EpisodeReading(fps=20))

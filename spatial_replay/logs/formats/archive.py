@@ -148,6 +148,12 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
     return values.reshape(len(values), -1) if values.ndim > 1 else values
 
 
+def row_count(array: Any) -> int:
+    """Return the number of rows of an array that can be read without risk, see `check_array`."""
+    check_array(array)
+    return int(array.shape[0])
+
+
 def check_array(array: Any) -> None:
     """Refuse an array whose data are elsewhere, larger than the file can hold, or behind a missing filter.
 

@@ -22,6 +22,7 @@ from spatial_replay.logs.formats.archive import (
     names_in,
     numbers,
     open_archive,
+    row_count,
     text_attribute,
     width_of,
 )
@@ -143,7 +144,7 @@ class _ManiSkill(GroupedEpisodes):
             item: Any = member(group, folder)
             arrays = [item] if hasattr(item, "shape") else [array for _, array in arrays_in(item)]
             if arrays and arrays[0].shape:
-                return int(arrays[0].shape[0])
+                return row_count(arrays[0])
         raise LogError(f"{place} has neither env_states nor obs; record with `record_env_state=True`")
 
     def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
@@ -213,7 +214,7 @@ class _IsaacLab(GroupedEpisodes):
         array = member(group, f"{_BODIES}/{names[0]}/root_pose")
         if array is None or not array.shape:
             raise LogError(f"{place}: {_BODIES}/{names[0]} has no root_pose")
-        return int(array.shape[0])
+        return row_count(array)
 
     def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
         frames: Integers = np.arange(count, dtype=np.int64)
@@ -333,7 +334,7 @@ class _Robosuite(GroupedEpisodes):
         states: Any = member(group, "states")
         if states is None or not states.shape:
             raise LogError(f"{place} has no states")
-        return int(states.shape[0])
+        return row_count(states)
 
     def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
         if reading.model is None:
