@@ -77,7 +77,7 @@ def read_labels(
         data_set = None if address is None else open_data_set(address[0])
         if address is not None and data_set is not None:
             label = _stored_label(data_set, address[1], reading)
-            # a file replaces all labels of the data set: a mixture would be nobody's rate
+            # a file replaces all labels of the data set: a mixture has a rate of neither
             by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
@@ -189,6 +189,13 @@ def _entry_path(
     if len(paths) > 1:
         raise UsageError(f"{name!r:.100} names {counted(len(paths), 'log')}; write more of the path")
     if paths:
+        neighbour, path = file.parent / name, Path(paths[0])
+        is_like = neighbour.name == path.name and neighbour.is_file() and path.is_file()
+        if is_like and not neighbour.samefile(path):
+            raise UsageError(
+                f"{name!r:.100} is the log next to this file, not {path}; copy the file next to the"
+                " logs that it labels"
+            )
         return paths[0]
     if "\0" not in name and (file.parent / name).exists():
         return None

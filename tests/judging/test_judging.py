@@ -197,6 +197,13 @@ def test_bad_labels_are_refused_with_the_place_and_the_remedy(fleet: Path, label
     assert message in judge(code=2)
 
 
+def test_labels_next_to_other_logs_of_the_same_names_are_refused(fleet: Path) -> None:
+    shutil.copytree(fleet / "logs", fleet / "elsewhere")
+    text = judge("--labels", "elsewhere/labels.json", code=2)
+    assert "entry 1: 'run-0.jsonl' is the log next to this file, not logs/run-0.jsonl" in text
+    assert "entry 4" in text
+
+
 def test_a_field_of_labels_needs_a_data_set(fleet: Path) -> None:
     assert "--labels next.success: no such file" in judge("--labels", "next.success", code=2)
     assert "missing.json" in judge("--labels", "missing.json", code=2)
