@@ -208,6 +208,9 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     yield f"against {comparison.old}: {pairs:,} pairs with the same start{others}"
     if not pairs:
         return
+    if not won and not lost:
+        yield "undecided: no pair has a success on one side alone"
+        return
     more = comparison.more_pairs
     if comparison.decision == "undecided":
         after = "" if more is None else f"; about {more:,} more pairs would decide"

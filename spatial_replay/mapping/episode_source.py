@@ -171,9 +171,14 @@ class EpisodeSource(Source):
             for signal in features.signals
         }
         if not names and not signals:
+            names_of_features = [feature.name for feature in self.data_set.features if feature.width]
+            remedy = (
+                f"name its `features`: {listed(names_of_features)}"
+                if names_of_features
+                else "it has no numbers"
+            )
             raise UsageError(
-                f"{mapping.name if mapping else self.name} names no objects of {self.data_set.name}; name its"
-                f" `features`: {listed([feature.name for feature in self.data_set.features])}"
+                f"{mapping.name if mapping else self.name} names no objects of {self.data_set.name}; {remedy}"
             )
         number = np.arange(len(rows), dtype=np.int64)
         numbered = np.where(rows.is_valid, number, -2 - number).reshape(len(names), len(times_ns))

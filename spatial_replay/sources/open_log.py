@@ -20,7 +20,7 @@ from stat import S_ISDIR, S_ISREG
 from typing import NamedTuple, Unpack
 from urllib.parse import quote
 
-from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
+from spatial_replay.errors import LogError, MissingFileError, RemoteError, SpatialReplayError, UsageError
 from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
 from spatial_replay.logs.formats.tracks import (
     CSV_COLUMNS,
@@ -51,6 +51,8 @@ _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
 LOG_ENDINGS = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
 """Endings of the names of logs."""
+_MOST_LOOKED_AT = 20
+"""Entries of a folder without a log, in which a data set is looked for."""
 _HEAD = 4096
 """Bytes by which a file's format is recognised."""
 
@@ -163,6 +165,8 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             logs = [name for name in names if name.endswith((".mcap", ".bag", ".jsonl", ".jsonl.gz", ".csv"))]
             what = "no file of a ROS 2 bag (.db3, .mcap)" if names else "nothing"
             such = f", such as {printable(str(file / logs[0]))}; batch takes a folder" if logs else ""
+            if inside := _data_set_in(file):
+                such = f"; {printable(str(inside))} is a data set of episodes"
             raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log{such}")
         return file
     if not file.version.has_ranges:
@@ -188,8 +192,17 @@ def _refuse_data_set(path: Path) -> None:
         first = printable(f"{path}#{data_set.episodes[0].number}")
         raise UsageError(
             f"{path} is a {data_set.kind} data set of {counted(len(data_set.episodes), 'episode')}; give one,"
-            f" such as {first}, or all of them to `batch`"
+            f" such as {first}, or all of them to `batch` or `judge`"
         )
+
+
+def _data_set_in(folder: Path) -> Path | None:
+    """Return the first data set in a folder, such as the name space of Minari's; None without one."""
+    for path in sorted(folder.iterdir())[:_MOST_LOOKED_AT]:
+        with suppress(SpatialReplayError):
+            if open_data_set(path) is not None:
+                return path
+    return None
 
 
 def _open_episode(path: str, number: int, options: ReadOptions) -> Source:

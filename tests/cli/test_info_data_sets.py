@@ -194,3 +194,11 @@ def test_an_episode_with_a_mapping_has_its_task_and_label(
         "task     fill the cup",
         "label    success",
     ]
+
+
+def test_the_folder_above_a_data_set_names_the_data_set(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lerobot(tmp_path / "space" / "fill", {"observation.state": (STATE, [0.0] * 4)})
+    assert run(["info", str(tmp_path / "space")]) == 2
+    assert f"{tmp_path}/space/fill is a data set of episodes" in capsys.readouterr().err.replace("\n", "")
