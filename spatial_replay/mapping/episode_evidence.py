@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.logs.formats.hdf5 import quaternion_order
+from spatial_replay.logs.formats.episodes import quaternion_order
 from spatial_replay.mapping.evidence import extents
 from spatial_replay.mapping.feature_reader import BoundObject, Columns
 from spatial_replay.mapping.suggest_features import HANDS

@@ -13,8 +13,7 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.formats.episodes import AS_STORED, Body, DataSet, Feature
-from spatial_replay.logs.formats.hdf5 import quaternion_order
+from spatial_replay.logs.formats.episodes import AS_STORED, Body, DataSet, Feature, quaternion_order
 from spatial_replay.mapping.trial import yaml_text
 from spatial_replay.text import counted, listed, printable
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -261,3 +261,17 @@ def as_label(values: Floats, place: str) -> Booleans:
             f"{place} is no label: it has {wrong[0]:.4g}; a label has 0 and 1, or true and false"
         )
     return np.asarray((rows > 0).any(axis=1))
+
+
+def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
+    """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it does not show.
+
+    A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z; no turn is the
+    one with c = 1.
+    """
+    is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
+    is_xyzw = bool((is_zero[:, 0] & is_zero[:, 1]).any())
+    is_wxyz = bool((is_zero[:, 1] & is_zero[:, 2] & ~is_zero[:, 0]).any())
+    if is_xyzw == is_wxyz:
+        return None
+    return "xyzw" if is_xyzw else "wxyz"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -38,6 +38,7 @@ from spatial_replay.logs.formats.episodes import (
     as_label,
     frame_times_ns,
     natural_key,
+    quaternion_order,
 )
 from spatial_replay.logs.formats.grouped import (
     GroupedEpisodes,
@@ -259,20 +260,6 @@ def _poses(home: Any, body: str, episode: Any, place: str, rows: slice = slice(N
     if array is None:
         raise LogError(f"{where} is missing; record it again")
     return pose_rows(array, where, 7, rows)
-
-
-def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
-    """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it does not show.
-
-    A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z; no turn is the
-    one with c = 1.
-    """
-    is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
-    is_xyzw = bool((is_zero[:, 0] & is_zero[:, 1]).any())
-    is_wxyz = bool((is_zero[:, 1] & is_zero[:, 2] & ~is_zero[:, 0]).any())
-    if is_xyzw == is_wxyz:
-        return None
-    return "xyzw" if is_xyzw else "wxyz"
 
 
 # -------------------------------------------------------------------------------------------------- robosuite
