@@ -291,18 +291,18 @@ def batch(
         evaluated = run_batch(cases, folder, workers, fail_on=fail_on, progress=progress)
         differences = None if before is None else compare(evaluated.table, before, tolerance)
 
-        def compared(evaluated: BatchResult) -> BatchResult:
+        def with_comparison(evaluated: BatchResult) -> BatchResult:
             # what is worse than the baseline fails wherever results are shown
             if before is None:
                 return evaluated
             return replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
 
         is_exported = any((outputs.junit, outputs.html, outputs.json_file, is_github()))
-        failing = failing_places(compared(evaluated).table, None if is_exported else _WORST)
+        failing = failing_places(with_comparison(evaluated).table, None if is_exported else _WORST)
         # results that only the baseline has come last
         failing = [place for place in failing if place < len(evaluated.table)]
         evaluated = explain_batch(evaluated, failing, workers, results=folder, progress=progress)
-        result = compared(evaluated)
+        result = with_comparison(evaluated)
         _write_outputs(outputs, suite, evaluated, result, workers)
         if outputs.json_file != "-":
             _print(result, evaluated, folder)

@@ -84,7 +84,7 @@ def open_data_set(path: str | PathLike[str]) -> DataSet | None:
     """
     folder = Path(path)
     try:
-        return _open(folder, _state(folder))
+        return _open(folder, _file_states(folder))
     except (OSError, ValueError) as error:
         raise LogError(f"{folder.name} cannot be read: {system_reason(error)}") from error
 
@@ -101,7 +101,7 @@ _DESCRIBING: Final = (
 """Files of a data set that say what is in it."""
 
 
-def _state(path: Path) -> tuple[object, ...]:
+def _file_states(path: Path) -> tuple[object, ...]:
     """Return what changes with the files that say what is in a data set."""
     # as texts: paths would take most of the time
     files = [*(f"{path}{name}" for name in _DESCRIBING), f"{path.with_suffix('.json')}"]
