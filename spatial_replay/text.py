@@ -95,15 +95,20 @@ def counted_from(texts: Iterable[str], first_ns: int) -> tuple[Sentence, ...]:
     )
 
 
-_NUMBER = re.compile(r"\d[\d.,]*")
+_CODE_OR_NUMBER = re.compile(r"(`[^`]*`)|\d[\d.,]*")
 _FEW: Final = 3
+
+
+def without_numbers(text: str) -> str:
+    """Return a text with 0 for each number outside of code: equal for texts that differ in numbers only."""
+    return _CODE_OR_NUMBER.sub(lambda match: match[1] or "0", text)
 
 
 def without_repetition(texts: Iterable[str]) -> list[str]:
     """Return texts with one in place of several that differ in their numbers only, and how many those are."""
     alike: dict[str, list[str]] = {}
     for text in texts:
-        alike.setdefault(_NUMBER.sub("0", text), []).append(text)
+        alike.setdefault(without_numbers(text), []).append(text)
     return [
         text
         for group in alike.values()

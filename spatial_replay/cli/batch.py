@@ -34,7 +34,7 @@ from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
-from spatial_replay.text import counted, first_lines, json_value
+from spatial_replay.text import counted, first_lines, json_value, without_numbers
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
@@ -477,12 +477,13 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
 
 def warn_of_names(table: pa.Table) -> None:
     """Warn of names that logs lack, and of what is remarkable about logs; the same is reported once."""
-    logs: dict[str, dict[str, None]] = {}
+    logs: dict[str, tuple[str, dict[str, None]]] = {}
     for name in ("missing", "remarks"):
         for log, messages in _columns(table, "log", name):
             for message in messages:
-                logs.setdefault(message.removeprefix(f"{Path(log).name}: "), {})[log] = None
-    messages_with_logs = [f"{message} (in {_join_names(list(names))})" for message, names in logs.items()]
+                text = message.removeprefix(f"{Path(log).name}: ")
+                logs.setdefault(without_numbers(text), (text, {}))[1][log] = None
+    messages_with_logs = [f"{text} (in {_join_names(list(names))})" for text, names in logs.values()]
     warn(*first_lines(messages_with_logs, _MOST_WARNINGS))
 
 
