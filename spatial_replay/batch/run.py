@@ -724,7 +724,7 @@ def _key_of(conditions: Conditions) -> list[Any]:
     """Return what rows depend on besides the log and the specification, whose constants have their values."""
     mapping = conditions.mapping
     return [
-        None if mapping is None else load_mapping(mapping).sha256,
+        None if mapping is None else load_mapping(mapping).identity,
         conditions.reading,
         conditions.start,
         conditions.end,

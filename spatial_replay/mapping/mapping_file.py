@@ -22,8 +22,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.formats.episodes import AS_STORED, EpisodeReading
+from spatial_replay.logs.formats.mujoco import identity_of_model
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text, schema_of
@@ -239,6 +240,18 @@ class LogMapping:
     features: tuple[TopicMapping, ...] = ()
     episodes: EpisodeReading = AS_STORED
     shapes: Table[str, ShapeMapping] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
+
+    @property
+    def identity(self) -> str:
+        """A hash of its content, and of the models and meshes that it names."""
+        model, assets = self.episodes.model, self.episodes.assets
+        if model is None and assets is None:
+            return self.sha256
+        try:
+            return f"{self.sha256} {identity_of_model(model, assets)}"
+        except (LogError, OSError) as error:
+            # reading an episode says so
+            return f"{self.sha256} {error}"
 
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}

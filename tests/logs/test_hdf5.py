@@ -287,6 +287,21 @@ def test_a_model_gives_the_bodies_of_qpos(tmp_path: Path) -> None:
 
 
 def minari(folder: Path, ends: list[bool], **about: Any) -> Path:
+    # a changed model changes the results of its episodes
+    (tmp_path / "cube.yaml").write_text("fps: 10\nmodel: scene.xml\n")
+    (tmp_path / "gate.spatial").write_text(
+        "region low = box(-9, -9, 9, 9) height (-9, 0.3)\nspec s = low prec[z] cube\n"
+    )
+
+    def evaluated() -> tuple[int, list[str]]:
+        gate, mapping = tmp_path / "gate.spatial", str(tmp_path / "cube.yaml")
+        result = sr.evaluate_logs(tmp_path / "set.npz", gate, output=tmp_path / "results", mapping=mapping)
+        return result.evaluated, result.table["verdict"].to_pylist()
+
+    assert evaluated() == (1, ["satisfied"])
+    assert evaluated() == (0, ["satisfied"])
+    (tmp_path / "scene.xml").write_text(CUBE.replace("0.1 0.1 0.1", "0.1 0.1 0.4"))
+    assert evaluated() == (1, ["violated"])
     """Write a data set of Minari in HDF5 with one episode."""
     (folder / "data").mkdir(parents=True)
     metadata = {"minari_version": "0.5.4", "data_format": "hdf5", "total_episodes": 1, **about}

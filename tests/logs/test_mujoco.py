@@ -11,7 +11,7 @@ import pytest
 
 from spatial_replay.errors import LogError
 from spatial_replay.logs.formats.episodes import Body
-from spatial_replay.logs.formats.mujoco import model_from_xml
+from spatial_replay.logs.formats.mujoco import model_from_file, model_from_xml
 
 pytest.importorskip("mujoco")
 
@@ -52,6 +52,15 @@ def test_footprints_and_heights_are_those_of_the_surfaces(data_folder: Path) -> 
         expected = vector["expected"]
         np.testing.assert_allclose(support, expected["support_16_directions"], rtol=0, atol=tolerance)
         np.testing.assert_allclose(body.shapes.height(0), expected["height"], rtol=0, atol=tolerance)
+
+
+def test_a_model_is_compiled_once_until_a_file_of_it_changes(tmp_path: Path) -> None:
+    (tmp_path / "can.obj").write_text(TETRAHEDRON)
+    (tmp_path / "scene.xml").write_text(scene(MESH, '<asset><mesh name="can" file="can.obj"/></asset>'))
+    model = model_from_file(tmp_path / "scene.xml")
+    assert model_from_file(tmp_path / "scene.xml") is model
+    (tmp_path / "can.obj").write_text(TETRAHEDRON.replace("0.1", "0.2"))
+    assert model_from_file(tmp_path / "scene.xml") is not model
 
 
 def test_colliding_geoms_alone_are_the_footprint() -> None:

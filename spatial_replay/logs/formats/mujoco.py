@@ -6,11 +6,13 @@ before a model is compiled, and MuJoCo itself never reads a file.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -36,28 +38,8 @@ UPRIGHT_COSINE: Final = math.cos(math.radians(5.6))
 """A cylinder tilted less is a segment with a radius, at most 0.5 % of the radius too long."""
 
 _UNUSED: Final = frozenset(
-    [
-        "actuator",
-        "camera",
-        "contact",
-        "custom",
-        "deformable",
-        "equality",
-        "extension",
-        "hfield",
-        "keyframe",
-        "light",
-        "material",
-        "model",
-        "plugin",
-        "sensor",
-        "size",
-        "skin",
-        "statistic",
-        "tendon",
-        "texture",
-        "visual",
-    ]
+    "actuator camera contact custom deformable equality extension hfield keyframe light material model plugin"
+    " sensor size skin statistic tendon texture visual".split()
 )
 """Elements without influence on the poses of bodies, or that load code or files."""
 _FOLDERS: Final = ("meshdir", "texturedir", "assetdir")
@@ -329,22 +311,25 @@ def _hulls(points: Floats, radius: float, bottom: Floats, top: Floats) -> Footpr
 
 
 def model_from_file(path: Path, assets: Path | None = None) -> SceneModel:
-    """Compile the model in a file, with the meshes of a folder: by default its own.
+    """Return the model in a file, with the meshes of a folder: by default its own.
 
     Raises:
         LogError: a model that cannot be read or compiled.
     """
+    return model_from_xml(_text_of(path), path.name, assets or path.absolute().parent)
+
+
+def _text_of(path: Path) -> str:
     try:
         if path.stat().st_size > LARGEST_MODEL:
             raise LogError(f"{path.name} has over {LARGEST_MODEL >> 20} MiB; give the XML of a MuJoCo model")
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         raise LogError(f"the model {path} cannot be read ({error}); give the XML of a MuJoCo model") from None
-    return model_from_xml(text, path.name, assets or path.absolute().parent)
 
 
 def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneModel:
-    """Compile a model from its XML, without what kinematics do without.
+    """Compile a model from its XML, without what kinematics do without; the last few are compiled once.
 
     Args:
         place: what names the model in messages.
@@ -354,20 +339,64 @@ def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneMo
     Raises:
         LogError: XML that is broken or too large, or no model of MuJoCo.
     """
-    with importing("models of MuJoCo need mujoco", extra="mujoco"):
-        import mujoco
+    return _compiled(_source_without_files(text, place) if assets is None else _source(text, place, assets))
+
+
+def identity_of_model(model: Path | None, assets: Path | None) -> str:
+    """Return a hash that changes with the files that a mapping's model, or models in a data set, are made of.
+
+    Raises:
+        LogError: they cannot be read.
+    """
+    if model is not None:
+        source = _source(_text_of(model), model.name, assets or model.absolute().parent)
+        parts = [source.xml.encode(), *(content for _, content in source.files)]
+    else:
+        # the models name their meshes: any file of the folder
+        files = sorted(file for file in assets.rglob("*") if file.is_file()) if assets is not None else []
+        states = [(str(file), state.st_size, state.st_mtime_ns) for file in files for state in [file.stat()]]
+        parts = [repr(states).encode("utf-8", "surrogatepass")]
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(hashlib.sha256(part).digest())
+    return digest.hexdigest()
+
+
+class _ModelSource(NamedTuple):
+    """What a model is compiled from: XML, the content of files by their names, remarks on lost ones."""
+
+    place: str
+    xml: str
+    files: tuple[tuple[str, bytes], ...]
+    remarks: tuple[str, ...]
+
+
+def _source(text: str, place: str, assets: Path | None) -> _ModelSource:
     root = _element(text, place)
     folder = _Folder(assets)
     _include(root, folder, place, depth=0)
     _refuse_many(root, place)
     directories = [compiler.get(key, "") for compiler in root.iter("compiler") for key in _FOLDERS[::2]]
     files = _strip(root, folder, next((name for name in directories if name), ""))
+    xml = ElementTree.tostring(root, encoding="unicode")
+    return _ModelSource(place, xml, tuple(files.items()), tuple(folder.remarks()))
+
+
+@lru_cache(maxsize=4)
+def _source_without_files(text: str, place: str) -> _ModelSource:
+    return _source(text, place, None)
+
+
+@lru_cache(maxsize=4)
+def _compiled(source: _ModelSource) -> SceneModel:
+    with importing("models of MuJoCo need mujoco", extra="mujoco"):
+        import mujoco
     try:
-        model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"), files)
+        model = mujoco.MjModel.from_xml_string(source.xml, dict(source.files))
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:300]
-        raise LogError(f"MuJoCo {mujoco.__version__} does not compile {place}: {reason}") from None
-    return SceneModel(model, place, folder.remarks())
+        raise LogError(f"MuJoCo {mujoco.__version__} does not compile {source.place}: {reason}") from None
+    return SceneModel(model, source.place, source.remarks)
 
 
 class _Folder:
