@@ -13,7 +13,7 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.output import align_rows
 from spatial_replay.cli.terminal import progress, show, show_json, warn
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.text import counted, json_fields, json_number, printable
+from spatial_replay.text import counted, json_fields, json_number, listed, printable, without_numbers
 
 if TYPE_CHECKING:
     from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, EpisodeReading, Feature
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _MOST_LABELS: Final = 1_000
 """Episodes whose labels are counted."""
 _MOST_TASKS: Final = 5
+_MOST_NAMED: Final = 5
+"""Episodes that a warning names."""
 _MOST_PLACES: Final = 60
 """Places of a feature that the text of an episode lists."""
 
@@ -109,14 +111,20 @@ def _read_labels(data_set: DataSet) -> list[bool | None]:
         return []
     episodes = data_set.episodes[:_MOST_LABELS]
     labels: list[bool | None] = []
+    numbers_by_error: dict[str, list[str]] = {}
     with progress("episodes", len(episodes)) as advance:
         for episode in episodes:
+            address = f"{data_set.name}#{episode.number}"
             try:
-                labels.append(data_set.label_of(episode.number))
+                success = data_set.success(episode.number)
+                labels.append(None if success is None else bool(success.any()))
             except LogError as error:
-                warn(str(error))
+                reason = str(error).removeprefix(f"{address}: ")
+                numbers_by_error.setdefault(without_numbers(reason), [reason]).append(f"#{episode.number}")
                 labels.append(None)
             advance(1)
+    for reason, *numbers in numbers_by_error.values():
+        warn(f"{reason} ({counted(len(numbers), 'episode')}: {listed(numbers, _MOST_NAMED)})")
     return labels
 
 
@@ -225,7 +233,7 @@ def _body_text(body: dict[str, Any]) -> str:
 
 def _label_text(data_set: DataSet, columns: EpisodeColumns) -> str:
     field = data_set.label.field if data_set.label else "label"
-    if columns.success is None or len(columns.success) != len(columns.times_ns) or not columns.label:
+    if columns.success is None or columns.success.ndim == 0 or not columns.label:
         return f"{field}: {str(columns.label).lower()}"
     first = int(columns.success.argmax())
     return f"{field}: true in {counted(int(columns.success.sum()), 'frame')}, first in frame {first}"

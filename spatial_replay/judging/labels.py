@@ -100,18 +100,19 @@ def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> Su
     about = SuccessLabel(None, task=episode.task, seed=episode.seed)
     field = reading.label
     try:
-        # labels need no times
-        columns = data_set.columns(number, reading._replace(fps=reading.fps or data_set.fps or 1.0), ())
+        success = data_set.success(number, reading)
     except LogError:
         return about
-    if columns.success is None or not columns.success.size:
+    if success is None or not success.size:
         return about
     # a label in an earlier frame is about a state that is stored
-    is_last = len(columns.success) == len(columns.times_ns) and not columns.success[:-1].any()
+    is_last = success.ndim == 1 and not success[:-1].any()
     is_own = field is None or (label is not None and label.field == field)
     is_about_next = label is not None and label.is_about_next if is_own else str(field).startswith("next.")
     is_stored = label is not None and label.is_stored
-    return about._replace(success=columns.label, is_unstored=is_last and is_about_next and not is_stored)
+    return about._replace(
+        success=bool(success.any()), is_unstored=is_last and is_about_next and not is_stored
+    )
 
 
 def _labels_of(file: Path, logs: Sequence[FoundLog]) -> dict[str, bool | None]:

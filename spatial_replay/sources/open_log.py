@@ -85,6 +85,8 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
     if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
         return _open_messages(path, "ROS 2 bag", options)
+    if isinstance(path, Path) and path.suffix == ".json":
+        _refuse_description(path)
     kind = format_of(path)
     if kind is not None:
         options.refuse_except(FORMATS[kind].options, kind, path.name)
@@ -194,6 +196,18 @@ def _refuse_data_set(path: Path) -> None:
             f"{path} is a {data_set.kind} data set of {counted(len(data_set.episodes), 'episode')}; give one,"
             f" such as {first}, or all of them to `batch` or `judge`"
         )
+
+
+def _refuse_description(path: Path) -> None:
+    """Refuse the JSON file next to the trajectories of ManiSkill.
+
+    Raises:
+        UsageError: it is one.
+    """
+    trajectories = path.with_suffix(".h5")
+    data_set = open_data_set(trajectories)
+    if data_set is not None and data_set.kind == "ManiSkill":
+        raise UsageError(f"{path.name} describes the episodes of {trajectories.name}; give {trajectories}")
 
 
 def _data_set_in(folder: Path) -> Path | None:

@@ -81,6 +81,27 @@ def test_an_episode_without_a_mapping_has_the_ranges_of_its_numbers(
     assert "fill has no episode 7; it has 2 episodes, fill#0 to fill#1" in capsys.readouterr().err
 
 
+def test_a_damaged_file_is_reported_once_for_all_episodes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lerobot(tmp_path / "fill", {"observation.state": (STATE, [0.0] * 4)})
+    for file in (folder / "data/chunk-000").iterdir():
+        file.write_bytes(b"PAR1")
+    assert run(["info", str(folder)]) == 0
+    (warning,) = [line for line in capsys.readouterr().err.split("spatial-replay: ") if "parquet" in line]
+    assert "download it again (2 episodes: #0, #1)" in " ".join(warning.split())
+
+
+def test_an_address_without_a_number_names_the_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lerobot(tmp_path / "fill", {"observation.state": (STATE, [0.0] * 4)})
+    for command in (["info"], ["explain", "--spec", "a dist b <= 1"], ["judge", "--spec", "gate.spatial"]):
+        assert run([*command, f"{folder}#x"]) == 2
+        message = capsys.readouterr().err.replace("\n", " ")
+        assert "fill#x: episodes go by number; it has 2 episodes, fill#0 to fill#1" in message
+
+
 def test_names_of_places_suggest_objects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, state = (SCENE, [*UPRIGHT, 0.0, 0.0]), (STATE, [0.0] * 4)
     folder = lerobot(tmp_path / "fill", {"observation.state": state, "observation.environment_state": scene})

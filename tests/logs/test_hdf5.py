@@ -219,6 +219,8 @@ def test_a_label_of_a_step_is_that_of_the_state_after_it(tmp_path: Path) -> None
     columns = data_set.columns(0)
     assert columns.success is not None and columns.success.tolist() == [False, False, True]
     assert columns.times_ns.tolist() == [0, 20_000_000, 40_000_000]
+    with pytest.raises(UsageError, match=r"Push.json describes the episodes of Push.h5; give .*Push.h5"):
+        sr.read_trace(tmp_path / "Push.json")
     np.testing.assert_array_equal(columns.features["actions"], [[1.0], [2.0], [np.nan]])
 
 

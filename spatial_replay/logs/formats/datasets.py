@@ -40,7 +40,7 @@ from spatial_replay.text import counted, listed, nearest_hint
 
 DATA_SET_ENDINGS: Final = (".hdf5", ".h5", ".npz")
 """Endings of the names of data sets that are files."""
-_ADDRESS: Final = re.compile(r"(.+)#([0-9]{1,9})", re.DOTALL)
+_ADDRESS: Final = re.compile(r"(.+)#(?:([0-9]{1,9})|[^#]*)", re.DOTALL)
 _MOST_BYTES: Final = 8 * 2**30
 """Bytes of the columns of one file, uncompressed."""
 
@@ -61,6 +61,9 @@ def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
     """Split `push_v3#17` into the path of a data set and a number; None if it is no such address.
 
     A file with that very name is no address.
+
+    Raises:
+        UsageError: the data set has something else than a number behind it.
     """
     match = _ADDRESS.fullmatch(fspath(text))
     if match is None or "://" in match[1]:
@@ -70,7 +73,9 @@ def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
         is_address = os.path.exists(match[1]) and not os.path.exists(match[0])  # noqa: PTH110
     except (OSError, ValueError):
         return None
-    return (match[1], int(match[2])) if is_address else None
+    if is_address and match[2] is None and (data_set := open_data_set(match[1])) is not None:
+        raise UsageError(f"{match[0]}: episodes go by number; {data_set.range_text}")
+    return (match[1], int(match[2])) if is_address and match[2] is not None else None
 
 
 def open_data_set(path: str | PathLike[str]) -> DataSet | None:

@@ -85,7 +85,7 @@ class EpisodeColumns:
         times_ns: (T,) int64, increasing.
         features: by name, each (T,) or (T, W) float64.
         bodies: those that the data set names itself.
-        success: (T,) the label of each frame; (1,) for one of the episode; None without a label.
+        success: (T,) the label of each frame; () that of the episode; None without a label.
         faults: messages about lost frames.
         remarks: other messages, each without the name of the data set.
         unjudged: why the episode has no verdict, such as two runs in one episode; "" otherwise.
@@ -173,9 +173,16 @@ class DataSet:
         """
         raise NotImplementedError
 
-    def label_of(self, number: int) -> bool | None:
-        """Read whether an episode is labelled a success; None without a label."""
-        return self.columns(number, AS_STORED._replace(fps=self.fps or 1.0), ()).label
+    def success(self, number: int, reading: EpisodeReading = AS_STORED) -> Booleans | None:
+        """Read the label of an episode, see `EpisodeColumns.success`; no pose is read.
+
+        Raises:
+            UsageError, LogError: see `columns`.
+        """
+        # labels need no times
+        return self.columns(
+            number, reading._replace(fps=reading.fps or self.fps or 1.0, model=None), ()
+        ).success
 
     def files(self, number: int) -> list[Path]:
         """Return the files that an episode depends on: all of the data set, unless its format knows better.

@@ -100,19 +100,18 @@ class GroupedEpisodes(DataSet):
                 read.times_ns,
                 values,
                 read.bodies,
-                self.success(group, count, episode, reading),
+                self.success_in(group, count, episode, reading),
                 read.faults,
                 (*read.remarks, *remarks),
                 read.unjudged,
             )
 
-    def label_of(self, number: int) -> bool | None:
-        """See `DataSet.label_of`; no pose is read."""
+    def success(self, number: int, reading: EpisodeReading = AS_STORED) -> Booleans | None:
+        """See `DataSet.success`."""
         episode, place = self.episode(number), f"{self.name}#{number}"
         with open_archive(self.path) as file:
             group = episode_group(file, f"{self.folder}/{episode.key}", place)
-            success = self.success(group, self.count_frames(group, place), episode, AS_STORED)
-            return None if success is None else bool(success.any())
+            return self.success_in(group, self.count_frames(group, place), episode, reading)
 
     def _features_of(
         self, group: Any, count: int, names: Sequence[str]
@@ -129,7 +128,9 @@ class GroupedEpisodes(DataSet):
             values[name] = with_last(numbers(array), count)
         return values, remarks
 
-    def success(self, group: Any, count: int, episode: Episode, reading: EpisodeReading) -> Booleans | None:
+    def success_in(
+        self, group: Any, count: int, episode: Episode, reading: EpisodeReading
+    ) -> Booleans | None:
         """Return the label of an episode, of each state or of all; None without one."""
         field = reading.label or (self.label.field if self.label else None)
         if field is None:
@@ -139,7 +140,7 @@ class GroupedEpisodes(DataSet):
             return success_of_states(numbers(array), count, f"{self.name}#{episode.number}: {field}")
         value = attribute(group, field)
         if value is not None:
-            return np.array([bool(value)])
+            return np.array(bool(value))
         if reading.label is not None and self.feature(field) is None:
             names = [feature.name for feature in self.features]
             hint = nearest_hint(field, names) or f"it has {listed(names)}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,7 +47,7 @@ from spatial_replay.logs.formats.grouped import (
     pose_rows,
     unit_quaternions,
 )
-from spatial_replay.logs.formats.mujoco import SceneModel, model_from_file, model_from_xml
+from spatial_replay.logs.formats.mujoco import model_from_file, model_from_xml
 from spatial_replay.logs.formats.tables import read_json
 from spatial_replay.text import counted, listed, nearest_hint
 
@@ -158,10 +157,12 @@ class _ManiSkill(GroupedEpisodes):
         frames: Integers = np.arange(count, dtype=np.int64)
         return EpisodeColumns(frame_times_ns(frames, self.required_fps(reading)), bodies=tuple(bodies))
 
-    def success(self, group: Any, count: int, episode: Episode, reading: EpisodeReading) -> Booleans | None:
-        success = super().success(group, count, episode, reading)
+    def success_in(
+        self, group: Any, count: int, episode: Episode, reading: EpisodeReading
+    ) -> Booleans | None:
+        success = super().success_in(group, count, episode, reading)
         value = self._rows.get(episode.key, {}).get("success")
-        return np.array([value]) if success is None and isinstance(value, bool) else success
+        return np.array(value) if success is None and isinstance(value, bool) else success
 
 
 # -------------------------------------------------------------------------------------------------- Isaac Lab
@@ -328,7 +329,7 @@ class _Robosuite(GroupedEpisodes):
             xml = text_attribute(group, "model_file")
             if not xml:
                 raise UsageError(f"{place} has no model_file; give the MuJoCo model by `model: scene.xml`")
-            model = _recorded_model(xml, f"the model_file of {self.name}", reading.assets)
+            model = model_from_xml(xml, f"the model_file of {self.name}", reading.assets)
         else:
             model = model_from_file(reading.model, reading.assets)
         seconds, bodies = model.states(numbers(member(group, "states")), f"{place}: states")
@@ -348,15 +349,12 @@ class _Robosuite(GroupedEpisodes):
             remarks.append(f"its time starts at {seconds[0]:.3f} s")
         return EpisodeColumns(times_ns, bodies=tuple(bodies), remarks=tuple(remarks), unjudged=unjudged)
 
-    def success(self, group: Any, count: int, episode: Episode, reading: EpisodeReading) -> Booleans | None:
+    def success_in(
+        self, group: Any, count: int, episode: Episode, reading: EpisodeReading
+    ) -> Booleans | None:
         if reading.label is None and self.label is not None and self.label.field == "successful":
-            return np.array([True])
-        return super().success(group, count, episode, reading)
-
-
-@lru_cache(maxsize=4)
-def _recorded_model(xml: str, place: str, assets: Path | None) -> SceneModel:
-    return model_from_xml(xml, place, assets)
+            return np.array(True)
+        return super().success_in(group, count, episode, reading)
 
 
 # ------------------------------------------------------------------------------------------------------- D4RL
