@@ -17,6 +17,7 @@ from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, Episod
 h5py = pytest.importorskip("h5py")
 
 AT_20_HZ = EpisodeReading(fps=20)
+XYZW = EpisodeReading(fps=20, order="xyzw")
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -144,7 +145,8 @@ def isaac(path: Path, *demos: dict[str, list[tuple[float, ...]]], success: bool 
 @pytest.mark.parametrize(
     ("bodies", "expected"),
     [
-        ({"a": [IDENTITY]}, IDENTITY),
+        # it stands until it turns
+        ({"a": [IDENTITY, (0.0, 0.0, 0.6, 0.8)]}, IDENTITY),
         ({"a": [(1.0, 0.0, 0.0, 0.0)]}, IDENTITY),
         ({"a": [(0.0, 0.0, 0.6, 0.8)]}, (0.0, 0.0, 0.6, 0.8)),
         ({"a": [(0.8, 0.0, 0.0, 0.6)]}, (0.0, 0.0, 0.6, 0.8)),
@@ -164,6 +166,8 @@ def test_the_order_of_quaternions_is_that_of_upright_bodies(
     "bodies",
     [
         {"a": [(0.5, 0.5, 0.5, 0.5)]},
+        # half a turn about the vertical axis in the other order
+        {"a": [IDENTITY], "b": [IDENTITY]},
         {"a": [(0.0, 0.0, 0.6, 0.8)], "b": [(0.8, 0.0, 0.0, 0.6)]},
     ],
 )
@@ -173,7 +177,7 @@ def test_an_order_that_does_not_show_is_asked_for(
     data_set = opened(isaac(tmp_path / "set.hdf5", bodies))
     with pytest.raises(UsageError, match="say `order: xyzw`"):
         data_set.columns(0, AT_20_HZ)
-    columns = data_set.columns(0, EpisodeReading(fps=20, order="xyzw"))
+    columns = data_set.columns(0, XYZW)
     assert body(columns, "a", 0)[3:] == list(bodies["a"][0])
 
 
@@ -184,13 +188,13 @@ def test_numbers_that_are_no_orientation_are_refused_by_name(tmp_path: Path) -> 
     with pytest.raises(
         LogError, match=r"set.hdf5#1: states/rigid_object/mug has a quaternion of length 0.04 at row 1"
     ):
-        data_set.columns(1, AT_20_HZ)
+        data_set.columns(1, XYZW)
 
 
 def test_episodes_go_by_number_and_keep_their_names(tmp_path: Path) -> None:
     data_set = opened(isaac(tmp_path / "set.hdf5", *([{"a": [IDENTITY]}] * 11), success=False))
     assert [episode.key for episode in data_set.episodes][-3:] == ["demo_8", "demo_9", "demo_10"]
-    columns = data_set.columns(10, AT_20_HZ)
+    columns = data_set.columns(10, XYZW)
     assert body(columns, "a", 0)[0] == 10
     assert columns.label is False
 
@@ -198,7 +202,7 @@ def test_episodes_go_by_number_and_keep_their_names(tmp_path: Path) -> None:
 def test_bodies_without_shapes_are_points_with_a_remark(tmp_path: Path) -> None:
     path = isaac(tmp_path / "set.hdf5", {"cup": [IDENTITY], "tray": [IDENTITY]})
     bodies = tmp_path / "bodies.yaml"
-    bodies.write_text("fps: 20\nshapes: {tray: {box: [0.4, 0.3]}}\n")
+    bodies.write_text("fps: 20\norder: xyzw\nshapes: {tray: {box: [0.4, 0.3]}}\n")
     (remark,) = sr.replay_log(f"{path}#0", "cup enclosedin tray", mapping=str(bodies)).remarks
     assert "cup is a point without a shape in the data; give it by `shapes: {cup: …}`" in str(remark)
 
@@ -215,12 +219,12 @@ def test_a_label_of_a_step_is_that_of_the_state_after_it(tmp_path: Path) -> None
     environment = {"env_id": "Push", "env_kwargs": {"sim_config": {"control_freq": 50}}}
     (tmp_path / "Push.json").write_text(json.dumps({"env_info": environment, "episodes": rows}))
     data_set = opened(tmp_path / "Push.h5")
+    with pytest.raises(UsageError, match=r"Push.json describes the episodes of Push.h5; give .*Push.h5"):
+        sr.read_trace(tmp_path / "Push.json")
     assert data_set.remarks == ("Push.json and Push.h5 differ in their episodes: traj_1",)
     columns = data_set.columns(0)
     assert columns.success is not None and columns.success.tolist() == [False, False, True]
     assert columns.times_ns.tolist() == [0, 20_000_000, 40_000_000]
-    with pytest.raises(UsageError, match=r"Push.json describes the episodes of Push.h5; give .*Push.h5"):
-        sr.read_trace(tmp_path / "Push.json")
     np.testing.assert_array_equal(columns.features["actions"], [[1.0], [2.0], [np.nan]])
 
 
@@ -283,12 +287,6 @@ def test_a_model_gives_the_bodies_of_qpos(tmp_path: Path) -> None:
     for name in ("set.hdf5", "set.npz"):
         columns = opened(tmp_path / name).columns(0, reading)
         assert body(columns, "cube", 1) == [1.0, 0.0, 0.5, *IDENTITY]
-
-
-# ------------------------------------------------------------------------------------- Minari
-
-
-def minari(folder: Path, ends: list[bool], **about: Any) -> Path:
     # a changed model changes the results of its episodes
     (tmp_path / "cube.yaml").write_text("fps: 10\nmodel: scene.xml\n")
     (tmp_path / "gate.spatial").write_text(
@@ -304,6 +302,12 @@ def minari(folder: Path, ends: list[bool], **about: Any) -> Path:
     assert evaluated() == (0, ["satisfied"])
     (tmp_path / "scene.xml").write_text(CUBE.replace("0.1 0.1 0.1", "0.1 0.1 0.4"))
     assert evaluated() == (1, ["violated"])
+
+
+# ------------------------------------------------------------------------------------- Minari
+
+
+def minari(folder: Path, ends: list[bool], **about: Any) -> Path:
     """Write a data set of Minari in HDF5 with one episode."""
     (folder / "data").mkdir(parents=True)
     metadata = {"minari_version": "0.5.4", "data_format": "hdf5", "total_episodes": 1, **about}
@@ -382,10 +386,9 @@ def trap(path: Path, kind: str) -> Path:
 )
 def test_data_that_are_not_plainly_in_the_file_are_refused(tmp_path: Path, kind: str, reason: str) -> None:
     data_set = opened(trap(tmp_path / "set.hdf5", kind))
-    reading = EpisodeReading(fps=20, order="xyzw")
-    assert [body.name for body in data_set.columns(0, reading).bodies] == ["a"]
+    assert [body.name for body in data_set.columns(0, XYZW).bodies] == ["a"]
     with pytest.raises(LogError, match=reason):
-        data_set.columns(1, reading)
+        data_set.columns(1, XYZW)
 
 
 def test_a_soft_link_within_an_episode_is_followed(tmp_path: Path) -> None:
@@ -394,7 +397,7 @@ def test_a_soft_link_within_an_episode_is_followed(tmp_path: Path) -> None:
         file["data/demo_0/states/rigid_object/b"] = h5py.SoftLink("/data/demo_0/states/rigid_object/a")
         # a circle of groups ends the search for features
         file["data/demo_0/states/again"] = file["data/demo_0/states"]
-    columns = opened(path).columns(0, AT_20_HZ)
+    columns = opened(path).columns(0, XYZW)
     assert [body.name for body in columns.bodies] == ["a", "b"]
 
 

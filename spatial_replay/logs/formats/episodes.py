@@ -273,12 +273,12 @@ def as_label(values: Floats, place: str) -> Booleans:
 def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
     """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it does not show.
 
-    A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z; no turn is the
-    one with c = 1.
+    A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z. (0, 0, 0, 1) is
+    upright in both orders: no turn as x y z w, half a turn as w x y z. So it contradicts w x y z, and does not
+    show x y z w.
     """
     is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
-    is_xyzw = bool((is_zero[:, 0] & is_zero[:, 1]).any())
-    is_wxyz = bool((is_zero[:, 1] & is_zero[:, 2] & ~is_zero[:, 0]).any())
-    if is_xyzw == is_wxyz:
-        return None
-    return "xyzw" if is_xyzw else "wxyz"
+    begins_with_zeros = is_zero[:, 0] & is_zero[:, 1]
+    if (is_zero[:, 1] & is_zero[:, 2] & ~is_zero[:, 0]).any():
+        return None if begins_with_zeros.any() else "wxyz"
+    return "xyzw" if (begins_with_zeros & ~is_zero[:, 2]).any() else None
