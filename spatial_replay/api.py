@@ -447,6 +447,8 @@ def judge(
     from spatial_replay.judging.stages import episode_stages, with_stages
 
     refuse_unknown(reading, Reading.__annotations__)
+    if same_start is not None and not against:
+        raise UsageError("same_start is about pairs; give the earlier episodes: against=")
     allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
     conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
     files = [specifications] if isinstance(specifications, str | PathLike) else list(specifications)

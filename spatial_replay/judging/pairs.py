@@ -18,7 +18,6 @@ from spatial_replay.judging.judgement import JudgedEpisode, Judgement, PreparedJ
 from spatial_replay.judging.statistics import (
     EVIDENCE,
     SIGNIFICANCE,
-    Rate,
     SignedRank,
     e_value,
     mcnemar_p,
@@ -37,8 +36,8 @@ class Comparison:
     """New episodes against old ones.
 
     Attributes:
-        new, old: names of both.
-        old_rate: of all decided old episodes.
+        new: name of the new episodes.
+        old: the judgement of the old ones.
         pairs: decided episodes of both that have the same key and first places.
         elsewhere: number of pairs with the same key whose objects start elsewhere, or are others.
         undecided: number of pairs in which one episode is undecided, or its success unstored.
@@ -46,8 +45,7 @@ class Comparison:
     """
 
     new: str
-    old: str
-    old_rate: Rate
+    old: Judgement
     pairs: tuple[tuple[JudgedEpisode, JudgedEpisode], ...]
     elsewhere: int
     undecided: int
@@ -98,12 +96,14 @@ class Comparison:
     @property
     def document(self) -> dict[str, Any]:
         """The comparison for JSON."""
-        names = ["old", "decision", "won", "lost", "elsewhere", "undecided", "alone"]
+        names = ["decision", "won", "lost", "elsewhere", "undecided", "alone"]
         names += ["p", "evidence", "more_pairs", "margins"]
         numbers = {name: getattr(self, name) for name in names}
         return {
+            "old": self.old.name,
             "pairs": len(self.pairs),
-            "old_rate": self.old_rate.value,
+            "old_rate": self.old.rate.value,
+            "old_with_unstored_rate": self.old.rate_with_unstored.value,
             **{name: json_value(value) for name, value in numbers.items()},
         }
 
@@ -154,7 +154,7 @@ def compare_judgements(
             pairs.append((row, partner))
     counts["alone"] += len(partners)
     numbers = counts["elsewhere"], counts["undecided"], counts["alone"]
-    return Comparison(new.name, old.name, old.rate, tuple(pairs), *numbers)
+    return Comparison(new.name, old, tuple(pairs), *numbers)
 
 
 def _rows_by_key(
@@ -205,7 +205,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         "episodes without a partner": comparison.alone,
     }
     others = "".join(f", {count:,} {name}" for name, count in rest.items() if count)
-    yield f"against {comparison.old}: {pairs:,} pairs with the same start{others}"
+    yield f"against {comparison.old.name}: {pairs:,} pairs with the same start{others}"
     if not pairs:
         return
     if not won and not lost:

@@ -26,16 +26,14 @@ def summary_lines(judgement: Judgement) -> Iterator[str]:
     count = counted(len(judgement.rows), "episode")
     yield f"{judgement.name}: {count} judged by `{judgement.result}`, `{judgement.formula}`"
     agreement = judgement.agreement
-    rates = {"ours": judgement.rate}
-    rates |= {"": judgement.rate_with_unstored} if agreement.unstored else {}
-    rates |= {"label": judgement.label_rate} if judgement.label_rate.episodes else {}
-    rates |= {"against": judgement.comparison.old_rate} if judgement.comparison else {}
-    counts = {name: f"{rate.successes:,} of {rate.episodes:,}" for name, rate in rates.items()}
-    width = max(map(len, counts.values()))
+    rates = [*_rates("ours", judgement)]
+    rates += [("label", judgement.label_rate, "")] if judgement.label_rate.episodes else []
+    rates += _rates("against", judgement.comparison.old) if judgement.comparison else []
+    counts = [f"{rate.successes:,} of {rate.episodes:,}" for _, rate, _ in rates]
+    width = max(map(len, counts))
     yield f"{'':10}{'success':<{width + 9}}95 %"
-    for name, rate in rates.items():
-        end = "" if name else f"   if the unstored {agreement.unstored:,} count"
-        yield f"{name:<10}{counts[name]:<{width}}  {_percents(rate)}{end}"
+    for count_text, (name, rate, end) in zip(counts, rates, strict=True):
+        yield f"{name:<10}{count_text:<{width}}  {_percents(rate)}{end}"
     numbers = {
         "both": agreement.both,
         "only the label": agreement.only_theirs,
@@ -53,6 +51,13 @@ def summary_lines(judgement: Judgement) -> Iterator[str]:
         yield f"{start}{', '.join(f'{name} {number:,}' for name, number in numbers.items())}"
     if judgement.pass_k:
         yield ", ".join(f"pass^{k} {100.0 * value:.0f} %" for k, value in judgement.pass_k.items())
+
+
+def _rates(name: str, judgement: Judgement) -> Iterator[tuple[str, Rate, str]]:
+    """Yield the names and rates of a judgement, and what is after them in their lines."""
+    yield name, judgement.rate, ""
+    if unstored := judgement.agreement.unstored:
+        yield "", judgement.rate_with_unstored, f"   if the unstored {unstored:,} count"
 
 
 def _percents(rate: Rate) -> str:

@@ -277,6 +277,9 @@ def test_successes_after_the_last_frame_are_unstored_and_no_disagreements() -> N
     assert "2 of 4  50 %   15 to 85   if the unstored 2 count" in text
     assert re.search(r"agreement 2 of 2 .*neither 2, unstored 2\n", text)
     assert "which is not in the data; 3.8 mm were missing" in text
+    text = judge_set("push_v3_stopped", "--against", "push_v3_stopped")
+    line = "2 of 4  50 %   15 to 85   if the unstored 2 count"
+    assert re.search(rf"against   0 of 4 .*\n +{line}\n", text)
     judge_set("push_v3_stopped", "--at-least", "0.1", code=4)
     judge_set("push_v3_stopped", "--at-least", "0.2", code=1)
 
@@ -461,3 +464,5 @@ def test_repeated_runs_say_how_often_all_of_them_succeed(fleet: Path) -> None:
 
 def test_same_start_needs_earlier_episodes(fleet: Path) -> None:
     assert "add --against LOG" in judge("--same-start", "0.1", code=2)
+    with pytest.raises(sr.UsageError, match="same_start is about pairs; give the earlier episodes: against="):
+        sr.judge("logs", "gate.spatial", same_start=0.1)

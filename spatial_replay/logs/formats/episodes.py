@@ -274,8 +274,7 @@ def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
     """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it does not show.
 
     A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z. (0, 0, 0, 1) is
-    upright in both orders: no turn as x y z w, half a turn as w x y z. So it contradicts w x y z, and does not
-    show x y z w.
+    upright in both orders: no turn as x y z w, half a turn as w x y z. So it does not show x y z w.
     """
     is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
     begins_with_zeros = is_zero[:, 0] & is_zero[:, 1]

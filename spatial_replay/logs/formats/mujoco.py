@@ -38,8 +38,28 @@ UPRIGHT_COSINE: Final = math.cos(math.radians(5.6))
 """A cylinder tilted less is a segment with a radius, at most 0.5 % of the radius too long."""
 
 _UNUSED: Final = frozenset(
-    "actuator camera contact custom deformable equality extension hfield keyframe light material model plugin"
-    " sensor size skin statistic tendon texture visual".split()
+    [
+        "actuator",
+        "camera",
+        "contact",
+        "custom",
+        "deformable",
+        "equality",
+        "extension",
+        "hfield",
+        "keyframe",
+        "light",
+        "material",
+        "model",
+        "plugin",
+        "sensor",
+        "size",
+        "skin",
+        "statistic",
+        "tendon",
+        "texture",
+        "visual",
+    ]
 )
 """Elements without influence on the poses of bodies, or that load code or files."""
 _FOLDERS: Final = ("meshdir", "texturedir", "assetdir")
