@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from spatial_replay.planning.settings import Settings
     from spatial_replay.recording.clips import Trigger
     from spatial_replay.recording.recorder import Recorder
+    from spatial_replay.sanity.differences import distinguish
     from spatial_replay.sanity.examine import doctor
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.spec.formula import Specification
@@ -85,6 +86,7 @@ __all__ = [
     "clip_log",
     "diff_logs",
     "diff_specifications",
+    "distinguish",
     "doctor",
     "evaluate",
     "evaluate_logs",

@@ -108,6 +108,7 @@ def test_an_argument_that_does_not_exist_names_the_nearest_and_what_is_no_object
         ("evaluate", ((specification, None), {"semantic": "paper"}), "did you mean 'semantics'"),
         ("automaton", ((specification,), {"rate": 3}), "did you mean 'rate_hz'"),
         ("doctor", ((specification,), {"example": False}), "did you mean 'examples'"),
+        ("distinguish", ((specification, specification), {"rate": 3}), "did you mean 'rate_hz'"),
         ("parse_specification", (("true",), {"const": {}}), "did you mean 'constants'"),
         ("read_trace", (("a.jsonl",), {"maping": "m.yaml"}), "did you mean 'mapping'"),
         ("tune", ((specification, "a.jsonl"), {"vary": ["near"]}), "give ranges by name"),

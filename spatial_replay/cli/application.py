@@ -48,6 +48,7 @@ GROUPS: dict[str, dict[str, str]] = {
     "Specifications": {
         "check": "Check a specification and print its tree.",
         "doctor": "Find faults of a specification before any run.",
+        "distinguish": "Find a run that one of two specifications accepts.",
         "tune": "Find the constants that fit recorded runs.",
         "learn": "Find a specification that distinguishes good runs from bad ones.",
         "falsify": "Search for simulated runs that violate a specification.",

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
+    from spatial_replay.sanity.differences import Distinction, distinguish
     from spatial_replay.sanity.examine import doctor, refuse_constant_results, refuse_unsatisfiable
 
-__all__ = ["doctor", "refuse_constant_results", "refuse_unsatisfiable"]
+__all__ = ["Distinction", "distinguish", "doctor", "refuse_constant_results", "refuse_unsatisfiable"]
 
 __getattr__, __dir__ = loaded_when_used(globals())

@@ -154,8 +154,8 @@ class Examination(Printed):
                     **json_fields(spec, "name", "reason", "undecided"),
                     "automaton": not spec.reason,
                     "by_logic_alone": spec.unrelated,
-                    "satisfied": _example_document(spec.satisfied),
-                    "violated": _example_document(spec.violated),
+                    "satisfied": example_document(spec.satisfied),
+                    "violated": example_document(spec.violated),
                 }
                 for spec in self.specs
             ],
@@ -193,7 +193,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _example_document(example: Example | None) -> dict[str, Any] | None:
+def example_document(example: Example | None) -> dict[str, Any] | None:
+    """Return a run as values for JSON."""
     if example is None:
         return None
     about = json_fields(example, "robustness", "note")
@@ -450,7 +451,7 @@ class _Examiner:
     ) -> None:
         if answer is None:
             return
-        reason = _reason(answer)
+        reason = reason_of(answer)
         loose = [name for name in specs if name in self._readings and self._readings[name].reason]
         if loose:
             reason += ", however its bounds and past operators are read"
@@ -490,7 +491,7 @@ _IMPLIED: Final = "it adds nothing; leave it out, or make it stricter"
 _SAME: Final = "leave one of them out"
 
 
-def _reason(answer: Answer) -> str:
+def reason_of(answer: Answer) -> str:
     """Return why there is no such run."""
     if answer.by_logic or not answer.exclusions:
         opposites = "".join(

@@ -33,6 +33,7 @@ from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.formula import (
     Atom,
     Axis,
+    Centre,
     CentroidProjection,
     Earlier,
     Formula,
@@ -375,6 +376,10 @@ class _Attempt:
         if isinstance(term, RegionName):
             limits = self._setting.region_box(term.name, outer=outer)
             return [(_Amount({}, low), _Amount({}, high)) for low, high in limits]
+        if isinstance(term, Centre):
+            sides = self._sides(term.term, index, outer=outer)
+            middles = [_Amount({}).plus(low, 0.5).plus(high, 0.5) for low, high in sides]
+            return [(middle, middle) for middle in middles]
         name, at = _object(term, index)
         sides = []
         for axis in self._setting.axes:
@@ -410,7 +415,7 @@ def _object(term: Term, index: int) -> tuple[str, int]:
         return term.term.name, index - term.samples
     if isinstance(term, TrackedName):
         return term.name, index
-    raise CannotPlaceError("a centre, a group of a class, or of all objects, is not placed")
+    raise CannotPlaceError("a group of a class, or of all objects, is not placed")
 
 
 def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]:
@@ -487,7 +492,7 @@ class Example:
     Attributes:
         verdict: what it is evaluated to.
         sentences: what has to hold in each sample; everything else may hold or not.
-        samples: objects placed so, one second apart; None if no placement was found.
+        samples: objects placed so; None if no placement was found.
         robustness: of these samples; None without any.
         note: why there are only words, or "".
     """
@@ -517,15 +522,20 @@ def shortest_example(
     satisfied: bool,
     *,
     is_exact: bool = True,
+    rate_hz: float | None = None,
     another: Callable[[Sequence[Word]], Word | None] = lambda avoided: None,
 ) -> Example | None:
     """Return a run with what has to hold in its samples, placed if it can be.
 
     Args:
         is_exact: otherwise the word is only a guess: without a placement that confirms it, there is no run.
+        rate_hz: samples per second of the run.
         another: returns a word that is as short, and has nothing of what could not be placed.
     """
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
+    periods_ns = (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS)
+    if rate_hz is not None:
+        periods_ns = (round(_SECOND_NS / rate_hz),)
     first: Example | None = None
     avoided: list[Word] = []
     while len(avoided) < MAX_WORDS:
@@ -537,7 +547,7 @@ def shortest_example(
             for sample_facts in facts
         )
         try:
-            placement, note, core = _place(specification, spec, facts, verdict, is_exact=is_exact)
+            placement, note, core = _place(specification, spec, facts, verdict, periods_ns)
         except CannotPlaceError as reason:
             placement, note, core = None, str(reason), None
         if placement is not None:
@@ -563,8 +573,7 @@ def _place(
     spec: NamedSpec,
     facts: Sequence[Sequence[tuple[Fact, bool]]],
     verdict: str,
-    *,
-    is_exact: bool,
+    periods_ns: Sequence[int],
 ) -> tuple[tuple[tuple[Sample, ...], float] | None, str, Core | None]:
     """Return samples that evaluate to the verdict, and their robustness.
 
@@ -580,7 +589,7 @@ def _place(
         raise CannotPlaceError(f"it takes {len(facts)} samples")
     setting, note = _setting(specification, spec), ""
     core: Core | None = None
-    for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
+    for period_ns in periods_ns:
         for samples, excluded in placements(setting, facts, period_ns):
             core = excluded
             if samples is None:

@@ -10,6 +10,7 @@ from fractions import Fraction
 from itertools import combinations, product
 from typing import Final, TypeVar
 
+from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.sanity.conditions import (
     Quantity,
     exact,
@@ -22,6 +23,7 @@ from spatial_replay.sanity.conditions import (
 from spatial_replay.sanity.linear import Inequality
 from spatial_replay.spec.formula import (
     Axis,
+    Centre,
     CentroidProjection,
     Measurement,
     Misalignment,
@@ -76,6 +78,7 @@ def laws(
     inequalities += _transitive(outside, within, regions)
     inequalities += _nesting(bare, within, regions)
     inequalities += _across(bare, outside, diameters)
+    inequalities += _centres(outside, regions)
     if extents.matter:
         # protrusions of regions are measured and rounded: exact extents add nothing to them
         inequalities += extents.laws(
@@ -127,6 +130,17 @@ def _across(
         if pair.first != pair.second and all(protrusion in outside for protrusion in rooms):
             law = _law((pair, 1), *((protrusion, -1) for protrusion in rooms), bound=diameter)
             yield law._replace(label=LEVEL)
+
+
+def _centres(outside: Mapping[Protrusion, None], regions: Mapping[str, Outline]) -> Iterator[Inequality]:
+    """Yield that a centre sticks out of a convex region at most as far as the whole."""
+    for protrusion in outside:
+        inner, outer = protrusion.inner, protrusion.outer
+        if not isinstance(inner, Centre) or not isinstance(outer, RegionName):
+            continue
+        whole, outline = Protrusion(inner.term, outer), regions.get(outer.name)
+        if whole in outside and outline is not None and len(footprint_from_outline(outline).parts) == 1:
+            yield _law((protrusion, 1), (whole, -1))
 
 
 def _enlargement(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:

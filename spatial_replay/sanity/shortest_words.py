@@ -717,18 +717,23 @@ class SpecReading:
     reason: str = ""
 
 
-def reading_of(specification: Specification, name: str, formula: Formula) -> SpecReading:
+def reading_of(
+    specification: Specification, name: str, formula: Formula, rate_hz: float | None = None
+) -> SpecReading:
     """Return the automata that decide on a formula: one for each of the parts that have to hold together.
 
     Operators without an automaton are relaxed: a bounded `F` loses its bound, a past operator may hold or
     not. Runs are only ever added, so that what the looser reading excludes is excluded.
+
+    Args:
+        rate_hz: samples per second, which gives bounds in seconds an automaton.
     """
     reasons: list[str] = []
     satisfying: list[Side] = []
     violating: list[Side | None] = []
     for part in conjuncts(formula):
         try:
-            exact_automaton = automaton_of(specification, name, part)
+            exact_automaton = automaton_of(specification, name, part, rate_hz)
         except NoAutomatonError as error:
             reasons.append(error.reason)
             looser = _loosely(specification, name, part, positive=True)
@@ -767,14 +772,16 @@ def _is_always(formula: Temporal) -> bool:
     return formula.operator == "G" and formula.bound is None
 
 
-def automaton_of(specification: Specification, name: str, formula: Formula) -> Automaton:
+def automaton_of(
+    specification: Specification, name: str, formula: Formula, rate_hz: float | None = None
+) -> Automaton:
     """Return the automaton of a formula in the words of a specification.
 
     Raises:
         NoAutomatonError: as `automaton`.
     """
     alone = replace(specification, specs=(NamedSpec(name, formula),), source="")
-    return automaton(alone, name, compiler="own")
+    return automaton(alone, name, rate_hz=rate_hz, compiler="own")
 
 
 def _loosely(specification: Specification, name: str, formula: Formula, *, positive: bool) -> Side | None:

@@ -230,19 +230,27 @@ LONGEST = 3
 SYMBOLS = list(product([False, True], repeat=2))
 
 
+Word = tuple[tuple[bool, bool], ...]
+WORDS: list[Word] = [word for length in range(1, LONGEST + 1) for word in product(SYMBOLS, repeat=length)]
+
+
+def accepts(formula: object, word: Word) -> bool:
+    """Whether a run in which p and q are so satisfies a formula."""
+
+    def leaf(atom: NamedSpec, t: int) -> Interval:
+        name, operator, _ = atom.parameters
+        holds = word[t]["pq".index(name)] == (operator == ">=")
+        return Interval(1.0, 1.0) if holds else Interval(-1.0, -1.0)
+
+    times_ns = [10**9 * t for t in range(len(word))]
+    return Prefix(times_ns, leaf, goes_on=False).rho(formula, 0).low > 0
+
+
 def satisfying_lengths(formula: object) -> dict[bool, set[int]]:
     """The lengths of short runs that satisfy a formula about p and q, and violate it, by trying all."""
     lengths: dict[bool, set[int]] = {True: set(), False: set()}
-    for length in range(1, LONGEST + 1):
-        for word in product(SYMBOLS, repeat=length):
-
-            def leaf(atom: NamedSpec, t: int, word: tuple[tuple[bool, bool], ...] = word) -> Interval:
-                name, operator, _ = atom.parameters
-                holds = word[t]["pq".index(name)] == (operator == ">=")
-                return Interval(1.0, 1.0) if holds else Interval(-1.0, -1.0)
-
-            rho = Prefix([10**9 * t for t in range(length)], leaf, goes_on=False).rho(formula, 0).low
-            lengths[rho > 0].add(length)
+    for word in WORDS:
+        lengths[accepts(formula, word)].add(len(word))
     return lengths
 
 
@@ -271,6 +279,30 @@ def test_shortest_runs_are_found_exactly_where_there_are_runs(text: str) -> None
             assert not lengths[satisfied]
         verdict = sr.evaluate(specification, sr.Trace.from_samples(example.samples)).verdict
         assert verdict == ("satisfied" if satisfied else "violated")
+
+
+@examples(60)
+@given(_formulas(2), _formulas(2))
+def test_the_shortest_runs_distinguish_two_specifications(first: str, second: str) -> None:
+    pair = [sr.parse_specification(f"spec one = {text}\n") for text in (first, second)]
+    distinction = sr.distinguish(*pair)
+    runs = distinction.only_first, distinction.only_second
+    relations = {(False, False): "same", (True, False): "weaker", (False, True): "stricter"}
+    assert distinction.relation == relations.get(tuple(run is not None for run in runs), "different")
+    for run, (accepting, rejecting) in zip(runs, (pair, pair[::-1]), strict=True):
+        lengths = {
+            len(word)
+            for word in WORDS
+            if accepts(accepting.specs[0].formula, word) and not accepts(rejecting.specs[0].formula, word)
+        }
+        if run is None:
+            assert not lengths
+            continue
+        assert min(lengths, default=LONGEST + 1) in (len(run.sentences), LONGEST + 1)
+        assert run.samples is not None
+        trace = sr.Trace.from_samples(run.samples)
+        verdicts = [sr.evaluate(specification, trace).verdict for specification in (accepting, rejecting)]
+        assert verdicts == ["satisfied", "violated"]
 
 
 sums = st.dictionaries(st.sampled_from("xyzw"), st.sampled_from([-2, -1, 1, 2]), min_size=1, max_size=3)

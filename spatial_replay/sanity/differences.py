@@ -1,0 +1,243 @@
+"""The shortest runs that one of two specifications accepts and the other one rejects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from math import inf
+from types import MappingProxyType
+from typing import Any, Final, Literal, TypeAlias
+
+from spatial_replay.automata.ltlf import counts_seconds
+from spatial_replay.errors import UsageError
+from spatial_replay.lazy import Printed
+from spatial_replay.sanity.conditions import FactDiagrams
+from spatial_replay.sanity.examine import example_document, reason_of
+from spatial_replay.sanity.examples import Example, shortest_example
+from spatial_replay.sanity.shortest_words import (
+    Answer,
+    UndecidedError,
+    WordSearch,
+    joint,
+    reading_of,
+)
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import (
+    Boolean,
+    Formula,
+    NamedSpec,
+    Outline,
+    Specification,
+)
+from spatial_replay.spec.load import require_specification
+from spatial_replay.text import counted, named_arguments, number_text
+
+Relation: TypeAlias = Literal["same", "stricter", "weaker", "different", "unknown"]
+
+_RATES_HZ: Final = (1.0, 10.0)
+"""Samples per second at which bounds in seconds are compared."""
+
+_MEANINGS: Final[Mapping[Relation, str]] = MappingProxyType(
+    {
+        "same": "{first} and {second} accept the same runs",
+        "stricter": "{first} is stricter than {second}: it rejects runs that {second} accepts",
+        "weaker": "{first} is weaker than {second}: it accepts runs that {second} rejects",
+        "different": "{first} and {second} accept different runs",
+        "unknown": "it is not decided whether {first} and {second} accept the same runs",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Distinction(Printed):
+    """How the runs that two specifications accept differ; a specification accepts a run if all results do.
+
+    Attributes:
+        first, second: the names of the specifications.
+        relation: of the first to the second: "same", "stricter", "weaker", "different", or "unknown".
+        only_first: the shortest run that the first accepts and the second rejects; None if none was found.
+        only_second: the shortest run that the second accepts and the first rejects.
+        rates_hz: the samples per second at which runs were compared; empty if no bound is in seconds.
+        reason: why no run distinguishes them, or why that is not decided; "" otherwise.
+    """
+
+    first: str
+    second: str
+    relation: Relation
+    only_first: Example | None = None
+    only_second: Example | None = None
+    rates_hz: tuple[float, ...] = ()
+    reason: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """How they differ."""
+        meaning = _MEANINGS[self.relation].format(first=self.first, second=self.second)
+        rates = " and ".join(f"{number_text(rate)} Hz" for rate in self.rates_hz)
+        at_rates = f", at {rates}" if rates else ""
+        return f"{meaning}{at_rates}{f' ({self.reason})' if self.reason else ''}"
+
+    def lines(self) -> Iterator[str]:
+        """Yield how they differ, and the runs that show it."""
+        yield self.sentence
+        yield from _run_lines(self.first, self.second, self.only_first)
+        yield from _run_lines(self.second, self.first, self.only_second)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The distinction as values for JSON."""
+        return {
+            "first": self.first,
+            "second": self.second,
+            "relation": self.relation,
+            "sentence": self.sentence,
+            "rates_hz": self.rates_hz,
+            "only_first": example_document(self.only_first),
+            "only_second": example_document(self.only_second),
+        }
+
+
+def _run_lines(accepting: str, rejecting: str, example: Example | None) -> Iterator[str]:
+    if example is None:
+        return
+    length = counted(len(example.sentences), "sample")
+    note = f", in words only: {example.note}" if example.note else ""
+    yield ""
+    yield f"accepted by {accepting}, rejected by {rejecting}: {length}{note}"
+    number = 0
+    for sentence, samples in groupby(example.sentences):
+        last = number + len(list(samples)) - 1
+        yield f"  {number if number == last else f'{number}-{last}'}  {sentence}"
+        number = last + 1
+
+
+@named_arguments
+def distinguish(first: Specification, second: Specification, *, rate_hz: float | None = None) -> Distinction:
+    """Find the shortest runs that one specification accepts and the other one rejects.
+
+    Automata decide, together with laws of geometry, as in `doctor`.
+
+    Args:
+        rate_hz: samples per second, by which bounds in seconds are counted; 1 and then 10 without it.
+
+    Raises:
+        UsageError: not specifications, other places of one region, a rate that is not above 0.
+    """
+    specifications = first, second
+    for specification in specifications:
+        require_specification(specification)
+    if rate_hz is not None and not 0.0 < rate_hz < inf:
+        raise UsageError(f"a rate of {rate_hz!r} Hz; give samples a second, above 0")
+    together = _together(first, second)
+    names = _names(specifications)
+    formulas = tuple(spec.formula for spec in together.specs)
+    if format_formula(formulas[0]) == format_formula(formulas[1]):
+        return Distinction(*names, "same", reason="they are the same formula")
+    rates: Sequence[float | None] = (None,)
+    if any(map(counts_seconds, formulas)):
+        rates = _RATES_HZ if rate_hz is None else (rate_hz,)
+    distinctions = []
+    for rate in rates:
+        distinction = _Comparison(together, rate).distinction(*names)
+        if distinction.relation not in ("same", "unknown"):
+            return distinction
+        distinctions.append(distinction)
+    *_, last = sorted(distinctions, key=lambda distinction: distinction.relation == "unknown")
+    return replace(last, rates_hz=tuple(rate for rate in rates if rate is not None))
+
+
+def _names(specifications: Sequence[Specification]) -> tuple[str, str]:
+    first, second = (specification.filename for specification in specifications)
+    return (first, second) if first != second else ("the first", "the second")
+
+
+def _together(first: Specification, second: Specification) -> Specification:
+    """Return a specification with all of both: one spec for each.
+
+    Raises:
+        UsageError: they have no result, or a template, or another place of one region.
+    """
+    regions: dict[str, Outline] = {**first.regions, **second.regions}
+    for name, outline in first.regions.items():
+        if regions[name] != outline:
+            raise UsageError(
+                f"region {name} is not the same in {first.filename} and {second.filename}; "
+                "write the same numbers in both, or give the regions two names"
+            )
+    specs = []
+    for name, specification in zip(("first", "second"), (first, second), strict=True):
+        for spec in specification.results:
+            if spec.parameter is not None:
+                raise UsageError(
+                    f"{spec.name}({spec.parameter}) is a template; write forall {spec.parameter} in a group"
+                )
+        formulas = tuple(spec.formula for spec in specification.results)
+        if not formulas:
+            raise UsageError(f"{specification.filename} has no result; give it a spec")
+        specs.append(NamedSpec(name, formulas[0] if len(formulas) == 1 else Boolean("and", formulas)))
+    return replace(first, specs=tuple(specs), regions=regions, source="")
+
+
+class _Comparison:
+    """Both directions of one comparison, at one rate."""
+
+    def __init__(self, together: Specification, rate_hz: float | None) -> None:
+        self._specification, self._rate_hz = together, rate_hz
+        formulas = [spec.formula for spec in together.specs]
+        self._search = WordSearch(FactDiagrams(formulas, together.regions))
+        self._readings = [reading_of(together, spec.name, spec.formula, rate_hz) for spec in together.specs]
+
+    def distinction(self, first: str, second: str) -> Distinction:
+        ways = [self._difference(0, 1), self._difference(1, 0)]
+        runs = [way if isinstance(way, Example) else None for way in ways]
+        answers = [way for way in ways if isinstance(way, Answer)]
+        obstacles = [way for way in ways if isinstance(way, str)]
+        relation: Relation = "same"
+        if all(runs) or (any(runs) and obstacles):
+            relation = "different"
+        elif any(runs):
+            relation = "weaker" if runs[0] else "stricter"
+        elif obstacles:
+            relation = "unknown"
+        reason = ""
+        if obstacles:
+            reason = obstacles[0]
+            if any(runs):
+                # whether there is one the other way round is not known
+                accepting, rejecting = (second, first) if runs[0] else (first, second)
+                reason = f"not decided is whether {accepting} accepts runs that {rejecting} rejects: {reason}"
+        elif relation == "same":
+            reason = reason_of(joint(answers))
+        rates = () if self._rate_hz is None else (self._rate_hz,)
+        return Distinction(first, second, relation, runs[0], runs[1], rates, reason)
+
+    def _difference(self, accepting: int, rejecting: int) -> Example | Answer | str:
+        """Return a run that only one accepts, the answer that there is none, or why that is unknown."""
+        accepted, rejected = self._readings[accepting], self._readings[rejecting]
+        obstacle = accepted.reason or rejected.reason
+        if accepted.satisfying is None or rejected.violating is None:
+            return obstacle
+        runs = accepted.satisfying, rejected.violating
+        try:
+            answer = self._search.shortest(*runs)
+        except UndecidedError:
+            return "it takes too many steps"
+        if answer.word is None:
+            return answer
+        length = len(answer.word)
+        example = shortest_example(
+            self._specification,
+            NamedSpec("difference", self._difference_formula(accepting, rejecting)),
+            self._search,
+            answer.word,
+            True,
+            is_exact=not obstacle,
+            rate_hz=self._rate_hz,
+            another=lambda avoided: self._search.another(length, avoided, *runs),
+        )
+        return example or obstacle
+
+    def _difference_formula(self, accepting: int, rejecting: int) -> Formula:
+        specs = self._specification.specs
+        return Boolean("and", (specs[accepting].formula, Boolean("not", (specs[rejecting].formula,))))
