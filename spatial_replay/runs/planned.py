@@ -20,9 +20,9 @@ from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.logs.messages import BEHAVIOUR_TREE, PLAN_METADATA, protobuf_channel
+from spatial_replay.logs.behaviour_tree import TREE_CHANNEL, TreeTick
+from spatial_replay.logs.messages import PLAN_METADATA
 from spatial_replay.logs.output_file import Durability
-from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
 from spatial_replay.planning.decisions import Kind, Outcome, Step, sentence_of
@@ -32,14 +32,11 @@ from spatial_replay.runs.scripted import RunLog, about_run, refuse_unknown_names
 from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop, default_specification, make_world
-from spatial_replay.simulation.world import Conditions, TreeTick
+from spatial_replay.simulation.world import Conditions
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas
 from spatial_replay.trace.trace import Sample
-
-_TREES = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
-
 
 _PRESETS: Final[Mapping[Skill, Mapping[str, float]]] = MappingProxyType(
     {
@@ -127,11 +124,7 @@ def execute_in(world: Tabletop, settings: Settings, step: Step) -> Outcome:
 
 def _log_tick(log: RunLog, tick: TreeTick, time_ns: int) -> None:
     """Log a tick of the robot's behaviour tree, with the newest sample."""
-    message = BehaviourTree(time_ns=time_ns, tick=tick.number)
-    for node in tick.nodes:
-        status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
-        message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
-    log.write_payload(_TREES, log.newest_ns, message.SerializeToString(deterministic=True))
+    log.write_payload(TREE_CHANNEL, log.newest_ns, tick.payload(time_ns))
 
 
 @dataclass(frozen=True, slots=True)

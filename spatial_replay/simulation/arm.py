@@ -13,9 +13,10 @@ import numpy as np
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
+from spatial_replay.logs.behaviour_tree import TreeTick
 from spatial_replay.planning.decisions import Outcome, Stage, points_along
 from spatial_replay.simulation.bullet import REST, STEPS_PER_S, Engine, downwards, joints_for, tool_frame
-from spatial_replay.simulation.world import Body, Box, Pose, TreeTick, footprint, height, rectangle
+from spatial_replay.simulation.world import Body, Box, Pose, footprint, height, rectangle
 
 TICKS_PER_S = 60
 """Commands of the arm per second."""

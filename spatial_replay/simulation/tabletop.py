@@ -14,6 +14,7 @@ import numpy as np
 
 from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.logs.behaviour_tree import TreeTick
 from spatial_replay.planning.decisions import Outcome
 from spatial_replay.planning.settings import Skill
 from spatial_replay.simulation.arm import (
@@ -36,7 +37,6 @@ from spatial_replay.simulation.world import (
     Injection,
     Pose,
     Start,
-    TreeTick,
     footprint,
     height,
 )

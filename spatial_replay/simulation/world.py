@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias, TypedDict, get_args
+from typing import Literal, TypeAlias, TypedDict, get_args
 
 import numpy as np
 
@@ -147,28 +147,6 @@ class Body:
     shape: Shape
     movable: bool = True
     support: bool = False
-
-
-class TreeNode(NamedTuple):
-    """A node of a behaviour tree.
-
-    Attributes:
-        kind: such as Sequence, Selector, Retry, or Action for a leaf.
-        parent: place of the node above among the nodes; None for the root.
-        status: RUNNING, SUCCESS or FAILURE; INVALID if it was not ticked since the tree began or was reset.
-    """
-
-    name: str
-    kind: str
-    parent: int | None
-    status: str
-
-
-class TreeTick(NamedTuple):
-    """A behaviour tree after a tick that changed the status of a node: depth first, children in order."""
-
-    number: int
-    nodes: tuple[TreeNode, ...]
 
 
 # ------------------------------------------------------------------------------- starts and injected failures

@@ -8,8 +8,8 @@ import pytest
 
 from simulation.worlds import off, world
 from spatial_replay import Trace, evaluate
+from spatial_replay.logs.behaviour_tree import TreeTick
 from spatial_replay.simulation.tabletop import default_specification
-from spatial_replay.simulation.world import TreeTick
 
 
 def test_the_pushing_script_satisfies_its_specification() -> None:

@@ -1,7 +1,6 @@
 """A place at a table, and a robot that sets it: fork, knife and spoon beside the plate, a cup behind it.
 
-The robot places bodies by a behaviour tree: detect, pick, carry, place, and recover from failures. This is
-the only module that knows py_trees.
+The robot places bodies by a behaviour tree: detect, pick, carry, place, and recover from failures.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from py_trees.behaviour import Behaviour
 from py_trees.common import Status
 from py_trees.decorators import Retry
 
+from spatial_replay.logs.behaviour_tree import TreeNode, TreeTick, tree_nodes
 from spatial_replay.planning.decisions import Outcome, Stage
 from spatial_replay.simulation.arm import (
     Grasp,
@@ -27,7 +27,7 @@ from spatial_replay.simulation.arm import (
     set_down,
 )
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import Body, Box, Cylinder, TreeNode, TreeTick
+from spatial_replay.simulation.world import Body, Box, Cylinder
 
 # ----------------------------------------------------------------------------------------- the behaviour tree
 
@@ -67,19 +67,10 @@ class _Ticks:
 
     def tick(self) -> None:
         self._tree.tick_once()
-        nodes = tuple(_nodes(self._tree, None, []))
+        nodes = tree_nodes(self._tree)
         if nodes != self._reported:
             self._scene.report_tick(TreeTick(self._count, nodes))
         self._reported, self._count = nodes, self._count + 1
-
-
-def _nodes(tree: Behaviour, parent: int | None, found: list[TreeNode]) -> list[TreeNode]:
-    kind = type(tree).__name__ if tree.children else "Action"
-    place = len(found)
-    found.append(TreeNode(tree.name, kind, parent, tree.status.name))
-    for child in tree.children:
-        _nodes(child, place, found)
-    return found
 
 
 class _Blackboard:

@@ -1,0 +1,63 @@
+"""Behaviour trees as messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, Protocol
+
+from spatial_replay.logs.messages import BEHAVIOUR_TREE, protobuf_channel
+from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+
+TREE_CHANNEL: Final = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
+
+
+class TreeNode(NamedTuple):
+    """A node of a behaviour tree.
+
+    Attributes:
+        kind: such as Sequence, Selector, Retry, or Action for a leaf; empty if the log does not say.
+        parent: index of the node above among the nodes; None for the root, or if the log does not say.
+        status: RUNNING, SUCCESS or FAILURE; INVALID if it was not ticked since the tree began or was reset.
+    """
+
+    name: str
+    kind: str
+    parent: int | None
+    status: str
+
+
+class TreeTick(NamedTuple):
+    """A behaviour tree after a tick that changed the status of a node: depth first, children in order."""
+
+    number: int | None
+    nodes: tuple[TreeNode, ...]
+
+    def payload(self, time_ns: int) -> bytes:
+        """Return the message of this tick at a time on the clock of the samples."""
+        message = BehaviourTree(time_ns=time_ns, tick=self.number)
+        for node in self.nodes:
+            status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
+            message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
+        return message.SerializeToString(deterministic=True)
+
+
+class Behaviour(Protocol):
+    """The part of a behaviour of py_trees that is logged."""
+
+    name: str
+    status: Any
+
+    @property
+    def children(self) -> Sequence[Any]: ...
+
+
+def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
+    """Return the nodes of a tree of py_trees."""
+    nodes: list[TreeNode] = []
+    branches: list[tuple[int | None, Behaviour]] = [(None, root)]
+    while branches:
+        parent, behaviour = branches.pop()
+        kind = type(behaviour).__name__ if behaviour.children else "Action"
+        branches += [(len(nodes), child) for child in reversed(behaviour.children)]
+        nodes.append(TreeNode(behaviour.name, kind, parent, behaviour.status.name))
+    return tuple(nodes)
