@@ -621,6 +621,11 @@ class SampleWriter:
         if self._queue.qsize() >= self._enough:
             self._ring()
 
+    @property
+    def newest_ns(self) -> int | None:
+        """Time of the newest sample; None before the first."""
+        return None if self._last_ns < 0 else self._last_ns
+
     def miss(self, sample: Sample) -> None:
         """Count a sample that is left out."""
         self.dropped += 1
