@@ -1,13 +1,15 @@
-"""A planner inside a behaviour tree of py_trees."""
+"""A planner inside a behaviour tree of py_trees, and behaviour trees in bags of Nav2."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import spatial_replay as sr
+from bags.bag_files import write_ros2
 from spatial_replay.logs.messages import BEHAVIOUR_TREE
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.planning import Grid, Workspace, moved_object, read_decisions
@@ -139,3 +141,95 @@ def test_a_step_fails_that_the_planner_stops_or_a_parent_interrupts(tmp_path: Pa
     reasons = [decision.outcome.reason for decision in read_decisions(log).decisions if decision.kind == 1]
     assert next(filter(None, stops)) == reasons[0]
     assert reasons[-1] == "set the table was interrupted"
+
+
+NAV2 = {
+    "nav2_msgs/msg/BehaviorTreeStatusChange": (
+        "builtin_interfaces/Time timestamp\nstring node_name\nuint16 uid\nstring previous_status\n"
+        "string current_status\n"
+    ),
+    "nav2_msgs/msg/BehaviorTreeLog": (
+        "builtin_interfaces/Time timestamp\nBehaviorTreeStatusChange[] event_log\n"
+    ),
+}
+NAMES = (
+    "builtin_interfaces/msg/Time",
+    "geometry_msgs/msg/Point",
+    "geometry_msgs/msg/Quaternion",
+    "geometry_msgs/msg/Pose",
+    "std_msgs/msg/Header",
+    "geometry_msgs/msg/PoseStamped",
+    *NAV2,
+)
+MAPPING = "topics:\n  /pose: {name: robot, shape: {disc: 0.2}}\n"
+NEAR = sr.parse_specification("G robot dist robot <= 1")
+
+
+def nav2_bag(folder: Path, logs: Sequence[tuple[str, float, Sequence[tuple[str, int, str]]]]) -> Path:
+    """A bag of ROS 2 of a robot that drives along x for two seconds, and of logs of behaviour trees."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in NAV2.items():
+        types.register(get_types_from_msg(text, name))
+    time, point, quaternion, pose, header, stamped, change, log = (types.types[name] for name in NAMES)
+    sent = []
+    for number in range(21):
+        place = pose(point(0.1 * number, 0.0, 0.0), quaternion(0.0, 0.0, 0.0, 1.0))
+        content = stamped(header(time(100 + number // 10, number % 10 * 10**8), "map"), place)
+        sent.append(("/pose", NAMES[5], number * 10**8, content))
+    for topic, seconds, nodes in logs:
+        # events count on the wall's clock, messages on that of the robot
+        events = [change(time(1_700_000_000, 0), name, uid, "IDLE", status) for name, uid, status in nodes]
+        content = log(time(100 + int(seconds), int(seconds % 1 * 1e9)), events)
+        sent.append((topic, NAMES[7], int(seconds * 1e9), content))
+    return write_ros2(folder, sorted(sent, key=lambda message: message[2]), typestore=types)
+
+
+def statuses(tick: BehaviourTree) -> dict[str, str]:
+    return {node.name: BehaviourTree.Status.Name(node.status).removeprefix("STATUS_") for node in tick.nodes}
+
+
+def test_a_replay_of_a_bag_has_the_ticks_of_nav2_on_the_clock_of_the_samples(tmp_path: Path) -> None:
+    topic = "/behavior_tree_log"
+    bag = nav2_bag(
+        tmp_path / "drive",
+        [
+            (topic, 0.5, [("Navigate", 1, "RUNNING"), ("FollowPath", 3, "RUNNING")]),
+            (topic, 1.25, [("Plan", 2, "SUCCESS"), ("FollowPath", 3, "FAILURE")]),
+            (topic, 1.5, [("FollowPath", 3, "IDLE"), ("Spin", 4, "SKIPPED")]),
+            # another tree numbers its nodes anew
+            (topic, 1.75, [("Dock", 1, "RUNNING")]),
+        ],
+    )
+    (tmp_path / "drive.yaml").write_text(MAPPING)
+    log, again = tmp_path / "drive.mcap", tmp_path / "again.mcap"
+    replayed = sr.replay_log(bag, NEAR, output=log, mapping=tmp_path / "drive.yaml")
+    ticks = ticks_of(log)
+    assert [(tick.time_ns, statuses(tick)) for tick in ticks] == [
+        (500_000_000, {"Navigate": "RUNNING", "FollowPath": "RUNNING"}),
+        (1_250_000_000, {"Navigate": "RUNNING", "Plan": "SUCCESS", "FollowPath": "FAILURE"}),
+        (
+            1_500_000_000,
+            {"Navigate": "RUNNING", "Plan": "SUCCESS", "FollowPath": "INVALID", "Spin": "INVALID"},
+        ),
+        (1_750_000_000, {"Dock": "RUNNING"}),
+    ]
+    assert sr.replay_log(log, NEAR, output=again).certificate == replayed.certificate
+    assert ticks_of(again) == ticks
+
+
+def test_the_trees_of_two_robots_have_a_root_each_on_the_clock_of_headers(tmp_path: Path) -> None:
+    changes = {"/a/behavior_tree_log": "RUNNING", "/b/behavior_tree_log": "FAILURE"}
+    bag = nav2_bag(
+        tmp_path / "drive", [(topic, 1.0, [("Drive", 1, status)]) for topic, status in changes.items()]
+    )
+    (tmp_path / "drive.yaml").write_text(f"clock: header\n{MAPPING}")
+    log = tmp_path / "drive.mcap"
+    sr.replay_log(bag, NEAR, output=log, mapping=tmp_path / "drive.yaml")
+    *_, last = ticks_of(log)
+    assert last.time_ns == 101 * 10**9
+    assert [(node.name, node.parent, node.status) for node in last.nodes] == [
+        ("/a/behavior_tree_log", 0, BehaviourTree.STATUS_RUNNING),
+        ("Drive", 0, BehaviourTree.STATUS_RUNNING),
+        ("/b/behavior_tree_log", 0, BehaviourTree.STATUS_RUNNING),
+        ("Drive", 2, BehaviourTree.STATUS_FAILURE),
+    ]

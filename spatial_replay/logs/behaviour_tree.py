@@ -1,4 +1,4 @@
-"""Behaviour trees as messages."""
+"""Behaviour trees as messages: ticks of py_trees, and the log of Nav2's behaviour trees."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from spatial_replay.logs.messages import BEHAVIOUR_TREE, protobuf_channel
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 
 TREE_CHANNEL: Final = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
+
+NAV2_LOG: Final = "nav2_msgs/msg/BehaviorTreeLog"
+"""The type of Nav2's messages about its behaviour tree."""
 
 
 class TreeNode(NamedTuple):
@@ -61,3 +64,27 @@ def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
         branches += [(len(nodes), child) for child in reversed(behaviour.children)]
         nodes.append(TreeNode(behaviour.name, kind, parent, behaviour.status.name))
     return tuple(nodes)
+
+
+class Nav2Tree:
+    """The nodes of a tree of Nav2, from its log of status changes.
+
+    The log names no parents. Nodes have the order of their numbers, which is depth first. Older versions of
+    Nav2 number none; then nodes have the order of their first change.
+    """
+
+    def __init__(self) -> None:
+        self._nodes: dict[int | str, TreeNode] = {}
+
+    def add(self, log: Any) -> tuple[TreeNode, ...]:
+        """Take a message of type `NAV2_LOG`, and return the nodes after it."""
+        for change in log.event_log:
+            key = getattr(change, "uid", change.node_name)
+            if key in self._nodes and self._nodes[key].name != change.node_name:
+                # another tree was loaded, and numbers its nodes anew
+                self._nodes.clear()
+            is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
+            status = change.current_status if is_active else "INVALID"
+            self._nodes[key] = TreeNode(change.node_name, "", None, status)
+        keys = sorted(self._nodes, key=lambda key: key if isinstance(key, int) else 0)
+        return tuple(self._nodes[key] for key in keys)

@@ -12,6 +12,7 @@ from functools import cache, cached_property, partial
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from spatial_replay.bags.open import files_of_bag_around, open_messages
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_pieces, without_jumps
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import concatenated, select
+from spatial_replay.logs.behaviour_tree import NAV2_LOG, TREE_CHANNEL, Nav2Tree, TreeNode, TreeTick
 from spatial_replay.logs.messages import (
     MAPPED,
     METADATA,
@@ -28,16 +30,18 @@ from spatial_replay.logs.messages import (
     Channel,
     FileSource,
     Messages,
+    Row,
     copied_channel,
     has_our_type,
     is_kept,
+    merge,
     noting_pauses,
     remarks_on_copies,
 )
 from spatial_replay.logs.read_options import FaultList, late_ns
 from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.mapping.assemble import Assembler
-from spatial_replay.mapping.mapping_file import LogMapping
+from spatial_replay.mapping.mapping_file import Clock, LogMapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
@@ -101,8 +105,9 @@ class MappedSource(FileSource):
         mapped = frozenset(plan.topics)
         names = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
         channels = _foreign_channels(reader, names)
-        copied = _CopiedMessages(channels)
-        read = mapped | copied.topics
+        trees = _TreeLog(reader, topics, self.mapping.clock)
+        copied = _CopiedMessages(channels, trees)
+        read = mapped | copied.topics | trees.topics
         first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
         moving = {topic.topic for topic in plan.planned if not topic.is_static}
         read_end_ns = FOREVER if end_ns is None or not plan.by_log_time else end_ns + plan.margin_ns
@@ -226,6 +231,7 @@ class _Blocks:
         remarks = (*self.remarks, *self.reader.take_remarks(), *self.assembler.take_remarks())
         self.remarks = []
         copied = self.copied.passed_on(messages, trace, last=last)
+        self.copied.trees.faults.move_to(self.faults)
         doubts = self.assembler.take_doubts()
         facts = self.assembler.facts if last else ()
         if len(trace) or len(copied) or faults or remarks or doubts or facts:
@@ -235,13 +241,15 @@ class _Blocks:
 class _CopiedMessages:
     """Holds raw messages until the samples made of them are ready, and returns them in the order of time."""
 
-    def __init__(self, channels: Mapping[int, Channel]) -> None:
+    def __init__(self, channels: Mapping[int, Channel], trees: _TreeLog) -> None:
         """Hold nothing yet.
 
         Args:
             channels: as the log has them, by the numbers of its columns.
+            trees: makes further messages.
         """
         self.topics = frozenset(channel.topic for channel in channels.values())
+        self.trees = trees
         self._numbers = list(channels)
         self._channels = MappingProxyType(
             {number: copied_channel(channel) for number, channel in channels.items()}
@@ -254,9 +262,7 @@ class _CopiedMessages:
 
         Beyond a number of bytes all are returned, because log times and header stamps may be far apart.
         """
-        messages = messages.of_topics(self.topics)
-        # a topic may have a channel of ours, too
-        messages = select(messages, np.flatnonzero(np.isin(messages.channel, self._numbers)))
+        messages = messages.of_topics(self.topics | self.trees.topics)
         self._waiting.append(messages)
         self._waiting_bytes += sum(map(len, messages.payloads))
         is_all = last or self._waiting_bytes > _WAITING_BYTES
@@ -270,7 +276,55 @@ class _CopiedMessages:
         evaluated, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
-        return evaluated.raw(self._channels)
+        # a topic may have a channel of ours, too
+        copied = select(evaluated, np.flatnonzero(np.isin(evaluated.channel, self._numbers)))
+        ticks = self.trees.ticks(evaluated)
+        raw = copied.raw(self._channels)
+        return merge([raw, ticks]) if len(ticks) else raw
+
+
+class _TreeLog:
+    """Makes ticks of the logs of Nav2's behaviour trees, on the clock of the mapping."""
+
+    def __init__(self, reader: MessageReader, topics: Iterable[Topic], clock: Clock) -> None:
+        logs = [topic for topic in topics if topic.type == NAV2_LOG and topic.unreadable is None]
+        self.topics = frozenset(topic.name for topic in logs)
+        self.faults = FaultList()
+        self._channels = reader.channels(self.topics) if logs else {}
+        self._decoders = {topic.name: reader.decoder(topic) for topic in logs}
+        self._trees = {topic: Nav2Tree() for topic in sorted(self.topics)}
+        self._nodes: dict[str, tuple[TreeNode, ...]] = {}
+        self._clock = clock
+        self._count = 0
+
+    def ticks(self, messages: MessageColumns) -> Messages:
+        """Return a tick for each message of a tree's log."""
+        rows = []
+        logs = select(messages, np.flatnonzero(np.isin(messages.channel, list(self._channels))))
+        for message in replace(logs, channels=self._channels).messages():
+            try:
+                log: Any = self._decoders[message.topic](message.payload)
+            except LogError as error:
+                self.faults.add(f"{message.topic}: {error}")
+                continue
+            header_ns = log.timestamp.sec * 10**9 + log.timestamp.nanosec
+            times_ns = {"log": message.log_time_ns, "publish": message.publish_time_ns, "header": header_ns}
+            self._nodes[message.topic] = self._trees[message.topic].add(log)
+            payload = self._tick().payload(times_ns[self._clock])
+            rows.append(Row(0, self._count, message.log_time_ns, message.publish_time_ns, payload))
+            self._count += 1
+        return Messages.from_rows({0: TREE_CHANNEL}, rows)
+
+    def _tick(self) -> TreeTick:
+        """Return the newest nodes; of several trees, each has a root with the name of its topic."""
+        if len(self.topics) == 1:
+            return TreeTick(None, *self._nodes.values())
+        nodes: list[TreeNode] = []
+        for topic in sorted(self._nodes):
+            root = len(nodes)
+            nodes.append(TreeNode(topic, "Tree", None, "RUNNING"))
+            nodes += [node._replace(parent=root) for node in self._nodes[topic]]
+        return TreeTick(None, tuple(nodes))
 
 
 def _first_ns(
