@@ -359,7 +359,7 @@ def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneMo
     Raises:
         LogError: XML that is broken or too large, or no model of MuJoCo.
     """
-    return _compiled(_source_without_files(text, place) if assets is None else _source(text, place, assets))
+    return _compile(_source_without_files(text, place) if assets is None else _source(text, place, assets))
 
 
 def identity_of_model(model: Path | None, assets: Path | None) -> str:
@@ -383,7 +383,7 @@ def identity_of_model(model: Path | None, assets: Path | None) -> str:
 
 
 class _ModelSource(NamedTuple):
-    """What a model is compiled from: XML, the content of files by their names, remarks on lost ones."""
+    """The source of a model: XML, the content of files by their names, and remarks on lost ones."""
 
     place: str
     xml: str
@@ -408,7 +408,7 @@ def _source_without_files(text: str, place: str) -> _ModelSource:
 
 
 @lru_cache(maxsize=4)
-def _compiled(source: _ModelSource) -> SceneModel:
+def _compile(source: _ModelSource) -> SceneModel:
     with importing("models of MuJoCo need mujoco", extra="mujoco"):
         import mujoco
     try:
