@@ -21,7 +21,11 @@ yaws = st.floats(-3.0, 3.0, allow_nan=False)
 tilts = st.one_of(st.just(0.0), st.floats(-math.pi, math.pi, allow_nan=False))
 
 
-@given(starts=st.lists(yaws, min_size=1, max_size=3), tilt=tilts)
+turned = st.lists(yaws, min_size=1, max_size=3).filter(lambda starts: max(map(abs, starts)) > 0.1)
+"""Of bodies of which one at least is turned: (0, 0, 0, 1) alone fits both orders."""
+
+
+@given(starts=turned, tilt=tilts)
 def test_both_orders_of_quaternions_give_one_pose(starts: list[float], tilt: float) -> None:
     """A body that stands upright at the start may tilt later, about the x axis."""
     upright = [[0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)] for yaw in starts]
