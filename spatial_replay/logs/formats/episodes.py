@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Set as AbstractSet
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +16,7 @@ import numpy as np
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.text import counted
+from spatial_replay.text import counted, listed, nearest_hint
 from spatial_replay.trace.trace import LATEST_NS
 
 
@@ -127,7 +129,9 @@ AS_STORED: Final = EpisodeReading()
 
 
 class DataSet:
-    """A robot-learning data set: a folder or a file with episodes.
+    """A robot-learning data set: a folder or a file with episodes, whose arrays have names.
+
+    A format reads the arrays of an episode (`open_episode`, `read`, `count_states`) and finds its `poses`.
 
     Attributes:
         path: of the folder or file.
@@ -140,6 +144,7 @@ class DataSet:
         label: None without a label.
         remarks: messages about the whole data set.
         names_bodies: whether it names its bodies, so that no mapping is needed.
+        always_read: arrays that `poses` needs.
     """
 
     path: Path
@@ -152,6 +157,7 @@ class DataSet:
     label: Label | None = None
     remarks: tuple[str, ...] = ()
     names_bodies: bool = False
+    always_read: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -161,7 +167,7 @@ class DataSet:
     def columns(
         self, number: int, reading: EpisodeReading = AS_STORED, features: Sequence[str] | None = None
     ) -> EpisodeColumns:
-        """Read an episode; the files of the last one stay in memory.
+        """Read an episode.
 
         Args:
             number: of the episode.
@@ -171,7 +177,21 @@ class DataSet:
             UsageError: no such episode, or the mapping has to say something, such as `fps`.
             LogError: the data cannot be read.
         """
-        raise NotImplementedError
+        episode = self.episode(number)
+        names = [feature.name for feature in self.features if feature.width] if features is None else features
+        with self.open_episode(episode) as group:
+            arrays = self.read(group, {*names, *self.always_read, *self._label_names(reading)})
+            count = self.count_states(episode, group, arrays)
+            columns = self.poses(episode, group, arrays, count, reading)
+            success = self._success(episode, group, arrays, count, reading)
+        values, remarks = dict[str, Floats](), list(columns.remarks)
+        for name in names:
+            if name in arrays and len(arrays[name]) in (count, count - 1):
+                values[name] = _with_last(arrays[name], count)
+            elif name in arrays:
+                rows = counted(len(arrays[name]), "row")
+                remarks.append(f"{name} has {rows} for {count} states; it is not read")
+        return replace(columns, features=values, success=success, remarks=tuple(remarks))
 
     def success(self, number: int, reading: EpisodeReading = AS_STORED) -> Booleans | None:
         """Read the label of an episode, see `EpisodeColumns.success`; no pose is read.
@@ -179,10 +199,58 @@ class DataSet:
         Raises:
             UsageError, LogError: see `columns`.
         """
-        # labels need no times
-        return self.columns(
-            number, reading._replace(fps=reading.fps or self.fps or 1.0, model=None), ()
-        ).success
+        episode = self.episode(number)
+        with self.open_episode(episode) as group:
+            arrays = self.read(group, {*self.always_read, *self._label_names(reading)})
+            count = self.count_states(episode, group, arrays)
+            return self._success(episode, group, arrays, count, reading)
+
+    def open_episode(self, episode: Episode) -> AbstractContextManager[Any]:
+        """Return what the arrays of an episode are read from, as a context.
+
+        Raises:
+            LogError: it cannot be read.
+        """
+        raise NotImplementedError
+
+    def read(self, group: Any, names: AbstractSet[str]) -> dict[str, Floats]:
+        """Return the arrays of some names, (T,) or (T, W) each; those without numbers are left out."""
+        raise NotImplementedError
+
+    def count_states(self, episode: Episode, group: Any, arrays: Mapping[str, Floats]) -> int:
+        """Return the number of states; an array of steps may have one row less."""
+        raise NotImplementedError
+
+    def poses(
+        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
+    ) -> EpisodeColumns:
+        """Return the times of all states, with bodies and messages."""
+        frames: Integers = np.arange(count, dtype=np.int64)
+        return EpisodeColumns(frame_times_ns(frames, self.required_fps(reading)))
+
+    def whole_label(self, episode: Episode, group: Any, label: str) -> bool | None:
+        """Return the label of an episode that has no array of labels; None without one."""
+        return None
+
+    def _label_names(self, reading: EpisodeReading) -> list[str]:
+        name = reading.label or (self.label.field if self.label else None)
+        return [] if name is None else [name]
+
+    def _success(
+        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
+    ) -> Booleans | None:
+        """Return the label of an episode: of each state, or of all; None without one."""
+        for label in self._label_names(reading):
+            if label in arrays:
+                return _success_of_states(arrays[label], count, f"{self.name}: {label}")
+            value = self.whole_label(episode, group, label)
+            if value is not None:
+                return np.array(value)
+            if reading.label is not None and self.feature(label) is None:
+                names = [feature.name for feature in self.features]
+                hint = nearest_hint(label, names) or f"it has {listed(names)}"
+                raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
+        return None
 
     def files(self, number: int) -> list[Path]:
         """Return the files that an episode depends on: all of the data set, unless its format knows better.
@@ -235,6 +303,31 @@ class DataSet:
         return fps
 
 
+MOST_BYTES: Final = 8 * 2**30
+"""Bytes of the numbers that are read at once, uncompressed."""
+SECOND_RUN: Final = "more than one run is in the episode, so it is not judged; record each run as an episode"
+
+
+def _with_last(values: Floats, count: int) -> Floats:
+    """Return an array of steps with a row of NaN in the state after the last step."""
+    lost = count - len(values)
+    return values if not lost else np.concatenate([values, np.full((lost, *values.shape[1:]), np.nan)])
+
+
+def _success_of_states(labels: Floats, count: int, place: str) -> Booleans:
+    """Return the label (T,) of each state; a label of a step is about the state after it.
+
+    Raises:
+        LogError: there are neither as many labels as states, nor one less.
+    """
+    is_success = _as_label(labels, place)
+    if len(labels) == count - 1:
+        return np.concatenate([[False], is_success])
+    if len(labels) != count:
+        raise LogError(f"{place} has {counted(len(labels), 'row')} for {counted(count, 'state')}")
+    return is_success
+
+
 def frame_times_ns(frames: Integers, fps: float) -> Integers:
     """Return the times of frames (T,), exact to the nearest nanosecond.
 
@@ -249,13 +342,18 @@ def frame_times_ns(frames: Integers, fps: float) -> Integers:
     return np.array([round(frame * period) for frame in frames.tolist()], np.int64)
 
 
+def integer_or_none(value: object) -> int | None:
+    """Return an integer of metadata; None for anything else."""
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
 def natural_key(name: str) -> tuple[Any, ...]:
     """Return a key that sorts `demo_2` before `demo_10`."""
     digits = name[len(name.rstrip("0123456789")) :]
     return (name[: len(name) - len(digits)], int(digits or -1), name)
 
 
-def as_label(values: Floats, place: str) -> Booleans:
+def _as_label(values: Floats, place: str) -> Booleans:
     """Return the label (T,) of each row of a column (T, …): whether it holds a number above 0.
 
     Raises:

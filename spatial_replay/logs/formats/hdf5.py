@@ -1,32 +1,21 @@
-"""Robot-learning data sets in HDF5: ManiSkill, Isaac Lab, robosuite with robomimic and LIBERO, and D4RL."""
+"""Data sets in HDF5 with a group for each episode: ManiSkill, Isaac Lab, robosuite, robomimic and LIBERO."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from collections.abc import Set as AbstractSet
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.logs.formats.archive import (
-    SIGNATURE,
-    arrays_in,
-    attribute,
-    integer_attribute,
-    json_attribute,
-    member,
-    names_in,
-    numbers,
-    open_archive,
-    row_count,
-    text_attribute,
-    width_of,
-)
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.formats.archive import Group, numbers, open_archive, row_count, width_of
 from spatial_replay.logs.formats.episodes import (
-    AS_STORED,
+    SECOND_RUN,
     Body,
     DataSet,
     Episode,
@@ -34,91 +23,206 @@ from spatial_replay.logs.formats.episodes import (
     EpisodeReading,
     Feature,
     Label,
-    as_label,
     frame_times_ns,
+    integer_or_none,
     natural_key,
     quaternion_order,
 )
-from spatial_replay.logs.formats.grouped import (
-    GroupedEpisodes,
-    episode_group,
-    first_group,
-    mapping_or_empty,
-    pose_rows,
-    unit_quaternions,
-)
 from spatial_replay.logs.formats.mujoco import model_from_file, model_from_xml
+from spatial_replay.logs.formats.steps import D4rl
 from spatial_replay.logs.formats.tables import read_json
-from spatial_replay.text import counted, listed, nearest_hint
+from spatial_replay.text import listed
+
+_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+_NUMBERED: Final = re.compile(r"[a-z]+_([0-9]{1,9})")
+"""The name of an episode's group."""
 
 
-def is_hdf5(path: Path) -> bool:
-    """Return whether a file begins as one of HDF5."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        return stream.read(len(SIGNATURE)) == SIGNATURE
-
-
-def open_hdf5(path: Path) -> DataSet:
-    """Open a data set in an HDF5 file.
+def open_hdf5(path: Path) -> DataSet | None:
+    """Open a data set in an HDF5 file; None for any other file.
 
     Raises:
         UsageError: its layout is none of those that are read, or h5py is not installed.
         LogError: it cannot be read.
     """
+    if not path.is_file():
+        return None
+    with path.open("rb") as stream:
+        if stream.read(len(_SIGNATURE)) != _SIGNATURE:
+            return None
     with open_archive(path) as file:
-        for layout in (_ManiSkill, _IsaacLab, _Robosuite, _D4rl):
+        for layout in (_ManiSkill, _IsaacLab, _Robosuite, D4rl):
             if layout.is_layout(file):
                 return layout(path, file)
         raise UsageError(
-            f"{path.name} is an HDF5 file with {listed(names_in(file)) or 'nothing in it'}, no layout that is"
+            f"{path.name} is an HDF5 file with {listed(file.names) or 'nothing in it'}, no layout that is"
             " read: ManiSkill (traj_0), Isaac Lab, robosuite, robomimic or LIBERO (data/demo_0), D4RL"
             " (terminals)"
         )
 
 
+class InGroups(DataSet):
+    """A data set in HDF5 with a group for each episode.
+
+    Attributes:
+        folder: the group that holds the episodes.
+    """
+
+    folder = ""
+
+    @property
+    def archive(self) -> Path:
+        """The file."""
+        return self.path
+
+    @contextmanager
+    def open_episode(self, episode: Episode) -> Iterator[Group]:
+        """See `DataSet.open_episode`."""
+        with open_archive(self.archive) as file:
+            yield file.episode(f"{self.folder}/{episode.key}", f"{self.name}#{episode.number}")
+
+    def read(self, group: Group, names: AbstractSet[str]) -> dict[str, Floats]:
+        """See `DataSet.read`."""
+        arrays = {name: group.array(self.array_path(name)) for name in names}
+        return {
+            name: numbers(array) for name, array in arrays.items() if array is not None and width_of(array)
+        }
+
+    def array_path(self, name: str) -> str:
+        """Return the path of a feature in the group of an episode."""
+        return name
+
+    def whole_label(self, episode: Episode, group: Group, label: str) -> bool | None:
+        """See `DataSet.whole_label`: an attribute."""
+        value = group.attribute(label)
+        return None if value is None else bool(value)
+
+
+class _Demonstrations(InGroups):
+    """A data set whose episodes are numbered groups.
+
+    Attributes:
+        left_out: arrays that are no features, by the first part of their paths.
+        task: of episodes that name none.
+    """
+
+    left_out = frozenset[str]()
+    task: str | None = None
+
+    def list_episodes(self, path: Path, file: Group) -> Group:
+        """Find the episodes, and the features of the first one; return the group of that one."""
+        self.path = path
+        home = file.group(self.folder) or file
+        keys = sorted((key for key in home.names if _NUMBERED.fullmatch(key)), key=natural_key)
+        places = [int(key.rpartition("_")[2]) for key in keys]
+        places = places if len(set(places)) == len(keys) else list(range(len(keys)))
+        self.episodes = tuple(
+            self._describe(home, number, key) for number, key in zip(places, keys, strict=True)
+        )
+        first = file.episode(f"{self.folder}/{keys[0]}", f"{self.name}#{places[0]}")
+        rows = self.count_states(self.episodes[0], first, {})
+        self.features = tuple(
+            Feature(name, (), width_of(array))
+            for name, array in first.arrays()
+            if array.shape and array.shape[0] in (rows, rows - 1) and name.split("/")[0] not in self.left_out
+        )
+        return first
+
+    def _describe(self, home: Group, number: int, key: str) -> Episode:
+        try:
+            return self.describe(home, number, key)
+        except LogError:
+            # reading it says why
+            return Episode(number, key)
+
+    def describe(self, home: Group, number: int, key: str) -> Episode:
+        """Return the number, key, task and seed of an episode."""
+        demo = home.group(key)
+        if demo is None:
+            return Episode(number, key)
+        task = demo.json("ep_meta").get("lang")
+        task = task if isinstance(task, str) and task else self.task
+        return Episode(number, key, demo.integer("num_samples"), task, demo.integer("seed"))
+
+
+def _first_group(group: Group | None, prefix: str) -> Group | None:
+    """Return the first group whose name is a prefix and a number."""
+    keys = [] if group is None else [key for key in group.names if _NUMBERED.fullmatch(key)]
+    keys = [key for key in keys if key.startswith(prefix)]
+    return group.group(min(keys, key=natural_key)) if group is not None and keys else None
+
+
+def _body(poses: Any | None, name: str, place: str, order: str) -> Body:
+    """Return a body from an array of poses, whose rows begin with a place and a quaternion.
+
+    Raises:
+        LogError: the array is missing or too narrow, or the quaternions are not of unit length.
+    """
+    values = _pose_rows(poses, place)
+    quaternions = values[:, 3:7]
+    lengths = np.linalg.norm(quaternions, axis=1)
+    off = np.flatnonzero(np.abs(lengths - 1) > 0.01)
+    if len(off):
+        raise LogError(
+            f"{place} has a quaternion of length {lengths[off[0]]:.3g} at row {off[0]}; an orientation has"
+            " length 1, so these are other numbers"
+        )
+    return Body(name, values[:, :3], quaternions if order == "xyzw" else quaternions[:, [1, 2, 3, 0]])
+
+
+def _pose_rows(poses: Any | None, place: str, rows: slice = slice(None)) -> Floats:
+    if poses is None:
+        raise LogError(f"{place} is missing; record it again")
+    values = numbers(poses, rows)
+    if values.ndim != 2 or values.shape[1] < 7:
+        raise LogError(f"{place} has the shape {values.shape}; a pose has 7 numbers")
+    return values
+
+
+def _object(value: object) -> Mapping[str, Any]:
+    """Return a value that is a JSON object; an empty one for any other."""
+    return value if isinstance(value, dict) else {}
+
+
 # -------------------------------------------------------------------------------------------------- ManiSkill
 
 
-class _ManiSkill(GroupedEpisodes):
+class _ManiSkill(_Demonstrations):
     """Trajectories of ManiSkill: `traj_0` with `env_states/actors`, and a JSON file next to it."""
 
     kind = "ManiSkill"
     fps = 20.0
 
-    def __init__(self, path: Path, file: Any) -> None:
+    def __init__(self, path: Path, file: Group) -> None:
         about = path.with_suffix(".json")
         info = read_json(about) if about.is_file() else {}
         rows = info.get("episodes")
-        self._rows: dict[str, Mapping[str, Any]] = {
+        self._rows = {
             f"traj_{row.get('episode_id')}": row
             for row in (rows if isinstance(rows, list) else ())
             if isinstance(row, dict)
         }
-        environment = mapping_or_empty(info.get("env_info"))
-        self._task = str(environment["env_id"]) if environment.get("env_id") else None
-        options = mapping_or_empty(environment.get("env_kwargs"))
-        fps = options.get("control_freq") or mapping_or_empty(options.get("sim_config")).get("control_freq")
+        environment = _object(info.get("env_info"))
+        self.task = str(environment["env_id"]) if environment.get("env_id") else None
+        options = _object(environment.get("env_kwargs"))
+        fps = options.get("control_freq") or _object(options.get("sim_config")).get("control_freq")
         if isinstance(fps, (int, float)) and 0 < fps <= 1e6:
             self.fps = float(fps)
-        super().__init__(path, file)
-        first = member(file, self.episodes[0].key)
-        self.names_bodies = bool(names_in(member(first, "env_states/actors")))
-        has_label = member(first, "success") is not None or any(
-            "success" in row for row in self._rows.values()
-        )
+        first = self.list_episodes(path, file)
+        actors = first.group("env_states/actors")
+        self.names_bodies = actors is not None and bool(actors.names)
         # the first state has no label, and each other one that of the step before it
-        self.label = Label("success") if has_label else None
-        self.remarks = tuple(self._compare(about))
+        if first.array("success") is not None or any("success" in row for row in self._rows.values()):
+            self.label = Label("success")
+        self.remarks = tuple(self._remarks(about))
 
     @staticmethod
-    def is_layout(file: Any) -> bool:
-        first = first_group(file, "traj_")
-        return any(member(first, name) is not None for name in ("env_states", "obs")) if first else False
+    def is_layout(file: Group) -> bool:
+        """Return whether a file has trajectories."""
+        first = _first_group(file, "traj_")
+        return first is not None and not {"env_states", "obs"}.isdisjoint(first.names)
 
-    def _compare(self, about: Path) -> Iterator[str]:
-        """Yield remarks on the JSON file next to the trajectories."""
+    def _remarks(self, about: Path) -> Iterator[str]:
         keys = {episode.key for episode in self.episodes}
         if not self._rows:
             yield f"{about.name} is missing or has no episodes: seeds are not known, and the rate is 20 Hz"
@@ -128,52 +232,60 @@ class _ManiSkill(GroupedEpisodes):
         if not self.names_bodies:
             yield "env_states has no actors by name; name objects by `features:`"
 
-    def describe(self, home: Any, number: int, key: str) -> Episode:
+    def describe(self, home: Group, number: int, key: str) -> Episode:
+        """See `_Demonstrations.describe`."""
         row = self._rows.get(key, {})
-        seed, steps = row.get("episode_seed"), row.get("elapsed_steps")
-        return Episode(
-            number,
-            key,
-            steps + 1 if isinstance(steps, int) else None,
-            self._task,
-            seed if isinstance(seed, int) else None,
-        )
+        seed, steps = integer_or_none(row.get("episode_seed")), integer_or_none(row.get("elapsed_steps"))
+        return Episode(number, key, None if steps is None else steps + 1, self.task, seed)
 
-    def count_frames(self, group: Any, place: str) -> int:
+    def count_states(self, episode: Episode, group: Group, arrays: Mapping[str, Floats]) -> int:
+        """See `DataSet.count_states`."""
         for folder in ("env_states", "obs"):
-            item: Any = member(group, folder)
-            arrays = [item] if hasattr(item, "shape") else [array for _, array in arrays_in(item)]
-            if arrays and arrays[0].shape:
-                return row_count(arrays[0])
+            states, whole = group.group(folder), group.array(folder)
+            first = whole if states is None else next((array for _, array in states.arrays()), None)
+            if first is not None and first.shape:
+                return row_count(first)
+        place = f"{self.name}#{episode.number}"
         raise LogError(f"{place} has neither env_states nor obs; record with `record_env_state=True`")
 
-    def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
-        bodies, actors = [], member(group, "env_states/actors")
-        for name in names_in(actors):
-            where = f"{place}: env_states/actors/{name}"
-            poses = pose_rows(member(actors, name, group), where, 7)
-            quaternions = unit_quaternions(poses[:, 3:7], where, reading.order or "wxyz")
-            bodies.append(Body(name, poses[:, :3], quaternions))
-        frames: Integers = np.arange(count, dtype=np.int64)
-        return EpisodeColumns(frame_times_ns(frames, self.required_fps(reading)), bodies=tuple(bodies))
+    def poses(
+        self,
+        episode: Episode,
+        group: Group,
+        arrays: Mapping[str, Floats],
+        count: int,
+        reading: EpisodeReading,
+    ) -> EpisodeColumns:
+        """See `DataSet.poses`."""
+        folder, times_ns = "env_states/actors", super().poses(episode, group, arrays, count, reading).times_ns
+        actors = group.group(folder)
+        bodies = [
+            _body(
+                group.array(f"{folder}/{name}"),
+                name,
+                f"{self.name}#{episode.number}: {folder}/{name}",
+                reading.order or "wxyz",
+            )
+            for name in (actors.names if actors is not None else ())
+        ]
+        return EpisodeColumns(times_ns, bodies=tuple(bodies))
 
-    def success_in(
-        self, group: Any, count: int, episode: Episode, reading: EpisodeReading
-    ) -> Booleans | None:
-        success = super().success_in(group, count, episode, reading)
-        value = self._rows.get(episode.key, {}).get("success")
-        return np.array(value) if success is None and isinstance(value, bool) else success
+    def whole_label(self, episode: Episode, group: Group, label: str) -> bool | None:
+        """See `DataSet.whole_label`: an attribute, or a key of the JSON file."""
+        value = super().whole_label(episode, group, label)
+        row = self._rows.get(episode.key, {})
+        return row["success"] if value is None and isinstance(row.get("success"), bool) else value
 
 
 # -------------------------------------------------------------------------------------------------- Isaac Lab
 
 
 _BODIES: Final = "states/rigid_object"
-_ASKED: Final = 32
-"""Episodes whose quaternions are looked at."""
+_MOST_EXAMINED: Final = 32
+"""Episodes whose quaternions are examined."""
 
 
-class _IsaacLab(GroupedEpisodes):
+class _IsaacLab(_Demonstrations):
     """Demonstrations of Isaac Lab, RoboLab and Arena: `data/demo_0/states/rigid_object`.
 
     The states are those after each step. Quaternions are x y z w since 2026 and w x y z before, and the
@@ -185,61 +297,72 @@ class _IsaacLab(GroupedEpisodes):
     names_bodies = True
     left_out = frozenset({"initial_state"})
 
-    def __init__(self, path: Path, file: Any) -> None:
-        about = json_attribute(member(file, "data"), "env_args")
-        self._task = str(about.get("env_name") or "") or None
-        steps = mapping_or_empty(about.get("sim_args"))
+    def __init__(self, path: Path, file: Group) -> None:
+        data = file.group("data") or file
+        about = data.json("env_args")
+        self.task = str(about.get("env_name") or "") or None
+        steps = _object(about.get("sim_args"))
         try:
             self.fps = 1 / (float(steps["dt"]) * int(steps["decimation"]))
         except (KeyError, TypeError, ValueError, ZeroDivisionError):
             self.fps = None
-        self._has_label = False
-        super().__init__(path, file)
-        self.label = Label("success") if self._has_label else None
+        self.list_episodes(path, file)
+        if _has_success(data, self.episodes):
+            self.label = Label("success")
         self._order: str | None = None
 
     @staticmethod
-    def is_layout(file: Any) -> bool:
-        first = first_group(member(file, "data"), "demo_")
-        return first is not None and bool(names_in(member(first, _BODIES)))
+    def is_layout(file: Group) -> bool:
+        """Return whether a file has demonstrations with bodies by name."""
+        first = _first_group(file.group("data"), "demo_")
+        bodies = None if first is None else first.group(_BODIES)
+        return bodies is not None and bool(bodies.names)
 
-    def describe(self, home: Any, number: int, key: str) -> Episode:
-        demo = member(home, key)
-        self._has_label = self._has_label or attribute(demo, "success") is not None
-        frames, seed = integer_attribute(demo, "num_samples"), integer_attribute(demo, "seed")
-        return Episode(number, key, frames, self._task, seed)
-
-    def count_frames(self, group: Any, place: str) -> int:
-        names = names_in(member(group, _BODIES))
-        if not names:
+    def count_states(self, episode: Episode, group: Group, arrays: Mapping[str, Floats]) -> int:
+        """See `DataSet.count_states`."""
+        place, bodies = f"{self.name}#{episode.number}", group.group(_BODIES)
+        if bodies is None or not bodies.names:
             raise LogError(f"{place} has no {_BODIES}; record with the recorder of states")
-        array = member(group, f"{_BODIES}/{names[0]}/root_pose")
-        if array is None or not array.shape:
-            raise LogError(f"{place}: {_BODIES}/{names[0]} has no root_pose")
-        return row_count(array)
+        poses = bodies.array(f"{bodies.names[0]}/root_pose")
+        if poses is None:
+            raise LogError(f"{place}: {_BODIES}/{bodies.names[0]} has no root_pose")
+        return row_count(poses)
 
-    def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
-        frames: Integers = np.arange(count, dtype=np.int64)
-        times_ns, order = frame_times_ns(frames, self.required_fps(reading)), reading.order or self._decide()
-        bodies, home = [], member(group, _BODIES)
-        for name in names_in(home):
-            poses, where = _poses(home, name, group, place), f"{place}: {_BODIES}/{name}"
-            if len(poses) != count:
-                raise LogError(f"{where} has {len(poses)} poses, and the first body {count}; record it again")
-            bodies.append(Body(name, poses[:, :3], unit_quaternions(poses[:, 3:7], where, order)))
+    def poses(
+        self,
+        episode: Episode,
+        group: Group,
+        arrays: Mapping[str, Floats],
+        count: int,
+        reading: EpisodeReading,
+    ) -> EpisodeColumns:
+        """See `DataSet.poses`."""
+        times_ns = super().poses(episode, group, arrays, count, reading).times_ns
+        order, bodies = reading.order or self._decide_order(), []
+        for name, place, poses in self._bodies_in(episode, group):
+            body = _body(poses, name, place, order)
+            if len(body.positions) != count:
+                rows = len(body.positions)
+                raise LogError(f"{place} has {rows} poses, and the first body {count}; record it again")
+            bodies.append(body)
         return EpisodeColumns(times_ns, bodies=tuple(bodies))
 
-    def _decide(self) -> str:
+    def _bodies_in(self, episode: Episode, group: Group) -> Iterator[tuple[str, str, Any | None]]:
+        bodies = group.group(_BODIES)
+        for name in bodies.names if bodies is not None else ():
+            place = f"{self.name}#{episode.number}: {_BODIES}/{name}"
+            yield name, place, group.array(f"{_BODIES}/{name}/root_pose")
+
+    def _decide_order(self) -> str:
         """Return the order of the quaternions.
 
         Raises:
             UsageError: the data do not show it.
         """
         if self._order is None:
-            with open_archive(self.path) as file:
-                # objects stand still and upright at the start of most episodes
-                starts = quaternion_order(self._quaternions(file, slice(1)))
-                self._order = starts or quaternion_order(self._quaternions(file, slice(None)))
+            # objects stand still and upright at the start of most episodes
+            starts = quaternion_order(self._quaternions(slice(1)))
+            self._order = starts or quaternion_order(self._quaternions(slice(None)))
         if self._order is None:
             raise UsageError(
                 f"{self.name} does not show the order of its quaternions; say `order: xyzw` (Isaac Lab since"
@@ -247,20 +370,17 @@ class _IsaacLab(GroupedEpisodes):
             )
         return self._order
 
-    def _quaternions(self, file: Any, rows: slice) -> Iterator[Floats]:
-        for episode in self.episodes[:_ASKED]:
-            place = f"{self.name}#{episode.number}"
-            group = episode_group(file, f"{self.folder}/{episode.key}", place)
-            home = member(group, _BODIES)
-            for name in names_in(home):
-                yield _poses(home, name, group, place, rows)[:, 3:7]
+    def _quaternions(self, rows: slice) -> Iterator[Floats]:
+        for episode in self.episodes[:_MOST_EXAMINED]:
+            with self.open_episode(episode) as group:
+                for _, place, poses in self._bodies_in(episode, group):
+                    yield _pose_rows(poses, place, rows)[:, 3:7]
 
 
-def _poses(home: Any, body: str, episode: Any, place: str, rows: slice = slice(None)) -> Floats:
-    where, array = f"{place}: {_BODIES}/{body}/root_pose", member(home, f"{body}/root_pose", episode)
-    if array is None:
-        raise LogError(f"{where} is missing; record it again")
-    return pose_rows(array, where, 7, rows)
+def _has_success(home: Group, episodes: tuple[Episode, ...]) -> bool:
+    """Return whether an episode has the attribute `success`."""
+    demos = (home.group(episode.key) for episode in episodes)
+    return any(demo is not None and demo.attribute("success") is not None for demo in demos)
 
 
 # -------------------------------------------------------------------------------------------------- robosuite
@@ -269,7 +389,7 @@ _SUCCESSES_ONLY: Final = (1, 4)
 """The version since which robosuite's recorder drops failed episodes."""
 
 
-class _Robosuite(GroupedEpisodes):
+class _Robosuite(_Demonstrations):
     """Demonstrations of robosuite, robomimic and LIBERO: `data/demo_0` with `states` of a `model_file`.
 
     A state is the one before the action of its step, so the state after the last action is not stored.
@@ -279,60 +399,61 @@ class _Robosuite(GroupedEpisodes):
     has_times = True
     names_bodies = True
     left_out = frozenset({"next_obs"})
+    always_read = ("states",)
 
-    def __init__(self, path: Path, file: Any) -> None:
-        home = member(file, "data")
-        about = json_attribute(home, "env_args")
-        options = mapping_or_empty(about.get("env_kwargs"))
-        version = text_attribute(home, "repository_version")
-        is_libero = attribute(home, "bddl_file_name") is not None
+    def __init__(self, path: Path, file: Group) -> None:
+        home = file.group("data") or file
+        about = home.json("env_args")
+        options = _object(about.get("env_kwargs"))
+        version = home.text("repository_version")
+        is_libero = home.attribute("bddl_file_name") is not None
         self.kind = "LIBERO" if is_libero else f"robosuite {version}" if version else "robomimic"
         self.robot = str(robots) if isinstance(robots := options.get("robots"), str) else ""
-        name = text_attribute(home, "env") or str(about.get("env_name") or "")
-        instruction = json_attribute(home, "problem_info").get("language_instruction")
-        self._task = str(instruction or name) or None
-        self._has_label = False
-        super().__init__(path, file)
-        field = self._label_field(options, version)
-        self.label = Label(field, is_about_next=True, is_stored=False) if field else None
+        name = home.text("env") or str(about.get("env_name") or "")
+        self.task = str(home.json("problem_info").get("language_instruction") or name) or None
+        self.list_episodes(path, file)
+        if _has_success(home, self.episodes):
+            field = "success"
+        elif options.get("reward_shaping") is False and self.feature("rewards") is not None:
+            field = "rewards"
+        else:
+            is_recent = tuple(map(int, re.findall(r"\d+", version)[:2])) >= _SUCCESSES_ONLY
+            field = "successful" if is_recent else ""
+        if field:
+            self.label = Label(field, is_about_next=True, is_stored=False)
         if field == "successful":
             self.remarks = ("it holds successes only: robosuite's recorder drops failed episodes",)
 
     @staticmethod
-    def is_layout(file: Any) -> bool:
-        first = first_group(member(file, "data"), "demo_")
-        return first is not None and hasattr(member(first, "states"), "shape")
+    def is_layout(file: Group) -> bool:
+        """Return whether a file has demonstrations with states."""
+        first = _first_group(file.group("data"), "demo_")
+        return first is not None and first.array("states") is not None
 
-    def _label_field(self, options: Mapping[str, Any], version: str) -> str:
-        if self._has_label:
-            return "success"
-        if options.get("reward_shaping") is False and self.feature("rewards") is not None:
-            return "rewards"
-        parts = tuple(map(int, re.findall(r"\d+", version)[:2]))
-        return "successful" if parts >= _SUCCESSES_ONLY else ""
-
-    def describe(self, home: Any, number: int, key: str) -> Episode:
-        demo = member(home, key)
-        self._has_label = self._has_label or attribute(demo, "success") is not None
-        task = json_attribute(demo, "ep_meta").get("lang")
-        frames, seed = integer_attribute(demo, "num_samples"), integer_attribute(demo, "seed")
-        return Episode(number, key, frames, task if isinstance(task, str) and task else self._task, seed)
-
-    def count_frames(self, group: Any, place: str) -> int:
-        states: Any = member(group, "states")
-        if states is None or not states.shape:
-            raise LogError(f"{place} has no states")
+    def count_states(self, episode: Episode, group: Group, arrays: Mapping[str, Floats]) -> int:
+        """See `DataSet.count_states`."""
+        states = group.array("states")
+        if states is None:
+            raise LogError(f"{self.name}#{episode.number} has no states")
         return row_count(states)
 
-    def read(self, group: Any, count: int, reading: EpisodeReading, place: str) -> EpisodeColumns:
-        if reading.model is None:
-            xml = text_attribute(group, "model_file")
-            if not xml:
-                raise UsageError(f"{place} has no model_file; give the MuJoCo model by `model: scene.xml`")
+    def poses(
+        self,
+        episode: Episode,
+        group: Group,
+        arrays: Mapping[str, Floats],
+        count: int,
+        reading: EpisodeReading,
+    ) -> EpisodeColumns:
+        """See `DataSet.poses`."""
+        place = f"{self.name}#{episode.number}"
+        if reading.model is not None:
+            model = model_from_file(reading.model, reading.assets)
+        elif xml := group.text("model_file"):
             model = model_from_xml(xml, f"the model_file of {self.name}", reading.assets)
         else:
-            model = model_from_file(reading.model, reading.assets)
-        seconds, bodies = model.states(numbers(member(group, "states")), f"{place}: states")
+            raise UsageError(f"{place} has no model_file; give the MuJoCo model by `model: scene.xml`")
+        seconds, bodies = model.states(arrays["states"], f"{place}: states")
         if not np.isfinite(seconds).all():
             row = int(np.flatnonzero(~np.isfinite(seconds))[0])
             raise LogError(f"{place}: the time of state {row} is {seconds[row]}")
@@ -340,83 +461,15 @@ class _Robosuite(GroupedEpisodes):
         remarks, unjudged, back = list(model.remarks), "", np.flatnonzero(np.diff(times_ns) <= 0)
         if len(back):
             row = int(back[0])
-            unjudged = (
-                f"its time goes from {seconds[row]:g} s to {seconds[row + 1]:g} s at state {row + 1}: more"
-                " than one run is in the episode, so it is not judged; record each run as an episode"
-            )
+            jump = f"from {seconds[row]:g} s to {seconds[row + 1]:g} s at state {row + 1}"
+            unjudged = f"its time goes {jump}: {SECOND_RUN}"
             times_ns = frame_times_ns(np.arange(count, dtype=np.int64), reading.fps or 20.0)
         elif count and seconds[0] > 0:
             remarks.append(f"its time starts at {seconds[0]:.3f} s")
         return EpisodeColumns(times_ns, bodies=tuple(bodies), remarks=tuple(remarks), unjudged=unjudged)
 
-    def success_in(
-        self, group: Any, count: int, episode: Episode, reading: EpisodeReading
-    ) -> Booleans | None:
-        if reading.label is None and self.label is not None and self.label.field == "successful":
-            return np.array(True)
-        return super().success_in(group, count, episode, reading)
-
-
-# ------------------------------------------------------------------------------------------------------- D4RL
-
-
-class _D4rl(DataSet):
-    """A data set of D4RL: arrays of all steps; `terminals` and `timeouts` end episodes."""
-
-    kind = "D4RL HDF5"
-
-    def __init__(self, path: Path, file: Any) -> None:
-        self.path = path
-        terminals = numbers(member(file, "terminals")).reshape(-1) > 0
-        count, timeouts = len(terminals), member(file, "timeouts")
-        is_end = terminals if timeouts is None else terminals | (numbers(timeouts).reshape(-1) > 0)
-        ends = np.flatnonzero(is_end)
-        if count and (len(ends) == 0 or ends[-1] != count - 1):
-            last = count - 1 - (int(ends[-1]) if len(ends) else -1)
-            self.remarks = (f"its last episode, of {counted(last, 'step')}, has no terminal and no timeout",)
-            ends = np.append(ends, count - 1)
-        self._bounds = [0, *(ends + 1).tolist()]
-        self.episodes = tuple(
-            Episode(number, str(number), self._bounds[number + 1] - self._bounds[number])
-            for number in range(len(ends))
-        )
-        self.features = tuple(
-            Feature(name, (), width_of(array))
-            for name, array in arrays_in(file)
-            if array.shape and array.shape[0] == count and name not in ("terminals", "timeouts")
-        )
-
-    @staticmethod
-    def is_layout(file: Any) -> bool:
-        arrays: list[Any] = [member(file, name) for name in ("terminals", "observations")]
-        return all(hasattr(array, "shape") and array.shape for array in arrays)
-
-    def columns(
-        self, number: int, reading: EpisodeReading = AS_STORED, features: Sequence[str] | None = None
-    ) -> EpisodeColumns:
-        """See `DataSet.columns`."""
-        self.episode(number)
-        rows = slice(self._bounds[number], self._bounds[number + 1])
-        names = [feature.name for feature in self.features if feature.width] if features is None else features
-        frames: Integers = np.arange(rows.stop - rows.start, dtype=np.int64)
-        times_ns = frame_times_ns(frames, self.required_fps(reading))
-        with open_archive(self.path) as file:
-            values = {name: self._array(file, name, rows) for name in names}
-            label, bodies, remarks = reading.label, list[Body](), tuple[str, ...]()
-            success = None
-            if label is not None:
-                success = as_label(self._array(file, label, rows), f"{self.name}: {label}")
-            if reading.model is not None:
-                name = "infos/qpos" if self.feature("infos/qpos") else "qpos"
-                model = model_from_file(reading.model, reading.assets)
-                bodies = model.bodies(self._array(file, name, rows), f"{self.name}: {name}")
-                remarks = model.remarks
-        return EpisodeColumns(times_ns, values, tuple(bodies), success, remarks=remarks)
-
-    def _array(self, file: Any, name: str, rows: slice) -> Floats:
-        array = member(file, name)
-        if array is None:
-            names = [feature.name for feature in self.features]
-            hint = nearest_hint(name, names) or f"it has {listed(names)}"
-            raise UsageError(f"{self.name} has no array {name!r}; {hint}")
-        return numbers(array, rows)
+    def whole_label(self, episode: Episode, group: Group, label: str) -> bool | None:
+        """See `DataSet.whole_label`: an attribute, or true where failures are dropped."""
+        if self.label is not None and label == self.label.field == "successful":
+            return True
+        return super().whole_label(episode, group, label)

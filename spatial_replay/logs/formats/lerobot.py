@@ -1,0 +1,315 @@
+"""LeRobot data sets (v2, v3): rows of Parquet files, found by their episodes.
+
+Only files below the folder of a data set are read: templates of paths in its metadata are not followed.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from collections.abc import Set as AbstractSet
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.logs.formats.episodes import (
+    MOST_BYTES,
+    SECOND_RUN,
+    DataSet,
+    Episode,
+    EpisodeColumns,
+    EpisodeReading,
+    Feature,
+    Label,
+    frame_times_ns,
+    integer_or_none,
+)
+from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
+from spatial_replay.text import counted
+
+_SUCCESS: Final = "next.success"
+_TIME_ERROR_S: Final = 1e-3
+"""A time in float32 may differ so much from the exact one."""
+_EPISODE_COLUMNS: Final = ("episode_index", "tasks", "length", "data/chunk_index", "data/file_index")
+
+
+class _Rows(NamedTuple):
+    """The rows of an episode in a file; whole if no other episode is between them."""
+
+    file: Path
+    begin: int
+    end: int
+    is_whole: bool = True
+
+
+def open_lerobot(path: Path) -> DataSet | None:
+    """Open a data set of LeRobot; None if the folder is none.
+
+    Raises:
+        UsageError: its version is unknown, or pyarrow is not installed.
+        LogError: its metadata cannot be read.
+    """
+    return _LeRobot(path) if (path / "meta" / "info.json").is_file() else None
+
+
+class _LeRobot(DataSet):
+    """A data set of LeRobot."""
+
+    always_read = ("episode_index", "frame_index", "timestamp", "next.done")
+
+    def __init__(self, path: Path) -> None:
+        info = read_json(path / "meta" / "info.json")
+        version = str(info.get("codebase_version") or "without codebase_version")
+        if not re.match(r"v[23]\.", version):
+            raise UsageError(
+                f"{path.name} is LeRobot {version}; v2.0 to v3.x are read; convert it with lerobot's script"
+            )
+        self.path, self.kind, self.robot = path, f"LeRobot {version}", str(info.get("robot_type") or "")
+        fps = info.get("fps")
+        self.fps = float(fps) if isinstance(fps, (int, float)) and 0 < fps <= 1e9 else None
+        features = info.get("features")
+        self.features = tuple(_features(features if isinstance(features, dict) else {}))
+        if self.feature(_SUCCESS) is not None:
+            self.label = Label(_SUCCESS, is_about_next=True, is_stored=False)
+        self._file_of, self.episodes, remarks = _episodes(path)
+        self._files = sorted((path / "data").rglob("*.parquet"))
+        self._file_by_end = {
+            end: file for file in self._files for end in (file.name, f"{file.parent.name}/{file.name}")
+        }
+        self._rows: dict[Path, Mapping[int, _Rows]] = {}
+        total = info.get("total_episodes")
+        if isinstance(total, int) and total != len(self.episodes):
+            remarks.append(
+                f"meta/info.json says {counted(total, 'episode')}, and meta has {len(self.episodes)}"
+            )
+        if info.get("chunks_size") == 1 and _lacks_files(path):
+            remarks.append(
+                "it looks like a copy by forge-robotics, which leaves out labels, poses of objects and names"
+                " of numbers; use the original"
+            )
+        self.remarks = tuple(remarks)
+        # a file, the columns that were looked for in it, and those that it has
+        self._loaded: tuple[object, AbstractSet[str], Mapping[str, Floats]] = (None, frozenset(), {})
+
+    def open_episode(self, episode: Episode) -> AbstractContextManager[list[_Rows]]:
+        """See `DataSet.open_episode`."""
+        return nullcontext(self._places(episode.number))
+
+    def read(self, group: list[_Rows], names: AbstractSet[str]) -> dict[str, Floats]:
+        """See `DataSet.read`."""
+        pieces = [
+            {name: table[name][rows.begin : rows.end] for name in names & table.keys()}
+            for rows in group
+            for table in [self._table(rows.file, names)]
+        ]
+        if len(pieces) == 1:
+            return pieces[0]
+        common = set.intersection(*(set(piece) for piece in pieces))
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in common}
+
+    def count_states(self, episode: Episode, group: Any, arrays: Mapping[str, Floats]) -> int:
+        """See `DataSet.count_states`."""
+        return len(arrays["episode_index"])
+
+    def poses(
+        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
+    ) -> EpisodeColumns:
+        """See `DataSet.poses`; the times are those of `frame_index`."""
+        fps, all_frames = self.required_fps(reading), np.arange(count, dtype=np.float64)
+        frames = arrays.get("frame_index", all_frames)
+        remarks, unjudged = tuple(_remarks(arrays, frames, fps, episode.frames)), ""
+        back = np.flatnonzero(np.diff(frames) <= 0)
+        if len(back):
+            at = int(back[0])
+            jump = f"from {frames[at]:g} to {frames[at + 1]:g} at row {at + 1}"
+            unjudged = f"its frame_index goes {jump}: {SECOND_RUN}"
+            frames = all_frames
+        times_ns = frame_times_ns(frames.astype(np.int64), fps)
+        return EpisodeColumns(times_ns, remarks=remarks, unjudged=unjudged)
+
+    def files(self, number: int) -> list[Path]:
+        """See `DataSet.files`."""
+        meta = [self.path / "meta" / "info.json", self.path / "meta" / "episodes.jsonl"]
+        meta += sorted((self.path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
+        return [file for file in meta if file.exists()] + [rows.file for rows in self._places(number)]
+
+    def _places(self, number: int) -> list[_Rows]:
+        """Return the rows of an episode: in a file of its own, or in all files that have some.
+
+        Raises:
+            LogError: no file has them.
+        """
+        likely = self._file_of[number]
+        named = self._file_by_end.get(likely)
+        is_alone = named is not None and named.name == likely and number in self._rows_of(named)
+        # whatever the metadata says: files that were copied or merged have wrong numbers there
+        files = [named] if named is not None and is_alone else self._files
+        places = [rows for file in files if (rows := self._rows_of(file).get(number)) is not None]
+        if not places:
+            file = "" if named else f" ({likely} is missing)"
+            raise LogError(
+                f"{self.name}#{number}: no file in data/ has its rows{file}; download the whole data set"
+            )
+        if not all(rows.is_whole for rows in places):
+            raise LogError(f"{self.name}#{number}: its rows lie between those of other episodes; sort them")
+        return places
+
+    def _rows_of(self, file: Path) -> Mapping[int, _Rows]:
+        """Return the rows of each episode in a file."""
+        if file not in self._rows:
+            numbers = _read_columns(file, {"episode_index"}).get("episode_index")
+            if numbers is None:
+                raise LogError(f"{file.name} has no column episode_index")
+            firsts = np.flatnonzero(np.diff(numbers, prepend=np.nan) != 0)
+            ends = [*firsts[1:].tolist(), len(numbers)]
+            rows_by_number: dict[int, _Rows] = {}
+            for first, end in zip(firsts.tolist(), ends, strict=True):
+                number = int(numbers[first])
+                earlier = rows_by_number.get(number)
+                rows_by_number[number] = (
+                    _Rows(file, first, end) if earlier is None else _Rows(file, earlier.begin, end, False)
+                )
+            self._rows[file] = rows_by_number
+        return self._rows[file]
+
+    def _table(self, file: Path, names: AbstractSet[str]) -> Mapping[str, Floats]:
+        """Return columns of a file; those of the last file stay in memory."""
+        key = (file, file.stat().st_mtime_ns)
+        read, table = self._loaded[1:] if self._loaded[0] == key else (frozenset[str](), {})
+        if unread := names - read:
+            self._loaded = (key, read | names, {**table, **_read_columns(file, unread)})
+        return self._loaded[2]
+
+
+def _lacks_files(path: Path) -> bool:
+    """Return whether the tables of episodes do not say in which files of data the episodes are."""
+    tables = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
+    return bool(tables) and "data/file_index" not in arrow().parquet.read_schema(tables[0]).names
+
+
+def _features(features: Mapping[str, Any]) -> Iterator[Feature]:
+    for name, about in features.items():
+        about = about if isinstance(about, dict) else {}
+        shape = about.get("shape")
+        shape = [1] if not isinstance(shape, list) else [size for size in shape if isinstance(size, int)]
+        width = int(np.prod(shape)) if about.get("dtype") not in ("video", "image", "string") else 0
+        yield Feature(name, _places_of(about.get("names"), width), width)
+
+
+def _places_of(names: object, width: int) -> tuple[str, ...]:
+    """Return the names of the numbers of a feature: a list, or the only list in an object."""
+    if isinstance(names, dict):
+        lists = [part for part in names.values() if isinstance(part, list)]
+        names = lists[0] if len(lists) == 1 else None
+    if not isinstance(names, list) or len(names) != width or len(set(map(str, names))) != width:
+        return ()
+    return tuple(map(str, names))
+
+
+def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str]]:
+    """Return the end of the path of each episode's file, the episodes, and remarks."""
+    rows, remarks = list(_episode_rows(path)), []
+    if not rows:
+        remarks.append("meta has no episodes; their numbers are those in data/")
+        files = sorted((path / "data").rglob("*.parquet"))
+        numbers = {
+            int(number)
+            for file in files
+            for number in _read_columns(file, {"episode_index"})["episode_index"]
+        }
+        rows = [{"episode_index": number} for number in numbers]
+    by_number: dict[int, Mapping[str, Any]] = {}
+    for row in rows:
+        if isinstance(row.get("episode_index"), int):
+            by_number.setdefault(row["episode_index"], row)
+    if len(by_number) < len(rows):
+        remarks.append(
+            f"meta lists {counted(len(rows) - len(by_number), 'episode')} twice or without a number"
+        )
+    episodes, file_of = [], {}
+    for number, row in sorted(by_number.items()):
+        tasks = row.get("tasks")
+        task = next(iter(tasks), None) if isinstance(tasks, list) else tasks
+        frames = integer_or_none(row.get("length"))
+        episodes.append(Episode(number, str(number), frames, str(task) if task else None))
+        places = row.get("data/chunk_index"), row.get("data/file_index")
+        file_of[number] = f"episode_{number:06d}.parquet"
+        if all(isinstance(place, int) for place in places):
+            file_of[number] = "chunk-{:03d}/file-{:03d}.parquet".format(*places)
+    return file_of, tuple(episodes), remarks
+
+
+def _episode_rows(path: Path) -> Iterator[Mapping[str, Any]]:
+    # tools for repairs add tables of other names
+    files = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
+    if files:
+        library = arrow()
+        for file in files:
+            try:
+                names = library.parquet.read_schema(file).names
+                columns = [name for name in names if name in _EPISODE_COLUMNS]
+                yield from library.parquet.read_table(file, columns=columns).to_pylist()
+            except library.ArrowException as error:
+                raise LogError(f"{file.relative_to(path)} cannot be read: {error}") from None
+        return
+    for number, line in enumerate(read_head(path / "meta" / "episodes.jsonl").splitlines(), 1):
+        if line.strip():
+            try:
+                row = json.loads(line)
+            except ValueError as error:
+                raise LogError(f"meta/episodes.jsonl:{number}: the line is not JSON ({error})") from None
+            if isinstance(row, dict):
+                yield row
+
+
+def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
+    """Read columns of a Parquet file as float64; those that it does not have are left out.
+
+    Raises:
+        LogError: the file cannot be read.
+    """
+    library = arrow()
+    try:
+        with library.parquet.ParquetFile(file) as parquet:
+            schema, rows = parquet.schema_arrow, parquet.metadata.num_rows
+            present = [name for name in schema.names if name in names]
+            if 8 * rows * max(1, len(present)) > MOST_BYTES:
+                raise LogError(f"{file.name} has {rows:,} rows; split it into smaller files")
+            table = parquet.read(columns=present)
+    except (OSError, library.ArrowException) as error:
+        raise LogError(
+            f"{file.name} cannot be read: {str(error).splitlines()[0]}; download it again"
+        ) from None
+    columns = ((name, numbers_from_column(table.column(name))) for name in table.column_names)
+    return {name: values for name, values in columns if values is not None}
+
+
+def _remarks(
+    columns: Mapping[str, Floats], frames: Floats, fps: float, expected: int | None
+) -> Iterator[str]:
+    """Yield remarks on the rows of an episode whose values are odd, although all are read."""
+    if expected is not None and expected != len(frames):
+        yield f"meta says {counted(expected, 'frame')}, and data has {len(frames)}"
+    steps = np.diff(frames)
+    odd = np.flatnonzero(steps != 1)
+    if len(frames) and frames[0] != 0:
+        yield f"its frame_index starts at {frames[0]:g}, and so its time at {frames[0] / fps:.3f} s"
+    if len(odd) and (steps > 0).all():
+        at = int(odd[0])
+        yield f"its frame_index goes from {frames[at]:g} to {frames[at + 1]:g}: frames are missing"
+    if "timestamp" in columns:
+        off = np.abs(columns["timestamp"].reshape(-1) - frames / fps)
+        at = int(np.nan_to_num(off, nan=0.0).argmax()) if len(off) else 0
+        if len(off) and off[at] > max(_TIME_ERROR_S, float(np.spacing(np.float32(frames[at] / fps)))):
+            yield (
+                f"its timestamp is {columns['timestamp'].reshape(-1)[at]:.6g} s at frame {frames[at]:g},"
+                f" which is {frames[at] / fps:.6g} s by frame_index and {fps:g} fps; frame_index counts"
+            )
+    if "next.done" in columns and columns["next.done"].reshape(-1)[:-1].any():
+        at = int(columns["next.done"].reshape(-1).argmax())
+        yield f"its next.done is true at frame {frames[at]:g}, before its last one"
