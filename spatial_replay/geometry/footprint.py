@@ -409,6 +409,19 @@ class FootprintBatch:
     def __len__(self) -> int:
         return len(self.part_start) - 1
 
+    def slice(self, begin: int, end: int) -> FootprintBatch:
+        """Return the rows from one to before another, as views."""
+        parts = slice(*self.part_start[[begin, end]].tolist())
+        vertices = slice(*self.vertex_start[[parts.start, parts.stop]].tolist())
+        return FootprintBatch.trusted(
+            part_start=self.part_start[begin : end + 1] - parts.start,
+            vertex_start=self.vertex_start[parts.start : parts.stop + 1] - vertices.start,
+            vertices=self.vertices[vertices],
+            radius=self.radius[parts],
+            bottom=self.bottom[begin:end],
+            top=self.top[begin:end],
+        )
+
     @property
     def sizes(self) -> Floats:
         """The diagonal of each footprint's box, (R,); of a disc its diameter."""

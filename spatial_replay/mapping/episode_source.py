@@ -1,18 +1,22 @@
 """Episodes of data sets as sources: the columns of an episode and a mapping in; a block of samples out.
 
-All frames of an episode become samples at once, by arrays.
+All frames of an episode, and of several short ones, become samples at once, by arrays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from itertools import accumulate, groupby, pairwise
+from typing import Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated
+from spatial_replay.errors import LogError, SpatialReplayError, UsageError
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated, select
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
 from spatial_replay.logs.messages import Block, Source, noting_pauses
@@ -32,6 +36,21 @@ from spatial_replay.text import Instant, Sentence, encodable, listed
 from spatial_replay.trace.trace import Trace, class_order, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
+Report: TypeAlias = Callable[[str, int, str], None]
+"""Receives each object without a valid footprint: its name, its frame, and the text after its name."""
+
+
+class ReadEpisode(NamedTuple):
+    """An episode in memory.
+
+    Attributes:
+        faults: about frames that are lost, and objects without a valid footprint.
+    """
+
+    columns: EpisodeColumns
+    trace: Trace
+    faults: tuple[str, ...]
+
 
 @dataclass(frozen=True)
 class EpisodeSource(Source):
@@ -40,12 +59,14 @@ class EpisodeSource(Source):
     Attributes:
         number: of the episode.
         mapped_by: None for a data set that names its bodies.
+        episode: what was read before; None to read it from the data set.
     """
 
     data_set: DataSet
     number: int
     mapped_by: LogMapping | None = None
     reading: ReadOptions = DEFAULTS
+    episode: ReadEpisode | None = field(default=None, repr=False, compare=False)
 
     @property
     def name(self) -> str:
@@ -92,14 +113,7 @@ class EpisodeSource(Source):
     @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; also raises LogError for an episode that is not judged."""
-        columns, faults = self.columns(), FaultList()
-        if columns.unjudged:
-            raise LogError(f"{self.name}: {columns.unjudged}")
-        for fault in columns.faults:
-            faults.add(f"{self.name}: {fault}")
-        # features contain NaN and infinity; they make objects unknown, without warnings
-        with np.errstate(all="ignore"):
-            trace = self._trace(columns, faults)
+        columns, trace, faults = self.episode or self._read()
         if not len(trace):
             raise LogError(f"{self.name} has no frame")
         remarks: list[str] = [
@@ -116,8 +130,8 @@ class EpisodeSource(Source):
             remarks.append(jump)
         if start_ns is not None or end_ns is not None:
             trace = within(trace, start_ns, end_ns)
-        if len(faults):
-            trace = replace(trace, faults=faults.take(last=True))
+        if faults:
+            trace = replace(trace, faults=faults)
         yield Block(trace, remarks=tuple(remarks))
 
     def _point_remarks(self, columns: EpisodeColumns) -> Iterator[str]:
@@ -131,14 +145,30 @@ class EpisodeSource(Source):
                 " the meshes of a model by `assets:`"
             )
 
-    def _trace(self, columns: EpisodeColumns, faults: FaultList) -> Trace:
-        """Return the samples of an episode: each frame is one.
+    def _read(self) -> ReadEpisode:
+        """Read the episode, in which each frame is a sample.
+
+        Raises:
+            UsageError: the mapping does not fit the numbers, or names a body again.
+            LogError: the files of the data set lack a feature, or the episode is not judged.
+        """
+        columns, faults = self.columns(), FaultList()
+        if columns.unjudged:
+            raise LogError(f"{self.name}: {columns.unjudged}")
+        for fault in columns.faults:
+            faults.add(f"{self.name}: {fault}")
+        report = partial(self._report, times_ns=columns.times_ns, faults=faults)
+        trace = self._frames(columns, report).trace(columns.times_ns)
+        return ReadEpisode(columns, trace, faults.take(last=True))
+
+    def _frames(self, columns: EpisodeColumns, report: Report) -> _Frames:
+        """Return the observations and signals of T frames.
 
         Raises:
             UsageError: the mapping does not fit the numbers, or names a body again.
             LogError: the files of the data set lack a feature.
         """
-        mapping, times_ns = self.mapped_by, columns.times_ns
+        mapping, count = self.mapped_by, len(columns.times_ns)
         features = FeatureReading() if mapping is None else _bind(mapping, self.data_set)
         shapes = {} if mapping is None else mapping.shapes
         if mapping is not None and mapping.episodes.model is not None and not columns.bodies:
@@ -147,29 +177,30 @@ class EpisodeSource(Source):
                 " model; leave it out"
             )
         class_of = {thing.name: thing.class_name for thing in features.objects}
-        detected = {
-            thing.name: thing.detections(
-                columns.features, len(times_ns), mapping.name if mapping else "", self.name
-            )
-            for thing in features.objects
-        }
-        rows_by_name: dict[str, ObservationRows] = {}
-        for body in columns.bodies:
-            if body.name in class_of:
-                raise UsageError(
-                    f"{self.data_set.name} has a body {body.name!r}; give the object of the mapping another"
-                    " `name`"
+        # features contain NaN and infinity; they make objects unknown, without warnings
+        with np.errstate(all="ignore"):
+            detections = {
+                thing.name: thing.detections(
+                    columns.features, count, mapping.name if mapping else "", self.name
                 )
-            class_of[body.name] = None
-            if (shape := shapes.get(body.name)) is None:
-                rows_by_name[body.name] = _rows_of_body(body, self.axes)
-            else:
-                detected[body.name] = detections_of_body(body, shape)
-        names, rows = self._rows(detected, rows_by_name, times_ns, faults)
-        signals = {
-            signal.name: signal.values(columns.features, len(times_ns), self.name)
-            for signal in features.signals
-        }
+                for thing in features.objects
+            }
+            rows_by_name: dict[str, ObservationRows] = {}
+            for body in columns.bodies:
+                if body.name in class_of:
+                    raise UsageError(
+                        f"{self.data_set.name} has a body {body.name!r}; give the object of the mapping"
+                        " another `name`"
+                    )
+                class_of[body.name] = None
+                if (shape := shapes.get(body.name)) is None:
+                    rows_by_name[body.name] = _rows_of_body(body, self.axes)
+                else:
+                    detections[body.name] = detections_of_body(body, shape)
+            names, rows = self._rows(detections, rows_by_name, count, report)
+            signals = {
+                signal.name: signal.values(columns.features, count, self.name) for signal in features.signals
+            }
         if not names and not signals:
             names_of_features = [feature.name for feature in self.data_set.features if feature.width]
             remedy = (
@@ -180,11 +211,63 @@ class EpisodeSource(Source):
             raise UsageError(
                 f"{mapping.name if mapping else self.name} names no objects of {self.data_set.name}; {remedy}"
             )
+        return _Frames(names, rows, signals, class_of)
+
+    def _rows(
+        self,
+        detections: Mapping[str, Detections],
+        rows_by_name: Mapping[str, ObservationRows],
+        count: int,
+        report: Report,
+    ) -> tuple[list[str], ObservationRows]:
+        """Return all names and, for one after the other, the observations of all frames.
+
+        Objects are checked together, since each check costs as much for few as for many. Frames without a
+        valid footprint are faults.
+        """
+        names, parts = list(rows_by_name), list(rows_by_name.values())
+        for has_height in (False, True):
+            group = [name for name, thing in detections.items() if (thing.height is not None) == has_height]
+            if not group:
+                continue
+
+            def report_row(index: int, what: str, group: Sequence[str] = group) -> None:
+                number, frame = divmod(index, count)
+                report(group[number], frame, what)
+
+            together = join_objects([detections[name] for name in group])
+            parts.append(rows_from_detections(together, None, self.axes, self.reading.concave, report_row))
+            names += group
+        return names, parts[0] if len(parts) == 1 else concatenated([_NO_ROWS, *parts])
+
+    def _report(self, name: str, frame: int, what: str, *, times_ns: Integers, faults: FaultList) -> None:
+        moment = Instant(int(times_ns[frame]), 0)
+        faults.add(Sentence(f"{self.name} at ", moment, f": object {name!r}{what}"))
+
+
+class _Frames(NamedTuple):
+    """The observations and signals of T frames.
+
+    Attributes:
+        names: of N objects.
+        rows: (N * T,), those of one object after those of the other.
+        signals: each (T,).
+        class_of: the class of each object, by name.
+    """
+
+    names: Sequence[str]
+    rows: ObservationRows
+    signals: Mapping[str, Floats]
+    class_of: Mapping[str, str | None]
+
+    def trace(self, times_ns: Integers) -> Trace:
+        """Return the frames as samples at times (T,)."""
+        names, rows = self.names, self.rows
         number = np.arange(len(rows), dtype=np.int64)
         numbered = np.where(rows.is_valid, number, -2 - number).reshape(len(names), len(times_ns))
         order = sorted(range(len(names)), key=names.__getitem__)
-        classes = class_order(class_of.values())
-        codes = np.array([classes.index(class_of[name]) for name in names], np.int64)
+        classes = class_order(self.class_of.values())
+        codes = np.array([classes.index(self.class_of[name]) for name in names], np.int64)
         return Trace(
             times_ns=times_ns,
             names=tuple(names[place] for place in order),
@@ -194,38 +277,100 @@ class EpisodeSource(Source):
             uncertainty=rows.uncertainty,
             class_code=np.repeat(codes, len(times_ns)),
             classes=classes,
-            signals=signals,
+            signals=self.signals,
         )
 
-    def _rows(
-        self,
-        detected: Mapping[str, Detections],
-        rows_by_name: Mapping[str, ObservationRows],
-        times_ns: Integers,
-        faults: FaultList,
-    ) -> tuple[list[str], ObservationRows]:
-        """Return all names and, for one after the other, the observations of all frames.
+    def divide(self, starts: Sequence[int]) -> Iterator[_Frames]:
+        """Yield the frames from each start to before the next one."""
+        objects = np.arange(len(self.names), dtype=np.int64)[:, None] * starts[-1]
+        order = [(objects + np.arange(begin, end)).ravel() for begin, end in pairwise(starts)]
+        rows = select(self.rows, np.concatenate(order))
+        for begin, end in pairwise(starts):
+            rows_of_part = rows.slice(len(self.names) * begin, len(self.names) * end)
+            signals = {name: values[begin:end] for name, values in self.signals.items()}
+            yield self._replace(rows=rows_of_part, signals=signals)
 
-        Objects are checked together, since each check costs as much for few as for many. Frames without a
-        valid footprint are faults.
-        """
-        names, parts = list(rows_by_name), list(rows_by_name.values())
-        for has_height in (False, True):
-            group = [name for name, thing in detected.items() if (thing.height is not None) == has_height]
-            if not group:
-                continue
-            report = partial(self._report, names=group, times_ns=times_ns, faults=faults)
-            together = join_objects([detected[name] for name in group])
-            parts.append(rows_from_detections(together, None, self.axes, self.reading.concave, report))
-            names += group
-        return names, parts[0] if len(parts) == 1 else concatenated([_NO_ROWS, *parts])
 
-    def _report(
-        self, index: int, what: str, *, names: Sequence[str], times_ns: Integers, faults: FaultList
-    ) -> None:
-        number, frame = divmod(index, len(times_ns))
-        moment = Instant(int(times_ns[frame]), 0)
-        faults.add(Sentence(f"{self.name} at ", moment, f": object {names[number]!r}{what}"))
+_MOST_FRAMES: Final = 2**15
+"""Frames that are read together: they bound its memory."""
+
+
+def read_together(sources: Sequence[Source]) -> list[Source]:
+    """Return the same sources, of which episodes of one data set with one mapping are read, all at once.
+
+    An episode that cannot be read stays as it is: its own reader raises the error.
+    """
+    read: list[Source] = []
+    for is_episode, group in groupby(sources, lambda source: isinstance(source, EpisodeSource)):
+        if not is_episode:
+            read += group
+            continue
+        episodes = cast(Iterator[EpisodeSource], group)
+        for _, alike in groupby(episodes, lambda one: (id(one.data_set), id(one.mapped_by), one.reading)):
+            read += _read_alike(list(alike))
+    return read
+
+
+def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
+    """Yield the episodes of one data set with one mapping, read together as far as they are alike."""
+    columns_by_place: dict[int, EpisodeColumns] = {}
+    frames = 0
+    for place, source in enumerate(sources if sources[0].mapped_by is not None else ()):
+        with suppress(SpatialReplayError):
+            columns = source.columns()
+            frames += len(columns.times_ns)
+            if frames > _MOST_FRAMES:
+                break
+            columns_by_place[place] = columns
+    shape = _shape_of(next(iter(columns_by_place.values()))) if columns_by_place else None
+    together = {
+        place: columns
+        for place, columns in columns_by_place.items()
+        if len(columns.times_ns) and not columns.unjudged and _shape_of(columns) == shape
+    }
+    episodes: dict[int, ReadEpisode] = {}
+    if shape is not None and len(together) > 1:
+        with suppress(SpatialReplayError):
+            parts = [(sources[place], columns) for place, columns in together.items()]
+            episodes = dict(zip(together, _read_parts(parts), strict=True))
+    for place, source in enumerate(sources):
+        yield replace(source, episode=episodes.get(place))
+
+
+def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
+    """Return the numbers a frame of each feature; None for columns that are not joined with others."""
+    if columns.bodies or any(len(values) != len(columns.times_ns) for values in columns.features.values()):
+        return None
+    return tuple((name, values.shape[1:]) for name, values in columns.features.items())
+
+
+def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:
+    """Return episodes whose features have the same shapes."""
+    starts = [0, *accumulate(len(columns.times_ns) for _, columns in parts)]
+    features = {
+        name: np.concatenate([columns.features[name] for _, columns in parts])
+        for name in parts[0][1].features
+    }
+    fault_lists = [FaultList() for _ in parts]
+    for (source, columns), faults in zip(parts, fault_lists, strict=True):
+        for fault in columns.faults:
+            faults.add(f"{source.name}: {fault}")
+
+    def report(name: str, frame: int, what: str) -> None:
+        place = bisect_right(starts, frame) - 1
+        source, columns = parts[place]
+        source._report(
+            name, frame - starts[place], what, times_ns=columns.times_ns, faults=fault_lists[place]
+        )
+
+    numbers = np.arange(starts[-1], dtype=np.int64)
+    frames = parts[0][0]._frames(EpisodeColumns(numbers, features), report)
+    return [
+        ReadEpisode(columns, frames_of_part.trace(columns.times_ns), faults.take(last=True))
+        for (_, columns), faults, frames_of_part in zip(
+            parts, fault_lists, frames.divide(starts), strict=True
+        )
+    ]
 
 
 _NO_ROWS = ObservationRows.blank(np.empty(0, np.int64))

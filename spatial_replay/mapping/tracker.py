@@ -205,6 +205,16 @@ class ObservationRows:
     def __len__(self) -> int:
         return len(self.yaw)
 
+    def slice(self, begin: int, end: int) -> ObservationRows:
+        """Return the observations from one to before another, as views."""
+        return ObservationRows(
+            self.shapes.slice(begin, end),
+            self.yaw[begin:end],
+            self.uncertainty[begin:end],
+            self.class_code[begin:end],
+            self.is_valid[begin:end],
+        )
+
     @classmethod
     def blank(cls, class_code: Integers) -> ObservationRows:
         """Return observations of which only the class is known."""
