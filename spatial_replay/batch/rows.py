@@ -11,8 +11,10 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import groupby
 from typing import Final, Literal, TypeAlias
 
+from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.batch.suite import DEFAULT_CONDITIONS, Conditions
 from spatial_replay.errors import (
     GeometryError,
@@ -25,11 +27,13 @@ from spatial_replay.errors import (
 )
 from spatial_replay.logs.messages import MAPPED, Source
 from spatial_replay.logs.remote import log_file
+from spatial_replay.mapping.episode_source import read_together
 from spatial_replay.monitor.result import RESULT_COLUMNS, SpecResult
 from spatial_replay.monitor.vacuity import Tested, UntestedPart
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window, window_from_points
+from spatial_replay.replay.together import JointReplay, ShortLog, can_join
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.sources.overview import fitness_of
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
@@ -148,9 +152,11 @@ class ResultRow:
     source: str = ""
 
 
-def rows_from_task(
-    task: Task, explained: Collection[ResultName] | None = ()
-) -> tuple[tuple[ResultRow, ...], ...]:
+TaskRows: TypeAlias = tuple[tuple[ResultRow, ...], ...]
+"""For each specification file of a task the rows of its results."""
+
+
+def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) -> TaskRows:
     """Open a log once, evaluate all its specifications over it, and return their rows.
 
     Args:
@@ -167,19 +173,81 @@ def rows_from_task(
         _refuse_unfit(task, source)
         replay = Replay(source, files, options, keep_leaves=True, certify=False)
         replayed = replay.run()
-        rows = [_rows_of_file(replay, replayed, file, index, explained) for index, file in enumerate(files)]
+        rows = _rows_of_log(task, files, replay.trees, replayed, explained)
     except Exception as error:  # one log must not end a batch
         return error_rows(task, *error_from_exception(error))
-    seconds, name = time.perf_counter() - begin, encodable(log_file(task.log).name)
-    return tuple(tuple(replace(row, seconds=seconds, source=name) for row in each) for each in rows)
+    return _rows_with_time(rows, time.perf_counter() - begin)
 
 
-def rows_from_tasks(tasks: tuple[Task, ...]) -> list[tuple[tuple[ResultRow, ...], ...]]:
-    """Return the rows of each of several logs."""
-    return [rows_from_task(task) for task in tasks]
+def rows_from_tasks(tasks: tuple[Task, ...]) -> list[TaskRows]:
+    """Return the rows of each of several logs; short ones are measured together."""
+    rows: list[TaskRows] = []
+    for _, like_tasks in groupby(tasks, lambda task: (task.specs, task.conditions)):
+        rows += _rows_of_like_tasks(list(like_tasks))
+    return rows
 
 
-def rows_with_explanations(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
+def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
+    """Return the rows of logs that are evaluated with the same specifications and conditions."""
+    try:
+        files = parsed_specifications(tasks[0].specs, tasks[0].conditions)
+    except SpatialReplayError:
+        return [rows_from_task(task) for task in tasks]
+    rows_by_task: dict[Task, TaskRows] = {}
+    sources: dict[Task, Source] = {}
+    begin = time.perf_counter()
+    for task in tasks:
+        try:
+            sources[task], options = opened_task(task, files)
+            _refuse_unfit(task, sources[task])
+        except Exception as error:  # one log must not end a batch
+            rows_by_task[task] = error_rows(task, *error_from_exception(error))
+            sources.pop(task, None)
+    if not sources or not can_join(files, options):
+        return [rows_by_task[task] if task in rows_by_task else rows_from_task(task) for task in tasks]
+    joint = None
+    logs: dict[Task, ShortLog] = {}
+    for task, source in zip(sources, read_together([*sources.values()]), strict=True):
+        try:
+            joint = joint or JointReplay(source, files, options)
+            log = joint.read(source) if joint.fits(source) else None
+        except Exception as error:
+            rows_by_task[task] = error_rows(task, *error_from_exception(error))
+            continue
+        if log is None:
+            rows_by_task[task] = rows_from_task(task)
+            continue
+        logs[task] = log
+        if joint.is_enough(logs.values()):
+            rows_by_task |= _rows_of_short_logs(joint, files, logs, begin)
+            logs, begin = {}, time.perf_counter()
+    if joint is not None and logs:
+        rows_by_task |= _rows_of_short_logs(joint, files, logs, begin)
+    return [rows_by_task[task] for task in tasks]
+
+
+def _rows_of_short_logs(
+    joint: JointReplay, files: Sequence[Specification], logs: Mapping[Task, ShortLog], begin_s: float
+) -> dict[Task, TaskRows]:
+    """Return the rows of logs that are measured together; each took its share of the time since `begin_s`."""
+    rows_by_task: dict[Task, TaskRows] = {}
+    try:
+        for task, replayed in zip(logs, joint.replay([*logs.values()]), strict=True):
+            rows_by_task[task] = _rows_of_log(task, files, joint.trees, replayed, ())
+    except Exception:  # alone, the log that it is of gets the error
+        rest = [task for task in logs if task not in rows_by_task]
+    else:
+        rest = []
+    seconds = (time.perf_counter() - begin_s) / len(logs)
+    rows_by_task = {task: _rows_with_time(rows, seconds) for task, rows in rows_by_task.items()}
+    return rows_by_task | {task: rows_from_task(task) for task in rest}
+
+
+def _rows_with_time(rows: TaskRows, seconds: float) -> TaskRows:
+    return tuple(tuple(replace(row, seconds=seconds) for row in rows_of_file) for rows_of_file in rows)
+
+
+def rows_with_explanations(task: Task) -> TaskRows:
     """Return the rows of a log, each with its explanation (see `rows_from_task`)."""
     return rows_from_task(task, None)
 
@@ -243,7 +311,7 @@ def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
     return f"internal error: {type(error).__name__}: {error}", kind
 
 
-def error_rows(task: Task, message: str, kind: ErrorKind) -> tuple[tuple[ResultRow, ...], ...]:
+def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
     """Return the rows of a task without results: one for each spec, with the error.
 
     A specification that cannot be parsed has one row, with an empty name.
@@ -266,14 +334,14 @@ def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int]) -> ResultR
     return replace(row, spec=spec.name, requirement=spec.id, title=spec.title, line=lines[spec.name])
 
 
-def _rows_of_file(
-    replay: Replay,
+def _rows_of_log(
+    task: Task,
+    files: Sequence[Specification],
+    trees: Sequence[ReportedTree],
     replayed: Replayed,
-    file: Specification,
-    index: int,
     explained: Collection[ResultName] | None,
-) -> tuple[ResultRow, ...]:
-    lines = spec_lines(file)
+) -> TaskRows:
+    """Return the rows of a log for each of its specification files."""
     log = ResultRow(
         samples=replayed.samples,
         zero_ns=replayed.first_ns,
@@ -281,11 +349,26 @@ def _rows_of_file(
         duration_ns=replayed.end_ns - replayed.start_ns,
         faults=_some(replayed.faults),
         remarks=_some(replayed.remarks),
-        missing=_some([_missing(each) for each in replayed.missing]),
+        missing=_some([_missing(name) for name in replayed.missing]),
         left=_some([departure.message for departure in replayed.left]),
         dropped=replayed.dropped.text or None,
+        source=encodable(log_file(task.log).name),
     )
-    pairs = zip(replay.trees, replayed.results, strict=True)
+    return tuple(
+        _rows_of_file(log, trees, replayed, file, index, explained) for index, file in enumerate(files)
+    )
+
+
+def _rows_of_file(
+    log: ResultRow,
+    trees: Sequence[ReportedTree],
+    replayed: Replayed,
+    file: Specification,
+    index: int,
+    explained: Collection[ResultName] | None,
+) -> tuple[ResultRow, ...]:
+    lines = spec_lines(file)
+    pairs = zip(trees, replayed.results, strict=True)
     # a name that another file has, too, is that of the file's own text here
     results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
     parts = {part.text: part for part in replayed.vacuous}

@@ -6,6 +6,7 @@ An object counts likewise in a formula that asks whether it is present.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -112,6 +113,12 @@ class Departures:
             self._watches.setdefault(watch.visitors, []).append(watch)
         self._past: Trace | None = None
         self._absent: dict[tuple[_Visitors, str], _Absence] = {}
+
+    def restart(self) -> Departures:
+        """Return departures from the same groups in another log, before its first sample."""
+        departures = copy(self)
+        departures.departures, departures._past, departures._absent = [], None, {}
+        return departures
 
     def add(self, trace: Trace) -> None:
         """Add the next samples; the ones that fill a pause do not count."""

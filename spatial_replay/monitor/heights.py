@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -45,6 +46,15 @@ class HeightComparisons:
         self._comparisons = [
             (specification, list(_comparisons_of(specification))) for specification in specifications
         ]
+
+    def restart(self) -> HeightComparisons:
+        """Return the same comparisons for another log, before its first sample."""
+        heights = copy(self)
+        heights._comparisons = [
+            (specification, [_Comparison(comparison.atom, comparison.bound) for comparison in comparisons])
+            for specification, comparisons in self._comparisons
+        ]
+        return heights
 
     def add(self, trace: Trace) -> None:
         """Add the next samples."""

@@ -13,7 +13,6 @@ import numpy as np
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed, data_frame
-from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene, look_back
 from spatial_replay.monitor.doubtful import doubts_of_instances
 from spatial_replay.monitor.ends import Needs, trim_trace
@@ -25,7 +24,6 @@ from spatial_replay.monitor.invariants import (
     invariant_sentences,
 )
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
-from spatial_replay.monitor.online.codes import distinct_channels
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.sentences import (
     Cause,
@@ -46,6 +44,8 @@ from spatial_replay.monitor.stream import (
     InstanceStream,
     SeriesBlock,
     find_instances,
+    one_after_another,
+    run_together,
 )
 from spatial_replay.monitor.vacuity import (
     Tested,
@@ -908,31 +908,14 @@ def _evaluate_group(
     trimmed = [trim_trace(trace, needs, start=True, end=True) for trace in traces]
     specification = with_numbers(specification, traces[0].units)
     instances = find_instances(specification, {}, (), 0, FOREVER)
-    scene = TraceScene(_one_after_another([trace for trace, _ in trimmed]), specification.regions)
-    columns = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
-    begin = 0
-    for whole, (trace, left_out) in zip(traces, trimmed, strict=True):
-        end, first_ns = begin + len(trace), int(whole.times_ns[0])
-        streams = [InstanceStream(instance, semantics, len(trace)) for instance in instances]
-        blocks = [
-            stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
-            for stream, leaves in zip(streams, columns, strict=True)
-        ]
+    counting = [trace for trace, _ in trimmed]
+    scene = TraceScene(one_after_another(counting), specification.regions)
+    for whole, (trace, left_out), (streams, blocks) in zip(
+        traces, trimmed, run_together(instances, scene, counting, semantics), strict=True
+    ):
+        first_ns = int(whole.times_ns[0])
         evaluation = _evaluation_of(specification, semantics, trace, first_ns, streams, blocks)
         yield replace(evaluation, left_out=counted_from(left_out, first_ns))
-        begin = end
-
-
-def _one_after_another(traces: Sequence[Trace]) -> Trace:
-    """Join traces whatever their times are: each sample gets its number as its time."""
-    shifted, begin = [], 0
-    for trace in traces:
-        times_ns = np.arange(begin, begin + len(trace), dtype=np.int64)
-        shifted.append(
-            replace(trace, times_ns=times_ns, reported_ns=None, signals_reported_ns={}, spans=(), doubts=())
-        )
-        begin += len(trace)
-    return Trace.concatenate(shifted)
 
 
 def _require_trace(value: object) -> None:

@@ -7,8 +7,8 @@ same bits.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import cast
 
@@ -19,7 +19,7 @@ from spatial_replay.geometry.arrays import Empty, Floats, Integers, joined
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene, look_back, tail
-from spatial_replay.monitor.online.codes import joined_channels
+from spatial_replay.monitor.online.codes import distinct_channels, joined_channels
 from spatial_replay.monitor.online.program import Program, compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.semantics import Evaluator
@@ -332,6 +332,43 @@ class EvaluationStream:
         self._before = trace
         scene = TraceScene(trace, self._regions, skip)
         return [stream.extend(scene, empty) for stream in self.streams]
+
+
+def one_after_another(traces: Sequence[Trace]) -> Trace:
+    """Join traces whatever their times are: each sample gets its number as its time."""
+    numbered, begin = [], 0
+    for trace in traces:
+        times_ns = np.arange(begin, begin + len(trace), dtype=np.int64)
+        numbered.append(
+            replace(trace, times_ns=times_ns, reported_ns=None, signals_reported_ns={}, spans=(), doubts=())
+        )
+        begin += len(trace)
+    return Trace.concatenate(numbered)
+
+
+def run_together(
+    instances: Sequence[Instance], scene: TraceScene, traces: Iterable[Trace], semantics: Semantics
+) -> Iterator[tuple[list[InstanceStream], list[SeriesBlock]]]:
+    """Evaluate instances over each of many traces, whose leaves are measured together.
+
+    Args:
+        instances: without bindings, and with terms that do not look back.
+        scene: of the samples of all traces, `one_after_another`.
+
+    Yields:
+        For each trace, the streams that have seen it, and the numbers of each stream.
+    """
+    leaves_by_instance = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
+    begin = 0
+    for trace in traces:
+        end = begin + len(trace)
+        streams = [InstanceStream(instance, semantics, len(trace)) for instance in instances]
+        blocks = [
+            stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
+            for stream, leaves in zip(streams, leaves_by_instance, strict=True)
+        ]
+        yield streams, blocks
+        begin = end
 
 
 class LiveStream:

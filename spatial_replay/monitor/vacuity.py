@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -52,6 +53,7 @@ from spatial_replay.spec.walks import (
     nodes_of,
     nodes_with_operands,
     standing,
+    substitute,
 )
 from spatial_replay.text import (
     Instant,
@@ -142,6 +144,8 @@ def find_vacuous(
             upper one of -inf.
     """
     instance = evidence.instance
+    if infinite is None and not _may_decide_nothing(instance):
+        return ()
     nodes = nodes_of(instance.formula)
     implications = _implications_of(instance.formula)
     windows, held = _Windows(times_ns), _Holding(instance, leaves, times_ns)
@@ -167,6 +171,26 @@ def find_vacuous(
     return tuple(
         _part(each, nodes[each.node], evidence) for each in sorted(found, key=lambda each: each.node)
     )
+
+
+@lru_cache(maxsize=256)
+def _may_decide_nothing(instance: Instance) -> bool:
+    """Return whether a part of a formula decides nothing in some log.
+
+    That needs a window that may be empty, an implication, a quantifier or an open group.
+    """
+    nodes = nodes_of(instance.formula)
+    leaves = [substitute(leaf, instance.bindings) for leaf in instance.program.leaves]
+    return (
+        any(isinstance(node, Temporal) and _may_be_empty(node) for node in nodes)
+        or any(operator_of(node) == "->" for node in nodes_of(_implications_of(instance.formula).formula))
+        or any(isinstance(leaf, Quantified) or any(_open_groups(leaf)) for leaf in leaves)
+    )
+
+
+def _may_be_empty(node: Temporal) -> bool:
+    """Return whether the window of an operator may have no sample: without a gap, it has its own sample."""
+    return node.operator in _NEXT or (node.bound is not None and node.bound.lower > 0)
 
 
 class _Idle(NamedTuple):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from spatial_replay import __version__
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.specification import (
+    ReportedTree,
     logged_specifications,
     specification_attachments,
 )
@@ -51,7 +53,7 @@ from spatial_replay.monitor.heights import HeightComparisons
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stillness import Stillness
-from spatial_replay.monitor.stream import SeriesBlock, join_blocks
+from spatial_replay.monitor.stream import Instance, InstanceStream, SeriesBlock, join_blocks
 from spatial_replay.monitor.vacuity import UntestedPart, idle_templates
 from spatial_replay.monitor.verdict import Semantics, Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
@@ -153,6 +155,162 @@ class Replayed:
         return worst_verdict(result.verdict for result in self.results)
 
 
+@dataclass(frozen=True, eq=False)
+class ReplayPlan:
+    """Specifications prepared for logs with the same units.
+
+    Attributes:
+        files: the specifications, as an annotated log stores them.
+        instances: what to evaluate of each file.
+        departures: of each file, before the first sample.
+        heights: of all files, before the first sample.
+    """
+
+    files: Sequence[Specification]
+    instances: Sequence[Sequence[Instance]]
+    departures: Sequence[Departures]
+    heights: HeightComparisons
+
+    @classmethod
+    def of(cls, selection: Selection) -> ReplayPlan:
+        """Prepare the specifications of a selection; for templates, its log is read once to find objects.
+
+        Raises:
+            UsageError: a template without its objects.
+        """
+        units = selection.source.axes.units
+        files = logged_specifications(selection.files, units)
+        instances = [selection.instances(file) for file in files]
+        departures = [
+            Departures(instances_of_file, file.regions, units.get("", ""))
+            for instances_of_file, file in zip(instances, files, strict=True)
+        ]
+        return cls(files, instances, departures, HeightComparisons(files))
+
+
+class LogAccount:
+    """The account of a log beside its results, block by block: its names, losses, remarks and doubts.
+
+    Attributes:
+        samples: how many were evaluated, without those that fill pauses.
+    """
+
+    def __init__(self, plan: ReplayPlan) -> None:
+        """Start before the first sample."""
+        self.samples = 0
+        self._unreadable = 0
+        self._times_ns: list[int] = []
+        self._faults: list[str] = []
+        self._remarks: list[str] = []
+        self._doubts: list[Doubt] = []
+        self._names = LogNames()
+        self._stillness = Stillness()
+        self._heights = plan.heights.restart()
+        self._departures = [departures.restart() for departures in plan.departures]
+
+    def add(self, block: Block, trace: Trace) -> None:
+        """Add the next block, with those of its samples that are evaluated."""
+        self._remarks += block.remarks
+        self._doubts += block.doubts
+        self._faults += trace.faults
+        self._names.add(trace)
+        self._stillness.add(trace)
+        self._heights.add(trace)
+        for departures in self._departures:
+            departures.add(trace)
+        samples = trace.without_filling()
+        self.samples += len(samples)
+        self._unreadable += samples.unreadable_count
+        if len(trace):
+            self._times_ns = [*self._times_ns[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
+
+    def check_samples(self, selection: Selection) -> None:
+        """Check that a sample was evaluated.
+
+        Raises:
+            LogError, UsageError: none was.
+        """
+        if not self.samples:
+            raise selection.nothing_to_evaluate(self._faults)
+
+    def doubts(self, first_ns: int) -> tuple[Doubt, ...]:
+        """Return the assumptions that the log contradicts, whose sentences count time from `first_ns`."""
+        return distinct_doubts(self._doubts, first_ns)
+
+    def replayed(
+        self,
+        selection: Selection,
+        first_ns: int,
+        results: Sequence[SpecResult],
+        certificate: Mapping[str, str] = MappingProxyType({}),
+    ) -> Replayed:
+        """Return the results of the log with this account.
+
+        Args:
+            first_ns: the time that texts count from.
+
+        Raises:
+            SpecificationError: names that the log never has, if names are strict.
+        """
+        missing = selection.missing_names(self._names)
+        dropped = dropped_samples(selection.source)
+        left, doubts = self._departures_by_time(first_ns), self.doubts(first_ns)
+        name, options = selection.source.name, selection.options
+        return Replayed(
+            log=name,
+            samples=self.samples,
+            first_ns=first_ns,
+            start_ns=self._times_ns[0],
+            end_ns=self._times_ns[-1],
+            faults=counted_from(self._faults, first_ns),
+            remarks=(
+                *(doubt.remark(name) for doubt in doubts),
+                *counted_from(self._remarks, first_ns),
+                *dropped.remarks,
+                *self._empty_ends(selection.window, first_ns),
+                *(departure.message for departure in left),
+                *self._stillness.remarks(),
+                *counted_from(self._heights.remarks(), first_ns),
+            ),
+            missing=missing,
+            dropped=dropped,
+            unreadable=self._unreadable,
+            results=tuple(results),
+            vacuous=idle_templates(
+                (spec for file in selection.files for spec in file.results),
+                (result.formula for result in results),
+                options.each,
+                self._names.classes,
+            ),
+            certificate=certificate,
+            semantics=options.semantics,
+            left=left,
+            doubts=doubts,
+        )
+
+    def _departures_by_time(self, first_ns: int) -> tuple[Departure, ...]:
+        """Return each departure once, whichever specifications it is of, by time."""
+        by_start = {
+            (departure.start_ns, departure.name): departure
+            for departures in self._departures
+            for departure in departures.departures
+        }
+        return tuple(
+            replace(departure, message=counted_from([departure.message], first_ns)[0])
+            for _, departure in sorted(by_start.items())
+        )
+
+    def _empty_ends(self, window: Window, first_ns: int) -> Iterator[Sentence]:
+        """Remark that the window goes on where there is no sample: the log pauses, or has ended."""
+        begin_ns, last_ns = self._times_ns[0], self._times_ns[-1]
+        usual_ns = (last_ns - begin_ns) / max(self.samples - 1, 1)
+        asked_ns = max(window.start_ns, first_ns) if window.start_ns else begin_ns
+        for start_ns, end_ns in ((asked_ns, begin_ns), (last_ns, window.end_ns)):
+            if 0 < LONG_PAUSE * usual_ns < end_ns - start_ns and end_ns != FOREVER:
+                begin, end = Instant(start_ns, first_ns), Instant(end_ns, first_ns)
+                yield Sentence("the window has no sample from ", begin, " to ", end)
+
+
 class Replay:
     """One pass over a source: samples in, verdicts and messages out.
 
@@ -188,15 +346,12 @@ class Replay:
         self._written_files = files
         self._selection = Selection(source, files, options)
         self._ends = self._selection.run_ends()
-        self.files = logged_specifications(files, source.axes.units)
-        instances = [self._selection.instances(file) for file in self.files]
-        self._departures = [
-            Departures(of_file, file.regions, source.axes.units.get("", ""))
-            for of_file, file in zip(instances, self.files, strict=True)
-        ]
+        plan = ReplayPlan.of(self._selection)
+        self.files = plan.files
+        self._account = LogAccount(plan)
         self._evaluation = AnnotatedEvaluation(
-            self.files,
-            instances,
+            plan.files,
+            plan.instances,
             options.semantics,
             source.attachments,
             show=show,
@@ -209,16 +364,9 @@ class Replay:
         self._hashes = (
             EvaluationHashes([(tree.name, tree.object) for tree in self.trees]) if certify else None
         )
-        self._faults: list[str] = []
-        self._remarks: list[str] = []
-        self._doubts: list[Doubt] = []
         self._topics: set[str] = set()
         self._images: set[str] = set()
-        self._names = LogNames()
-        self._stillness = Stillness()
-        self._heights = HeightComparisons(self.files)
-        self._samples = self._unreadable = self._encoded = self._end_ns = 0
-        self._times: list[int] = []
+        self._encoded = self._end_ns = 0
         self._start_ns, self._is_beside = LATEST_NS, False
         self._zero_ns: int | None = None
         self._traces = _KeptTraces(self._selection, min(_KEPT_BYTES * len(self.trees), _MOST_KEPT_BYTES))
@@ -254,12 +402,11 @@ class Replay:
             if needs_messages:
                 messages = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
-            self._remarks += block.remarks
-            self._doubts += block.doubts
+            self._account.add(block, inside)
             if not layer:
                 self._topics.update(channel.topic for channel in messages.channels.values())
                 self._images |= image_topics(messages.channels.values())
-            self._add(inside, messages, stretches)
+            self._keep(inside, messages, stretches)
             if self._zero_ns is None:
                 self._zero_ns = log_zero_ns(self._source, self._selection.window, self._ends)
                 begin(self._zero_ns)
@@ -349,18 +496,7 @@ class Replay:
             for block, trace in blocks:
                 yield block, trace, self._evaluation.extend(trace)
 
-    def _add(self, trace: Trace, messages: Messages, stretches: Sequence[SeriesBlock]) -> None:
-        self._faults += trace.faults
-        self._names.add(trace)
-        self._stillness.add(trace)
-        self._heights.add(trace)
-        for departures in self._departures:
-            departures.add(trace)
-        samples = trace.without_filling()
-        self._samples += len(samples)
-        self._unreadable += samples.unreadable_count
-        if len(trace):
-            self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
+    def _keep(self, trace: Trace, messages: Messages, stretches: Sequence[SeriesBlock]) -> None:
         if len(messages):
             self._end_ns = max(self._end_ns, int(messages.log_time_ns[-1]))
         if self._hashes is not None:
@@ -381,82 +517,29 @@ class Replay:
         return SeriesBlock(stretch.times_ns, series, leaves)
 
     def _results(self) -> Replayed:
-        if not self._samples:
-            raise self._selection.nothing_to_evaluate(self._faults)
-        missing = self._selection.missing_names(self._names)
-        dropped = dropped_samples(self._source)
-        options = self._selection.options
+        self._account.check_samples(self._selection)
         first_ns = self._zero_ns or 0
-        left = self._departures_by_time(first_ns)
-        doubts = distinct_doubts(self._doubts, first_ns)
-        return Replayed(
-            log=self._source.name,
-            samples=self._samples,
-            first_ns=first_ns,
-            start_ns=self._times[0],
-            end_ns=self._times[-1],
-            faults=counted_from(self._faults, first_ns),
-            remarks=(
-                *(doubt.remark(self._source.name) for doubt in doubts),
-                *counted_from(self._remarks, first_ns),
-                *dropped.remarks,
-                *self._empty_ends(first_ns),
-                *(departure.message for departure in left),
-                *self._stillness.remarks(),
-                *counted_from(self._heights.remarks(), first_ns),
-            ),
-            missing=missing,
-            dropped=dropped,
-            unreadable=self._unreadable,
-            results=replayed_specs(
-                self._evaluation,
-                self.files,
-                [join_blocks(blocks) if blocks else None for blocks in self._kept],
-                self._traces.read,
-                first_ns,
-                has_series=self._keep_series,
-                has_leaves=self._keep_leaves,
-                doubts=doubts,
-            ),
-            vacuous=idle_templates(
-                (spec for file in self.files for spec in file.results),
-                (tree.formula for tree in self.trees),
-                options.each,
-                self._names.classes,
-            ),
-            certificate={}
-            if self._hashes is None
-            else self._hashes.certificate(
+        doubts = self._account.doubts(first_ns)
+        results = replayed_specs(
+            self._evaluation.streams,
+            self.trees,
+            self.files,
+            [join_blocks(blocks) if blocks else None for blocks in self._kept],
+            self._traces.read,
+            first_ns,
+            units=self._evaluation.units,
+            has_series=self._keep_series,
+            has_leaves=self._keep_leaves,
+            doubts=doubts,
+        )
+        certificate: Mapping[str, str] = {}
+        if self._hashes is not None:
+            certificate = self._hashes.certificate(
                 self._written_files,
                 dict(self._source.metadata()).get(PLAN_METADATA),
                 (doubt.title for doubt in doubts),
-            ),
-            semantics=options.semantics,
-            left=left,
-            doubts=doubts,
-        )
-
-    def _departures_by_time(self, first_ns: int) -> tuple[Departure, ...]:
-        """Return each departure once, whichever specifications it is of, by time."""
-        by_start = {
-            (departure.start_ns, departure.name): departure
-            for departures in self._departures
-            for departure in departures.departures
-        }
-        return tuple(
-            replace(departure, message=counted_from([departure.message], first_ns)[0])
-            for _, departure in sorted(by_start.items())
-        )
-
-    def _empty_ends(self, first_ns: int) -> Iterator[Sentence]:
-        """Remark that the window goes on where there is no sample: the log pauses, or has ended."""
-        window, begin_ns, last_ns = self._selection.window, self._times[0], self._times[-1]
-        usual_ns = (last_ns - begin_ns) / max(self._samples - 1, 1)
-        asked_ns = max(window.start_ns, first_ns) if window.start_ns else begin_ns
-        for start_ns, end_ns in ((asked_ns, begin_ns), (last_ns, window.end_ns)):
-            if 0 < LONG_PAUSE * usual_ns < end_ns - start_ns and end_ns != FOREVER:
-                begin, end = Instant(start_ns, first_ns), Instant(end_ns, first_ns)
-                yield Sentence("the window has no sample from ", begin, " to ", end)
+            )
+        return self._account.replayed(self._selection, first_ns, results, certificate)
 
 
 def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trace, list[SeriesBlock]]:
@@ -501,38 +584,42 @@ def dropped_samples(source: Source) -> Dropped:
 
 
 def replayed_specs(
-    evaluation: AnnotatedEvaluation,
+    streams: Sequence[InstanceStream],
+    trees: Sequence[ReportedTree],
     files: Sequence[Specification],
-    kept: Sequence[SeriesBlock | None],
+    blocks: Sequence[SeriesBlock | None],
     traces: Callable[[], Iterable[Trace]],
     zero_ns: int,
     *,
+    units: Mapping[str, str],
     has_series: bool = True,
     has_leaves: bool = True,
     doubts: Sequence[Doubt] = (),
 ) -> tuple[SpecResult, ...]:
-    """Return the results of an evaluation that has taken in all samples.
+    """Return the results of streams that have taken in all samples.
 
     Args:
-        kept: for each of its trees every sample, or None if nothing was kept.
+        trees: the results, under the names they are reported by.
+        blocks: of each stream every sample, or None if nothing was kept.
         traces: reads the samples again.
         zero_ns: the time that sentences count from.
-        has_series, has_leaves: whether the stretches hold the numbers, and the atoms.
+        units: those that are declared, see `unit_of`.
+        has_series, has_leaves: whether the blocks hold the numbers, and the atoms.
         doubts: those about the log.
     """
-    doubts_by_result = doubts_of_instances([stream.instance for stream in evaluation.streams], doubts, traces)
+    doubts_by_result = doubts_of_instances([stream.instance for stream in streams], doubts, traces)
     return tuple(
         SpecResult.from_stream(
             stream,
-            Evidence(stream.instance, files[tree.file].regions, traces, evaluation.units, zero_ns),
+            Evidence(stream.instance, files[tree.file].regions, traces, units, zero_ns),
             block,
             name=tree.name,
             has_series=has_series,
             has_leaves=has_leaves,
-            doubts=own_doubts,
+            doubts=doubts_of_result,
         )
-        for tree, stream, block, own_doubts in zip(
-            evaluation.trees, evaluation.streams, kept, doubts_by_result, strict=True
+        for tree, stream, block, doubts_of_result in zip(
+            trees, streams, blocks, doubts_by_result, strict=True
         )
     )
 

@@ -478,11 +478,13 @@ class Evaluated:
             dropped=loaded.dropped,
             unreadable=loaded.inside.unreadable_count,
             results=replayed_specs(
-                self.evaluation,
+                self.evaluation.streams,
+                self.evaluation.trees,
                 self.edited.files,
                 self.stretches,
                 self.selection.iter_traces,
                 loaded.first_ns,
+                units=self.evaluation.units,
                 doubts=loaded.doubts,
             ),
             vacuous=idle_templates(

@@ -7,7 +7,9 @@ import re
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -304,6 +306,10 @@ class LogNames:
         self.signals.update(trace.signals)
         self.classes.update(name for name in trace.classes if name)
 
+    def frozen(self) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
+        """Return those of objects, signals and classes as values."""
+        return frozenset(self.objects), frozenset(self.signals), frozenset(self.classes)
+
     def check(self, file: Specification, each: Mapping[str, str]) -> tuple[Diagnostic, ...]:
         """Compare the names of a specification with these (see `check_names`)."""
         objects, signals, classes = sorted(self.objects), sorted(self.signals), sorted(self.classes)
@@ -329,6 +335,8 @@ class Selection:
 
     Attributes:
         files: the specifications; samples before the window that they look back at are read, too.
+        needs: the names that these use.
+        looks_back: whether they look back at samples before the window.
 
     Raises:
         UsageError: objects for a parameter that no template has, an operator that the semantics lacks, a
@@ -338,13 +346,31 @@ class Selection:
     source: Source
     files: Sequence[Specification]
     options: ReplayOptions
+    needs: Needs = field(init=False, repr=False)
+    looks_back: bool = field(init=False, repr=False)
+    _missing_names: Callable[..., list[Diagnostic]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", source_keeping(self.source, self.options.keep))
+        object.__setattr__(self, "needs", Needs.of(self.files, self.options.each))
+        object.__setattr__(self, "looks_back", look_before(self.files))
+        # most of many logs have the same names
+        object.__setattr__(self, "_missing_names", lru_cache(maxsize=16)(self._find_missing))
         templates = [spec for file in self.files for spec in file.results if spec.parameter is not None]
         check_parameters(templates, self.options.each)
         _check_windows(self.files, self.source.max_gap_ns or 0)
         checked_semantics(self.options.semantics, self.files)
+
+    def over(self, source: Source) -> Selection:
+        """Return the same part of another log.
+
+        Raises:
+            UsageError: a window that may lie between two samples of a pause (`max_gap`).
+        """
+        _check_windows(self.files, source.max_gap_ns or 0)
+        selection = copy(self)
+        object.__setattr__(selection, "source", source_keeping(source, self.options.keep))
+        return selection
 
     @property
     def window(self) -> Window:
@@ -352,8 +378,7 @@ class Selection:
 
     def run_ends(self) -> RunEnds:
         """Return the rule for the ends of the log; a start or an end of the window overrides it."""
-        needs = Needs.of(self.files, self.options.each)
-        return RunEnds(needs, start=not self.window.start_ns, end=self.window.end_ns >= FOREVER)
+        return RunEnds(self.needs, start=not self.window.start_ns, end=self.window.end_ns >= FOREVER)
 
     def read_blocks(
         self, *, messages: bool = True, ends: RunEnds | None = None
@@ -380,7 +405,7 @@ class Selection:
         """Read each block, with every Nth of its samples."""
         window = self.window
         # every Nth sample is counted from the log's first, wherever the window starts
-        from_start = look_before(self.files) or window.every > 1
+        from_start = self.looks_back or window.every > 1
         read = 0
         source = self.source if messages else self.source.keeping()
         for block in read_blocks(source, None if from_start else window.start_ns, window.end_ns):
@@ -468,13 +493,13 @@ class Selection:
         Raises:
             SpecificationError: it lacks some, and names are strict.
         """
-        missing = self._missing_names(names)
+        missing = self._missing_names(*names.frozen())
         if missing and not self.window.is_whole:
             # an object that appears outside the window is no mistake in the specification
             whole = LogNames()
             for block in read_blocks(self.source.keeping()):
                 whole.add(block.trace)
-            missing = self._missing_names(whole)
+            missing = self._missing_names(*whole.frozen())
         if missing and self.options.strict_names:
             raise SpecificationError(missing)
         return tuple(replace(diagnostic, severity="warning") for diagnostic in missing)
@@ -503,7 +528,10 @@ class Selection:
             f"({first_ns} to {last_ns} ns on its clock){pauses}"
         )
 
-    def _missing_names(self, names: LogNames) -> list[Diagnostic]:
+    def _find_missing(
+        self, objects: frozenset[str], signals: frozenset[str], classes: frozenset[str]
+    ) -> list[Diagnostic]:
+        names = LogNames({*objects}, {*signals}, {*classes})
         remarks = [remark for file in self.files for remark in names.check(file, self.options.each)]
         return [remark for remark in remarks if remark.severity == "error"]
 
@@ -515,6 +543,8 @@ def _trim(block: Block, ends: RunEnds) -> Block:
 
 def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
     """Check that no window lies between two of the samples that fill a pause."""
+    if not max_gap_ns:
+        return
     step_ns = max_gap_ns // SAMPLES_A_GAP
     nodes = (node for file in files for spec in file.results for node in iter_formulas(spec.formula))
     for bound in (node.bound for node in nodes if isinstance(node, Temporal) and node.bound is not None):

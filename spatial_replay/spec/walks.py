@@ -547,6 +547,8 @@ def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: b
         declared: the units of signals by their names, that of lengths by "".
         is_scaled: whether the number is what `scale` made of it, which has no unit.
     """
+    if not declared:
+        return ""
     units = {
         "" if is_scaled and unit.divisor is not None else _declared_name(unit, declared)
         for unit in units_of(formula)

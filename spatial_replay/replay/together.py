@@ -1,0 +1,151 @@
+"""Many logs replayed with one plan: short ones are measured together, and each gets results of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from spatial_replay.annotate.specification import reported_trees
+from spatial_replay.logs.messages import Source
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.stream import InstanceStream, SeriesBlock, one_after_another, run_together
+from spatial_replay.replay.engine import LogAccount, Replayed, ReplayPlan, replayed_specs
+from spatial_replay.replay.selection import (
+    DEFAULT_OPTIONS,
+    ReplayOptions,
+    Selection,
+    log_zero_ns,
+    look_before,
+)
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.trace import Trace
+
+_MOST_SAMPLES: Final = 2**12
+_MOST_BYTES: Final = 2**22
+"""In a log that is measured together with others."""
+_ENOUGH_SAMPLES: Final = 2**14
+_ENOUGH_BYTES: Final = 2**25
+"""In all logs that are measured together."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShortLog:
+    """A log that was read, with its account.
+
+    Attributes:
+        zero_ns: the time that sentences count from.
+    """
+
+    selection: Selection
+    traces: Sequence[Trace]
+    account: LogAccount
+    zero_ns: int
+
+    @property
+    def samples(self) -> int:
+        """How many samples are evaluated, with those that fill pauses."""
+        return sum(map(len, self.traces))
+
+    @property
+    def nbytes(self) -> int:
+        """The size of its samples in bytes."""
+        return sum(trace.nbytes for trace in self.traces)
+
+
+class JointReplay:
+    """Replays of the same specifications over many logs with the same units.
+
+    Results are those of `Replay` with the leaves kept, to the bit.
+
+    Attributes:
+        trees: every result, under the name it is reported by.
+    """
+
+    def __init__(
+        self, source: Source, files: Sequence[Specification], options: ReplayOptions = DEFAULT_OPTIONS
+    ) -> None:
+        """Prepare.
+
+        Args:
+            source: a log, which says the units.
+
+        Raises:
+            UsageError: see `can_join`; an operator that the semantics lacks.
+        """
+        self._selection = Selection(source, files, options)
+        self._plan = ReplayPlan.of(self._selection)
+        self.trees = reported_trees(self._plan.files, self._plan.instances)
+        self._units = source.axes.units
+
+    def fits(self, source: Source) -> bool:
+        """Return whether the units of a log are those of the others."""
+        return source.axes.units == self._units
+
+    def read(self, source: Source) -> ShortLog | None:
+        """Read a log; None if it is a long one.
+
+        Raises:
+            LogError, UsageError: it cannot be read, or has no sample.
+        """
+        selection, account = self._selection.over(source), LogAccount(self._plan)
+        ends = selection.run_ends()
+        traces: list[Trace] = []
+        samples = size = 0
+        for block, trace in selection.read_blocks(messages=False, ends=ends):
+            samples, size = samples + len(trace), size + trace.nbytes
+            if samples > _MOST_SAMPLES or size > _MOST_BYTES:
+                return None
+            account.add(block, trace)
+            traces.append(trace)
+        account.check_samples(selection)
+        return ShortLog(selection, traces, account, log_zero_ns(source, selection.window, ends))
+
+    def is_enough(self, logs: Collection[ShortLog]) -> bool:
+        """Return whether more logs would take too much memory."""
+        return (
+            sum(log.samples for log in logs) > _ENOUGH_SAMPLES
+            or sum(log.nbytes for log in logs) > _ENOUGH_BYTES
+        )
+
+    def replay(self, logs: Sequence[ShortLog]) -> Iterator[Replayed]:
+        """Evaluate short logs, and yield the results of each.
+
+        Raises:
+            SpecificationError: names that a log never has, if names are strict.
+        """
+        traces = [log.traces[0] if len(log.traces) == 1 else Trace.concatenate(log.traces) for log in logs]
+        joined, semantics = one_after_another(traces), self._selection.options.semantics
+        runs = [
+            run_together(instances, TraceScene(joined, file.regions), traces, semantics)
+            for instances, file in zip(self._plan.instances, self._plan.files, strict=True)
+        ]
+        for log, *runs_of_log in zip(logs, *runs, strict=True):
+            streams = [stream for streams, _ in runs_of_log for stream in streams]
+            blocks = [block for _, blocks in runs_of_log for block in blocks]
+            yield self._replayed(log, streams, blocks)
+
+    def _replayed(
+        self, log: ShortLog, streams: Sequence[InstanceStream], blocks: Sequence[SeriesBlock]
+    ) -> Replayed:
+        results = replayed_specs(
+            streams,
+            self.trees,
+            self._plan.files,
+            blocks,
+            lambda: iter(log.traces),
+            log.zero_ns,
+            units=self._units,
+            has_series=False,
+            doubts=log.account.doubts(log.zero_ns),
+        )
+        return log.account.replayed(log.selection, log.zero_ns, results)
+
+
+def can_join(files: Sequence[Specification], options: ReplayOptions) -> bool:
+    """Return whether specifications can be measured over many logs at once.
+
+    Templates have instances of their own in each log, and terms that look back need the samples before.
+    """
+    has_templates = any(spec.parameter is not None for file in files for spec in file.results)
+    return options.window.is_whole and not has_templates and not look_before(files)
