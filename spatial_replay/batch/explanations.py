@@ -8,9 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from spatial_replay.batch.identities import identities_of
 from spatial_replay.batch.record import Explanation, RunRecord, with_explanations
 from spatial_replay.batch.rows import ResultName, ResultRow, Task, parsed_specifications, rows_from_task
-from spatial_replay.batch.run import BatchResult, identities_of, meaning_hash, row_key
+from spatial_replay.batch.run import BatchResult, meaning_hash, row_key
 from spatial_replay.batch.run_table import worst_rows
 from spatial_replay.batch.store import EXPLANATION, ResultsFolder
 from spatial_replay.batch.workers import Progress, WorkerLost, Workers, no_progress

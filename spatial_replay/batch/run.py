@@ -7,9 +7,8 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from glob import glob, has_magic
 from math import nan
 from os import PathLike
@@ -18,10 +17,12 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from spatial_replay import __version__
+from spatial_replay.batch.identities import identify, states_of
 from spatial_replay.batch.record import with_explanations, with_record
 from spatial_replay.batch.rows import (
     ResultRow,
     Task,
+    TaskRows,
     error_rows,
     parsed_specifications,
     rows_from_task,
@@ -44,7 +45,6 @@ from spatial_replay.logs.formats.datasets import DATA_SET_ENDINGS, data_set_addr
 from spatial_replay.logs.remote import (
     BAG_METADATA,
     RemoteFile,
-    each_ahead,
     is_address,
     local_copy,
     log_file,
@@ -53,7 +53,7 @@ from spatial_replay.logs.remote import (
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.mapping.yaml_document import MOST_FAULTS
 from spatial_replay.monitor.stream import Choice
-from spatial_replay.sources.open_log import LOG_ENDINGS, bag_files_at
+from spatial_replay.sources.open_log import LOG_ENDINGS
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_formula, format_specification
 from spatial_replay.spec.formula import NamedSpec, Specification
@@ -162,8 +162,6 @@ _DATA_SET_FOLDERS: Final = frozenset({"meta", "data"})
 """Folders of which each data set that is a folder has one."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
-_TOGETHER: Final = 16
-"""Logs that are hashed as one task."""
 
 
 class FoundLog(NamedTuple):
@@ -316,139 +314,6 @@ def _nothing(text: str, folder: Path) -> str:
     if os.path.isdir(folder / text):  # noqa: PTH112
         return f"{text}: no log in this folder; logs end in {', '.join(LOG_ENDINGS)}"
     return f"{text}: no such file; check the path"
-
-
-def identify(
-    paths: Sequence[str], known: Mapping[str, str], workers: Workers, progress: Progress
-) -> tuple[dict[str, str | None], dict[str, str | None]]:
-    """Return the identity of each log, and the states of their files.
-
-    An identity is a hash of bytes, or what a server says of a version; None if the log cannot be read. The
-    path, size, times and inode of a file, its state, only decide whether it is hashed again.
-
-    Args:
-        known: identities by states.
-        workers: they read the logs that are not known.
-        progress: shows how many have been read.
-    """
-    states = {path: None if is_address(path) else _state(path) for path in paths}
-    unknown = [path for path, state in states.items() if state is None or state not in known]
-    groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
-    # few are read sooner than a process begins
-    at_work = ThisProcess() if len(groups) == 1 else workers
-    identity_by_path: dict[str, str | None] = {}
-    with progress("logs read", len(unknown)) as advance:
-        for group, identities in at_work.results(identities_of, groups) if groups else ():
-            identity_by_path |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
-            advance(len(group))
-    return {
-        path: identity_by_path[path] if path in identity_by_path else known[states[path] or ""]
-        for path in paths
-    }, states
-
-
-def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
-    """Return the identity of each log; None if it cannot be read."""
-    if not any(map(is_address, paths)):
-        # in this thread, which a signal interrupts
-        return {path: _identity(path) for path in paths}
-    return dict(zip(paths, each_ahead(_identity, paths, _TOGETHER), strict=True))
-
-
-def _identity(path: str) -> str | None:
-    try:
-        return _version_at(path) if is_address(path) else _hash_of_log(path)
-    except (OSError, ValueError, SpatialReplayError):
-        return None
-
-
-def _files_of(path: str) -> list[Path]:
-    """Return the files that a log consists of; of an episode, those with its numbers and its metadata."""
-    address = data_set_address(path)
-    data_set = None if address is None else open_data_set(address[0])
-    if address is not None and data_set is not None:
-        return data_set.files(address[1])
-    whole = Path(path)
-    return sorted(file for file in whole.iterdir() if file.is_file()) if whole.is_dir() else [whole]
-
-
-def _state(path: str) -> str | None:
-    """Return a hash of what the file system says of a log's files: equal while they are unchanged.
-
-    Returns:
-        None if they cannot be read.
-    """
-    try:
-        # not as paths, which take longer than asking the disk
-        number = _episode_of(path)
-        files = [path] if number is None and not os.path.isdir(path) else map(str, _files_of(path))  # noqa: PTH112
-        states = [(os.path.realpath(file), os.stat(file)) for file in files]  # noqa: PTH116
-    except (OSError, ValueError, SpatialReplayError):
-        return None
-    text = json.dumps(
-        [
-            *([] if number is None else [number]),
-            *(
-                (name, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
-                for name, state in states
-            ),
-        ]
-    )
-    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
-
-
-def _episode_of(path: str) -> int | None:
-    """Return the number in the address of an episode; None for any other log."""
-    address = data_set_address(path)
-    return None if address is None else address[1]
-
-
-def _hash_of_log(path: str) -> str:
-    files, number = _files_of(path), _episode_of(path)
-    if Path(path).is_file():
-        return _hash_of(files[0])
-    if number is None and not Path(path).is_dir():
-        raise OSError(f"{path} is no regular file")
-    total = hashlib.sha256()
-    for file in files:
-        digest = _hash_of(file) if number is None else _cached_hash(file, file.stat().st_mtime_ns)
-        total.update(f"{file.name}\0{digest}\0".encode("utf-8", "surrogatepass"))
-    return f"files:{total.hexdigest()}" + ("" if number is None else f"#{number}")
-
-
-@lru_cache(maxsize=64)
-def _cached_hash(file: Path, state_ns: int) -> str:
-    """Return the hash of a file with many episodes, read once."""
-    return _hash_of(file)
-
-
-def _version_at(address: str) -> str:
-    """Return the identity of a log at an address.
-
-    Raises:
-        UsageError, RemoteError: it cannot be read.
-    """
-    file = log_file(address)
-    assert isinstance(file, RemoteFile)
-    files = bag_files_at(file) if file.name == BAG_METADATA else [file]
-    versions = [(str(file), *_version_of(file)) for file in files]
-    return f"version:{hashlib.sha256(json.dumps(versions).encode()).hexdigest()}"
-
-
-def _version_of(file: RemoteFile) -> tuple[int, str]:
-    """Return the size of a remote file, and its strong tag or, without one, the digest of its bytes."""
-    version = file.current_version()
-    if version.is_exact:
-        return version.size, str(version.tag)
-    digest = hashlib.sha256()
-    for piece in file.iter_whole():
-        digest.update(piece)
-    return version.size, digest.hexdigest()
-
-
-def _hash_of(path: Path) -> str:
-    with path.open("rb") as stream:
-        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -653,16 +518,18 @@ def run_batch(
         tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
-            for task, result in _evaluated_tasks(workers, list(tasks)) if tasks else ():
-                # a log that changed during the run has another key; at an address, readers see to that
-                is_same = is_address(task.log) or _state(task.log) == states[task.log]
-                for key, rows in zip(tasks[task], result, strict=True):
-                    # errors may pass
-                    if is_same and key in lasting and all(row.error is None for row in rows):
-                        new_rows.add(key, rows)
-                    else:
-                        unstored[key] = rows
-                advance(1)
+            for group, results in _evaluated_groups(workers, list(tasks)) if tasks else ():
+                now = states_of([task.log for task in group])
+                for task, result in zip(group, results, strict=True):
+                    # a log that changed during the run has another key; at an address, readers see to that
+                    is_same = now[task.log] == states[task.log]
+                    for key, rows in zip(tasks[task], result, strict=True):
+                        # errors may pass
+                        if is_same and key in lasting and all(row.error is None for row in rows):
+                            new_rows.add(key, rows)
+                        else:
+                            unstored[key] = rows
+                advance(len(group))
         table = _table(wanted, [stored, *new_rows.tables], unstored, fail_on)
         explanations = folder.read_explanations()
         names = zip(*(table.column(name).to_pylist() for name in ("key", "spec", "object")), strict=True)
@@ -674,27 +541,52 @@ def run_batch(
     return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
 
 
-_LEAST_GROUPS: Final = 64
-_MOST_IN_GROUP: Final = 16
+_GROUP_S: Final = 0.25
+"""How long evaluating the logs that a worker is given at once takes, about."""
+_MOST_IN_GROUP: Final = 64
 """Logs that a worker is given at once: handing out one takes longer than evaluating a short one."""
 
 
-def _evaluated_tasks(
+def _evaluated_groups(
     workers: Workers, tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Sequence[Sequence[ResultRow]]]]:
-    """Yield each task with its rows. The logs of a worker that died are evaluated again, one by one."""
-    size = max(1, min(len(tasks) // _LEAST_GROUPS, _MOST_IN_GROUP))
-    groups = [tuple(tasks[begin : begin + size]) for begin in range(0, len(tasks), size)]
-    while groups:
-        again: list[tuple[Task, ...]] = []
-        for group, rows in workers.results(rows_from_tasks, groups):
+) -> Iterator[tuple[Sequence[Task], Sequence[TaskRows]]]:
+    """Yield tasks with the rows of each. The logs of a worker that died are evaluated again, one by one."""
+    groups = _Groups(tasks)
+    again: list[tuple[Task, ...]] = []
+    for several in (groups, again):
+        for group, rows in workers.results(rows_from_tasks, several) if several else ():
             if not isinstance(rows, WorkerLost):
-                yield from zip(group, rows, strict=True)
+                groups.note(rows)
+                yield group, rows
             elif len(group) > 1:
                 again += [(task,) for task in group]
             else:
-                yield group[0], error_rows(group[0], str(rows), "machine")
-        groups = again
+                yield group, [error_rows(group[0], str(rows), "machine")]
+
+
+class _Groups:
+    """Tasks in groups, larger ones where the logs before were short."""
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        self._tasks, self._size = tasks, 1
+
+    def __iter__(self) -> Iterator[tuple[Task, ...]]:
+        begin = 0
+        while begin < len(self._tasks):
+            end = begin + self._size
+            yield tuple(self._tasks[begin:end])
+            begin = end
+
+    def note(self, rows: Iterable[TaskRows]) -> None:
+        """Take in how long the logs of a group took."""
+        seconds = [
+            rows_of_log[0][0].seconds
+            for rows_of_log in rows
+            if rows_of_log[0] and rows_of_log[0][0].error is None
+        ]
+        if seconds:
+            mean_s = max(sum(seconds) / len(seconds), 1e-6)
+            self._size = max(1, min(int(_GROUP_S / mean_s), _MOST_IN_GROUP))
 
 
 def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:

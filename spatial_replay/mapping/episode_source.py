@@ -341,7 +341,7 @@ def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
     """Return the numbers a frame of each feature; None for columns that are not joined with others."""
     if columns.bodies or any(len(values) != len(columns.times_ns) for values in columns.features.values()):
         return None
-    return tuple((name, values.shape[1:]) for name, values in columns.features.items())
+    return tuple(sorted((name, values.shape[1:]) for name, values in columns.features.items()))
 
 
 def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:

@@ -252,16 +252,20 @@ class DataSet:
                 raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
         return None
 
-    def files(self, number: int) -> list[Path]:
-        """Return the files that an episode depends on: all of the data set, unless its format knows better.
-
-        Raises:
-            LogError: they cannot be found.
-        """
+    def shared_files(self) -> list[Path]:
+        """Return the files that every episode depends on: all of them, unless the format knows better."""
         if self.path.is_file():
             about = self.path.with_suffix(".json")
             return [self.path, *([about] if about.is_file() else [])]
         return sorted(file for file in self.path.rglob("*") if file.is_file())
+
+    def files_of(self, number: int) -> list[Path]:
+        """Return the other files that an episode depends on.
+
+        Raises:
+            LogError: they cannot be found.
+        """
+        return []
 
     def episode(self, number: int) -> Episode:
         """Return the episode of a number.

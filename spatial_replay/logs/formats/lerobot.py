@@ -132,11 +132,15 @@ class _LeRobot(DataSet):
         times_ns = frame_times_ns(frames.astype(np.int64), fps)
         return EpisodeColumns(times_ns, remarks=remarks, unjudged=unjudged)
 
-    def files(self, number: int) -> list[Path]:
-        """See `DataSet.files`."""
+    def shared_files(self) -> list[Path]:
+        """See `DataSet.shared_files`."""
         meta = [self.path / "meta" / "info.json", self.path / "meta" / "episodes.jsonl"]
         meta += sorted((self.path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
-        return [file for file in meta if file.exists()] + [rows.file for rows in self._places(number)]
+        return [file for file in meta if file.exists()]
+
+    def files_of(self, number: int) -> list[Path]:
+        """See `DataSet.files_of`."""
+        return [rows.file for rows in self._places(number)]
 
     def _places(self, number: int) -> list[_Rows]:
         """Return the rows of an episode: in a file of its own, or in all files that have some.

@@ -1,0 +1,179 @@
+"""What logs hold, as hashes: equal ones share their results, and those that did not change keep theirs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+from spatial_replay.batch.workers import Progress, ThisProcess, WorkerLost, Workers
+from spatial_replay.errors import SpatialReplayError
+from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
+from spatial_replay.logs.formats.episodes import DataSet
+from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, each_ahead, is_address, log_file
+from spatial_replay.sources.open_log import bag_files_at
+
+_TOGETHER: Final = 16
+"""Logs that are hashed as one task."""
+
+
+def identify(
+    paths: Sequence[str], known: Mapping[str, str], workers: Workers, progress: Progress
+) -> tuple[dict[str, str | None], dict[str, str | None]]:
+    """Return the identity of each log, and the states of their files.
+
+    An identity is a hash of bytes, or what a server says of a version; None if the log cannot be read. The
+    path, size, times and inode of a file, its state, only decide whether it is hashed again.
+
+    Args:
+        known: identities by states.
+        workers: they read the logs that are not known.
+        progress: shows how many have been read.
+    """
+    states = states_of(paths)
+    unknown = [path for path, state in states.items() if state is None or state not in known]
+    groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
+    # few are read sooner than a process begins
+    at_work = ThisProcess() if len(groups) == 1 else workers
+    identity_by_path: dict[str, str | None] = {}
+    with progress("logs read", len(unknown)) as advance:
+        for group, identities in at_work.results(identities_of, groups) if groups else ():
+            identity_by_path |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
+            advance(len(group))
+    return {
+        path: identity_by_path[path] if path in identity_by_path else known[states[path] or ""]
+        for path in paths
+    }, states
+
+
+def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
+    """Return the identity of each log; None if it cannot be read."""
+    if not any(map(is_address, paths)):
+        # in this thread, which a signal interrupts
+        files = _LogFiles()
+        return {path: _identity(path, files) for path in paths}
+    return dict(zip(paths, each_ahead(_identity, paths, _TOGETHER), strict=True))
+
+
+def _identity(path: str, files: _LogFiles | None = None) -> str | None:
+    try:
+        return _version_at(path) if is_address(path) else _hash_of_log(path, files or _LogFiles())
+    except (OSError, ValueError, SpatialReplayError):
+        return None
+
+
+class _LogFiles:
+    """The files of logs as they are now: a data set, and each file, is looked at once."""
+
+    def __init__(self) -> None:
+        self._data_sets: dict[str, tuple[DataSet | None, list[str]]] = {}
+        self._states: dict[str, tuple[str, os.stat_result]] = {}
+
+    def of(self, path: str) -> tuple[list[str], int | None]:
+        """Return the files that a log consists of, and the number of an episode, None for any other log.
+
+        Those of an episode are the files with its numbers and its metadata.
+        """
+        address = data_set_address(path)
+        if address is not None:
+            data_set, shared = self._data_set(address[0])
+            if data_set is not None:
+                return [*shared, *map(str, data_set.files_of(address[1]))], address[1]
+        # not as paths, which take longer than asking the disk
+        if not os.path.isdir(path):  # noqa: PTH112
+            return [path], None
+        return sorted(str(file) for file in Path(path).iterdir() if file.is_file()), None
+
+    def state(self, file: str) -> tuple[str, os.stat_result]:
+        """Return the real path of a file, and what the file system says of it."""
+        if file not in self._states:
+            self._states[file] = os.path.realpath(file), os.stat(file)  # noqa: PTH116
+        return self._states[file]
+
+    def _data_set(self, path: str) -> tuple[DataSet | None, list[str]]:
+        if path not in self._data_sets:
+            data_set = open_data_set(path)
+            shared = [] if data_set is None else [str(file) for file in data_set.shared_files()]
+            self._data_sets[path] = data_set, shared
+        return self._data_sets[path]
+
+
+def states_of(paths: Sequence[str]) -> dict[str, str | None]:
+    """Return hashes of what the file system says of the files of logs: equal while they are unchanged.
+
+    None for an address, and for files that cannot be read.
+    """
+    files = _LogFiles()
+    return {path: None if is_address(path) else _state(path, files) for path in paths}
+
+
+def _state(path: str, files: _LogFiles) -> str | None:
+    try:
+        names, number = files.of(path)
+        states = [files.state(name) for name in names]
+    except (OSError, ValueError, SpatialReplayError):
+        return None
+    text = json.dumps(
+        [
+            *([] if number is None else [number]),
+            *(
+                (name, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+                for name, state in states
+            ),
+        ]
+    )
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _hash_of_log(path: str, files: _LogFiles) -> str:
+    names, number = files.of(path)
+    if Path(path).is_file():
+        return _hash_of(Path(path))
+    if number is None and not Path(path).is_dir():
+        raise OSError(f"{path} is no regular file")
+    total = hashlib.sha256()
+    for name in names:
+        digest = (
+            _hash_of(Path(name)) if number is None else _cached_hash(name, files.state(name)[1].st_mtime_ns)
+        )
+        total.update(f"{Path(name).name}\0{digest}\0".encode("utf-8", "surrogatepass"))
+    return f"files:{total.hexdigest()}" + ("" if number is None else f"#{number}")
+
+
+@lru_cache(maxsize=64)
+def _cached_hash(file: str, state_ns: int) -> str:
+    """Return the hash of a file with many episodes, read once."""
+    return _hash_of(Path(file))
+
+
+def _version_at(address: str) -> str:
+    """Return the identity of a log at an address.
+
+    Raises:
+        UsageError, RemoteError: it cannot be read.
+    """
+    file = log_file(address)
+    assert isinstance(file, RemoteFile)
+    files = bag_files_at(file) if file.name == BAG_METADATA else [file]
+    versions = [(str(file), *_version_of(file)) for file in files]
+    return f"version:{hashlib.sha256(json.dumps(versions).encode()).hexdigest()}"
+
+
+def _version_of(file: RemoteFile) -> tuple[int, str]:
+    """Return the size of a remote file, and its strong tag or, without one, the digest of its bytes."""
+    version = file.current_version()
+    if version.is_exact:
+        return version.size, str(version.tag)
+    digest = hashlib.sha256()
+    for piece in file.iter_whole():
+        digest.update(piece)
+    return version.size, digest.hexdigest()
+
+
+def _hash_of(path: Path) -> str:
+    with path.open("rb") as stream:
+        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
