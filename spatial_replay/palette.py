@@ -21,8 +21,6 @@ LABEL: Final = (0.95, 0.95, 0.95)
 CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
 """Colours of curves in one plot, distinguishable with every common colour blindness (Okabe and Ito)."""
 
-MAP: Final = ("#00204d", "#414d6b", "#7c7b78", "#bcae6c", "#ffea46")
-"""Colours of a gradient map, from what fails most to what holds most (five of cividis)."""
 
 _LIGHTER: Final = 0.4
 
@@ -44,6 +42,9 @@ def lighter(colour: str) -> str:
     red, green, blue = (share + _LIGHTER * (1.0 - share) for share in shares)
     return hexadecimal((red, green, blue))
 
+
+MAP: Final = (hexadecimal(NEGATIVE), "#f5f5f5", hexadecimal(POSITIVE))
+"""Colours of a gradient map, from what fails most over 0 to what holds most."""
 
 SIGNS: Final = MappingProxyType(
     {

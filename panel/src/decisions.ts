@@ -2,19 +2,23 @@
 
 import {
   element, inShort, makeDecision, numberText, printable, secondsText,
-  type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnTarget,
+  type DrawnBar, type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnOutline, type DrawnTarget,
 } from "report-drawing";
 import { createElement, type ReactElement } from "react";
 
 import { TimedList } from "./event-list";
-import { wide, type DecisionMessage, type GridMessage, type TargetMessage } from "./messages";
+import { wide, type DecisionMessage, type GridMessage, type SceneMessage, type TargetMessage } from "./messages";
 import type { Cursor, View, Viewer } from "./viewer";
 
 const DECISION = "/plan/decision";
 const MAP = "/plan/gradient_map";
+const SCENE = "/spatial/scene";
 /** Cells of all maps that are kept: 16 MiB. */
 const MOST_CELLS = 1 << 22;
 const MOST_GUARDS = 4;
+const OBJECT = "object/";
+/** A type of a field of cells. */
+const UINT16 = 3;
 /** Conjuncts and causes that are listed of a map. */
 const MOST_LISTED = 3;
 const KINDS = ["", "execute", "hold", "wait", "no path"];
@@ -32,6 +36,7 @@ interface Owner {
 
 export class DecisionsView implements View {
   readonly topics = [DECISION, MAP];
+  readonly currentTopics = [SCENE];
   readonly body = element("div", { class: "panel-body decisions" });
   private readonly card = element("ol", { class: "cards" });
   private readonly pruned = element("div", { class: "tasks" });
@@ -40,7 +45,11 @@ export class DecisionsView implements View {
   /** By number; with its outcome once that is known. */
   private readonly decisions = new Map<number, Decision>();
   private readonly maps = new Map<number, GridMessage>();
+  /** Fields of all cells are read once. */
+  private readonly drawn = new WeakMap<GridMessage, DrawnMap | null>();
   private readonly mapsByTime = new Map<number, GridMessage[]>();
+  /** The objects of the newest scene. */
+  private outlines: DrawnOutline[] = [];
   private cells = 0;
   private mapsRead = 0;
   private shown = "";
@@ -49,7 +58,7 @@ export class DecisionsView implements View {
   constructor(viewer: Viewer) {
     this.clock = {
       run: {
-        settles: true, results: [], numbers: (values) => values,
+        settles: true, results: [], lengths: "", numbers: (values) => values, outlinesAt: () => this.outlines,
         palette: { positive: "#0072b2", negative: "#d55e00", neutral: "#8c8c8c", curves: [] },
       },
       view: [0, 0], time: 0, seek: (time) => viewer.seek(time), pause: () => undefined,
@@ -69,6 +78,10 @@ export class DecisionsView implements View {
   }
 
   take(topic: string, time: number, message: unknown, isOfRange: boolean): void {
+    if (topic === SCENE) {
+      this.outlines = outlinesOf(message as SceneMessage);
+      return;
+    }
     if (topic === MAP) {
       this.takeMap(time, message as GridMessage, isOfRange);
       return;
@@ -162,7 +175,8 @@ export class DecisionsView implements View {
     const found: DrawnMap[] = [];
     [...owners].sort(([a], [b]) => a - b).forEach(([number, owner], place) => {
       const grid = this.maps.get(number) ?? (live.length === owners.size ? live[place] : undefined);
-      const drawn = grid && drawnMap(grid, owner, decision.message);
+      if (grid && !this.drawn.has(grid)) this.drawn.set(grid, drawnMap(grid, owner, decision.message));
+      const drawn = grid && this.drawn.get(grid);
       if (drawn) found.push(drawn);
     });
     return found;
@@ -170,31 +184,60 @@ export class DecisionsView implements View {
 }
 
 function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): DrawnMap | null {
-  const { column_count: columns, cell_stride: cell, row_stride: row, data } = grid;
-  const rows = row ? Math.floor(data.length / row) : 0;
-  const offset = grid.fields.find((field) => field.name.startsWith("robustness"))?.offset ?? cell;
-  if (!rows || !columns || cell * columns > row || offset + 4 > cell) return null;
-  const bytes = new DataView(data.buffer, data.byteOffset, data.byteLength);
-  const values = new Float32Array(rows * columns);
-  let scale = 0;
-  for (let y = 0; y < rows; y++) {
-    for (let x = 0; x < columns; x++) {
-      const number = values[y * columns + x] = bytes.getFloat32(y * row + x * cell + offset, true);
-      if (Number.isFinite(number)) scale = Math.max(scale, Math.abs(number));
-    }
-  }
+  const values = fieldOf(grid, "robustness");
+  if (!values) return null;
+  const { column_count: columns } = grid;
   const { x = 0, y = 0 } = grid.pose?.position ?? {};
+  const rows = values.length / columns;
   const high: [number, number] = [x + columns * (grid.cell_size?.x ?? 0), y + rows * (grid.cell_size?.y ?? 0)];
   if (![x, y, ...high].every(Number.isFinite) || high[0] <= x || high[1] <= y) return null;
   const candidate = decision.considered[owner.edge]!.candidates[owner.candidate]!;
+  const { conjuncts = [], causes = [], room } = candidate;
   const turned = candidate.maps.length > 1 ? `, turned by ${degrees(owner.turn)}` : "";
   const target = candidate.target && (candidate.target.turn ?? 0) === owner.turn ? drawnTarget(candidate.target) : null;
   const isLast = owner.edge === decision.considered.length - 1;
+  const object = printable(candidate.object);
+  const layers = conjuncts.map(({ text }, index) => ({ name: `${index + 1}: ${text}`, number: index + 1 }))
+    .map(({ name, number }) => ({ number, title: printable(name), values: fieldOf(grid, name) }))
+    .filter((layer): layer is { number: number; title: string; values: Float32Array } => layer.values !== null);
+  const [limited, blocked, around] = ["limited_by", "blocked_by", "room"].map((name) => fieldOf(grid, name));
   return {
-    columns, low: [x, y], high, scale, values, edge: owner.edge, candidate: owner.candidate, target,
-    title: printable(candidate.object) + turned,
+    columns, low: [x, y], high, values, edge: owner.edge, candidate: owner.candidate, target, object, layers,
+    scale: values.reduce((most, number) => (Number.isFinite(number) ? Math.max(most, Math.abs(number)) : most), 0),
+    title: object + turned,
     chosen: Boolean(decision.target && isLast && candidate.chosen && target),
+    limits: conjuncts.map(({ text }) => printable(text)), blocks: causes.map(causeWords),
+    ...(limited && blocked ? { limited, blocked } : {}),
+    ...(target ? { at_target: conjuncts.map((conjunct) => conjunct.at_target ?? null) } : {}),
+    ...(room && around ? { room: around, wanted_room: room.wanted ?? 0 } : {}),
   };
+}
+
+/** Returns a field of all cells, row by row; null if the message has no such field, or sizes that do not fit. */
+function fieldOf(grid: GridMessage, name: string): Float32Array | null {
+  const { column_count: columns, cell_stride: cell, row_stride: row, data } = grid;
+  const rows = row ? Math.floor(data.length / row) : 0;
+  const field = grid.fields.find((each) => each.name === name);
+  const isShort = field?.type === UINT16;
+  if (!field || !rows || !columns || cell * columns > row || field.offset + (isShort ? 2 : 4) > cell) return null;
+  const bytes = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  return Float32Array.from({ length: rows * columns }, (_, place) => {
+    const offset = Math.floor(place / columns) * row + (place % columns) * cell + field.offset;
+    return isShort ? bytes.getUint16(offset, true) : bytes.getFloat32(offset, true);
+  });
+}
+
+/** Returns the objects of a scene with their outlines. */
+function outlinesOf({ entities }: SceneMessage): DrawnOutline[] {
+  return entities.filter(({ id }) => id.startsWith(OBJECT)).map(({ id, lines }) => ({
+    name: printable(id.slice(OBJECT.length)),
+    rings: lines.map(({ pose, points }) => {
+      const { x = 0, y = 0 } = pose?.position ?? {};
+      const { z = 0, w = 1 } = pose?.orientation ?? {};
+      const [sin, cos] = [2 * z * w, 1 - 2 * z * z];
+      return points.flatMap((point) => [x + cos * point.x - sin * point.y, y + sin * point.x + cos * point.y]);
+    }),
+  }));
 }
 
 function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
@@ -203,6 +246,7 @@ function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
     number: message.number ?? 0, time, specification: printable(message.specification), kind: KINDS[message.kind] ?? "",
     states: [...message.states], reason: printable(message.reason), maps,
     target: message.target ? drawnTarget(message.target) : null,
+    margin: message.margin ?? null,
     outcome: !message.outcome ? null : {
       time: time + Number(wide(message.outcome.end_ns) - wide(message.time_ns)) / 1e9, succeeded: message.outcome.succeeded ?? false, reason: printable(message.outcome.reason),
       states: [...message.outcome.states],
@@ -210,10 +254,12 @@ function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
     edges: message.considered.map((edge) => ({
       path: [...edge.path], aim: edge === last && !edge.pruned, progress: guards(edge.progress),
       constraints: guards(edge.constraints), pruned: printable(edge.pruned),
+      later: (edge.motions ?? []).slice(1).map((motion) => `${printable(motion.object)} to ${drawnTarget(motion).words}`),
+      once: edge.joint && (edge.motions?.length ?? 0) > 1 ? ` once all ${edge.motions!.length} motions are done` : "",
       candidates: edge.candidates.map((each) => ({
-        object: printable(each.object), best: each.best === -Infinity ? "nowhere free" : numberText(each.best ?? NaN),
+        object: printable(each.object), best: Math.max(each.best ?? NaN, each.target?.robustness ?? -Infinity),
         status: each.rejected ? "rejected" : each.chosen ? "chosen" : "possible", rejected: printable(each.rejected),
-        why: whyOf(each),
+        ...barsOf(each),
         target: each.target ? drawnTarget(each.target) : null,
       })),
     })),
@@ -222,20 +268,39 @@ function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
 
 type Candidate = DecisionMessage["considered"][number]["candidates"][number];
 
-/** What limits, blocks and costs the target of an object; logs of earlier planners do not say. */
-function whyOf({ conjuncts = [], causes = [], room, target }: Candidate): string[] {
-  const cells = (count = 0) => `${count} cell${count === 1 ? "" : "s"}`;
-  const limiting = conjuncts.filter((each) => each.limits).sort((a, b) => (b.limits ?? 0) - (a.limits ?? 0));
-  const words = ["something unknown", "", "", "an obstacle of the workspace", "the robot's reach", "something unknown", "a motion that failed there"];
-  const lines = [
-    ...limiting.slice(0, MOST_LISTED).map((each) => `limited by ${printable(each.text)} in ${cells(each.limits)}`),
-    ...causes.slice(0, MOST_LISTED).map((each) => `blocked by ${printable(each.text) || words[each.kind]} in ${cells(each.cells)}`),
-  ];
-  if (room && target) {
-    lines.push(`room ${numberText(target.robustness ?? NaN)} chosen, ${numberText(room.possible ?? NaN)} possible with less room `
-      + `(${numberText(room.clearance ?? NaN)} of ${numberText(room.wanted ?? NaN)})`);
+/** How many cells each demand limits and each cause blocks; logs of earlier planners do not say. */
+function barsOf({ conjuncts = [], causes = [], room, target }: Candidate): { cells: number; bars: DrawnBar[]; room: string } {
+  const limits = conjuncts.filter((each) => each.limits).sort((a, b) => (b.limits ?? 0) - (a.limits ?? 0))
+    .map((each) => ({ kind: "limited by", words: ["", printable(each.text)], cells: each.limits ?? 0 }));
+  const blocks = causes.map((each) => ({ kind: "blocked", words: causeWords(each), cells: each.cells ?? 0 }));
+  return {
+    cells: [...limits, ...blocks].reduce((sum, { cells }) => sum + cells, 0),
+    bars: [...limits.slice(0, MOST_LISTED), ...blocks.slice(0, MOST_LISTED)],
+    room: room && target ? `${numberText(target.robustness ?? NaN)} chosen, ${numberText(room.possible ?? NaN)} possible with `
+      + `less room (${numberText(Math.max(room.clearance ?? NaN, 0))} of ${numberText(room.wanted ?? NaN)})` : "",
+  };
+}
+
+/** Why an object must not be in a cell: text and code, in turn; see cause_sentence in planning/decision_log.py. */
+function causeWords({ kind, text }: { readonly kind: number; readonly text: string }): string[] {
+  const words = printable(text);
+  const inner = deniedIn(words);
+  if (kind === 1) return inner ? ["", inner, " would fail"] : ["", words, " would hold"];
+  const sentences = ["", "", `${words} stands there`, "an obstacle of the workspace stands there", "the robot does not reach it",
+    "", "a motion to a place near it failed"];
+  return [sentences[kind] || "something that has to hold is unknown there"];
+}
+
+/** Returns what "not (…)" denies; nothing of a text of another form. */
+function deniedIn(text: string): string {
+  if (!text.startsWith("not (") || !text.endsWith(")")) return "";
+  const inner = text.slice(5, -1);
+  let depth = 0;
+  for (const letter of inner) {
+    depth += letter === "(" ? 1 : letter === ")" ? -1 : 0;
+    if (depth < 0) return "";
   }
-  return lines;
+  return inner;
 }
 
 function guards(found: readonly { readonly text: string }[]): string[] {
@@ -250,7 +315,7 @@ function drawnTarget(target: TargetMessage): DrawnTarget {
   return {
     object: printable(target.object), at: isDrawn ? [x, y] : null, way: isDrawn ? way : [],
     words: `(${numberText(x)}, ${numberText(y)})${turn ? `, turned by ${degrees(turn)}` : ""}`,
-    robustness: numberText(target.robustness ?? NaN),
+    turn, robustness: target.robustness ?? null,
   };
 }
 

@@ -121,7 +121,10 @@ export interface DecisionMessage {
       readonly room?: { readonly wanted?: number; readonly possible?: number; readonly clearance?: number } | null;
     }[];
     readonly pruned: string;
+    readonly motions?: readonly TargetMessage[];
+    readonly joint?: boolean;
   }[];
+  readonly margin?: number;
   readonly target?: TargetMessage | null;
   readonly pruned: readonly { readonly source?: number; readonly target?: number; readonly reason: string }[];
   readonly reason: string;
@@ -139,8 +142,21 @@ export interface GridMessage {
   readonly cell_size?: { readonly x: number; readonly y: number } | null;
   readonly row_stride: number;
   readonly cell_stride: number;
-  readonly fields: readonly { readonly name: string; readonly offset: number }[];
+  readonly fields: readonly { readonly name: string; readonly offset: number; readonly type: number }[];
   readonly data: Uint8Array;
+}
+
+export interface SceneMessage {
+  readonly entities: readonly {
+    readonly id: string;
+    readonly lines: readonly {
+      readonly pose?: {
+        readonly position?: { readonly x: number; readonly y: number } | null;
+        readonly orientation?: { readonly z: number; readonly w: number } | null;
+      } | null;
+      readonly points: readonly { readonly x: number; readonly y: number }[];
+    }[];
+  }[];
 }
 
 /** Returns a time in nanoseconds. */

@@ -51,31 +51,38 @@ declare module "report-drawing" {
     parts: string[];
   }
   export interface DrawnTarget {
-    object: string; at: [number, number] | null; words: string; robustness: string; way: number[];
+    object: string; at: [number, number] | null; words: string; turn: number; robustness: number | null; way: number[];
   }
   export interface DrawnMap {
     columns: number; low: [number, number]; high: [number, number]; scale: number; values: Float32Array;
-    chosen: boolean; edge: number | null; candidate: number | null; title: string; target: DrawnTarget | null;
-    limited?: Float32Array; blocked?: Float32Array; limits?: string[]; blocks?: string[];
-    layers?: { title: string; values: Float32Array }[];
+    chosen: boolean; edge: number | null; candidate: number | null; object: string; title: string;
+    target: DrawnTarget | null;
+    limited?: Float32Array; blocked?: Float32Array; limits: string[]; blocks: string[][];
+    layers: { number: number; title: string; values: Float32Array }[]; at_target?: (number | null)[];
+    room?: Float32Array; wanted_room?: number;
   }
+  export interface DrawnBar { kind: string; words: string[]; cells: number }
   export interface DrawnEdge {
-    path: number[]; aim: boolean; progress: string[]; constraints: string[]; pruned: string;
+    path: number[]; aim: boolean; progress: string[]; constraints: string[]; pruned: string; later: string[]; once: string;
     candidates: {
-      object: string; best: string; status: string; rejected: string; target: DrawnTarget | null;
-      why?: string[];
+      object: string; best: number | null; status: string; rejected: string; target: DrawnTarget | null;
+      cells: number; bars: DrawnBar[]; room: string;
     }[];
   }
+  /** An object with its outlines: points x and y in turn. */
+  export interface DrawnOutline { name: string; rings: number[][] }
   export interface DrawnDecision {
     number: number; time: number; specification: string; kind: string; states: number[]; reason: string;
-    edges: DrawnEdge[]; maps: DrawnMap[]; target: DrawnTarget | null;
+    edges: DrawnEdge[]; maps: DrawnMap[]; target: DrawnTarget | null; margin: number | null;
     outcome: { time: number; succeeded: boolean; reason: string; states: number[] } | null;
   }
   export interface DrawnRun {
     settles: boolean;
     results: DrawnResult[];
     palette: { positive: string; negative: string; neutral: string; curves: string[] };
+    lengths: string;
     numbers(values: Float32Array): Float32Array;
+    outlinesAt(time: number): DrawnOutline[];
   }
   /** The part of the page's clock that drawings use. */
   export interface DrawnClock {

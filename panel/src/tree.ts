@@ -91,7 +91,7 @@ export class Tree {
       first: 0, samples: 0, times: this.series.times, nodes,
     };
     this.run = {
-      settles: true, results: [this.result], numbers: (values) => values,
+      settles: true, results: [this.result], lengths: "", outlinesAt: () => [], numbers: (values) => values,
       palette: { positive: "", negative: "", neutral: "", curves: [] },
     };
     this.made = element("ul", {}, ...(nodes[0] ? [branch(nodes[0], this.rows)] : []));

@@ -44,6 +44,8 @@ export interface View {
   readonly body: HTMLElement;
   /** Topics besides the specification's, in the order in which their ranges are read. */
   readonly topics: readonly string[];
+  /** Topics of which only the newest message before the cursor counts; their ranges are not read. */
+  readonly currentTopics?: readonly string[];
   /** Takes another specification; what was taken before is about a former one. */
   specify(message: SpecificationMessage): void;
   /** Forgets the messages of a topic: all of its messages follow. */
@@ -124,7 +126,7 @@ class Panel implements Viewer {
     };
     const fields = ["currentFrame", "currentTime", "startTime", "previewTime", "colorScheme", "didSeek", "topics"] as const;
     for (const field of fields) context.watch(field);
-    context.subscribe([SPECIFICATION, ...this.view.topics].map((topic) => ({ topic })));
+    context.subscribe([SPECIFICATION, ...this.view.topics, ...(this.view.currentTopics ?? [])].map((topic) => ({ topic })));
     this.readRange(SPECIFICATION).catch(report);
     this.refresh();
   }

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
 
 from spatial_replay.errors import UsageError, importing
-from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.palette import MAP, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.text import printable
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 INK: Final = "#24292f"
 """Colour of text on light colours, in any style of page."""
-_MIDDLE: Final = (0.96, 0.96, 0.96)
 
 
 def new_panels(
@@ -70,7 +69,7 @@ def signed_colours() -> Colormap:
     """Return a colour map from vermillion over almost white to blue, for signed numbers."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    return LinearSegmentedColormap.from_list("robustness", [NEGATIVE, _MIDDLE, POSITIVE])
+    return LinearSegmentedColormap.from_list("robustness", MAP)
 
 
 def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> None:

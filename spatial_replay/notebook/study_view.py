@@ -332,6 +332,7 @@ def draw_map(
     turn: int | None = None,
     sample: Sample | None = None,
     target: Target | None = None,
+    margin: float | None = None,
 ) -> Axes:
     """Draw a map: blue where the progress set would hold, vermillion where not, blocked cells hatched.
 
@@ -339,13 +340,14 @@ def draw_map(
         turn: index of the orientation; by default that of the target or of the best free cell.
         sample: the sample with objects to draw over the map.
         target: where the object is to go; its path is drawn too.
+        margin: the robustness that a target needs; a line is drawn there.
 
     Raises:
         UsageError: matplotlib is not installed.
     """
     ax = new_panel((6.4, 5.2)) if ax is None else ax
     turn = _best_turn(gradient, target) if turn is None else turn
-    image = _draw_cells(gradient, ax, turn, _reach_of([gradient]))
+    image = _draw_cells(gradient, ax, turn, _reach_of([gradient]), margin)
     _draw_objects(ax, sample, gradient.name)
     if target is not None:
         _draw_target(ax, target, sample)
@@ -373,11 +375,12 @@ def _reach_of(maps: Sequence[GradientMap]) -> float:
     return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
 
-def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float) -> AxesImage:
+def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin: float | None) -> AxesImage:
     """Draw the cells of one orientation.
 
     Args:
         reach: the absolute robustness that gets the full colours.
+        margin: the robustness at which a line is drawn.
     """
     grid = gradient.grid
     right, top = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
@@ -386,10 +389,13 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float) -> Axe
         gradient.values[turn], cmap=signed_colours(), vmin=-reach, vmax=reach, origin="lower",
         extent=(grid.xmin, right, grid.ymin, top), interpolation="nearest",
     )  # fmt: skip
+    x, y = (axis.reshape(grid.shape) for axis in grid.centres().T)
+    values = gradient.values[turn]
+    if margin is not None and min(values.shape) > 1 and np.nanmin(values, initial=margin) < margin:
+        ax.contour(x, y, values, levels=[margin], colors=[INK], linewidths=[1.0])
     for reason, hatch in enumerate(_HATCHES):
         cells = gradient.blocked[turn] == reason
         if hatch and cells.any() and min(cells.shape) > 1:
-            x, y = (axis.reshape(grid.shape) for axis in grid.centres().T)
             hatched = ax.contourf(x, y, cells, levels=[0.5, 1.5], colors="none", hatches=[hatch])
             hatched.set(edgecolor=_HATCH, linewidth=0.0)
     return image
@@ -437,11 +443,12 @@ def step_html(step: Step) -> str:
 
 
 @plot.register(Step)
-def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
+def draw_step(step: Step, sample: Sample | None = None, *, margin: float | None = None) -> tuple[Axes, ...]:
     """Draw the maps of a step: a row for each edge considered, a column for each object.
 
     Args:
         sample: the sample of the decision; its objects are drawn over the maps.
+        margin: the robustness that a target needs; a line is drawn there.
 
     Returns:
         The axes of each map; none if the step has no map.
@@ -466,7 +473,7 @@ def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
     used_panels = tuple(panels[number] for number, _, _ in places)
     reach = _reach_of(maps)
     images = [
-        _draw_candidate(panel, edge, candidate, sample, reach)
+        _draw_candidate(panel, edge, candidate, sample, reach, margin)
         for panel, (_, edge, candidate) in zip(used_panels, places, strict=True)
     ]
     used_panels[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
@@ -479,12 +486,17 @@ def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
 
 
 def _draw_candidate(
-    ax: Axes, edge: Consideration, candidate: Candidate, sample: Sample | None, reach: float
+    ax: Axes,
+    edge: Consideration,
+    candidate: Candidate,
+    sample: Sample | None,
+    reach: float,
+    margin: float | None,
 ) -> AxesImage:
     """Draw one map, titled with the choice made on it."""
     gradient = candidate.map
     ax.set_axis_on()
-    image = _draw_cells(gradient, ax, _best_turn(gradient, candidate.target), reach)
+    image = _draw_cells(gradient, ax, _best_turn(gradient, candidate.target), reach, margin)
     _draw_objects(ax, sample, candidate.name)
     if candidate.target is not None:
         _draw_target(ax, candidate.target, sample)
@@ -505,4 +517,4 @@ def _choice_text(candidate: Candidate) -> str:
 @plot.register(LoggedStep)
 def draw_logged_step(logged: LoggedStep) -> tuple[Axes, ...]:
     """Draw the maps of a logged step with the objects of its sample; see `draw_step`."""
-    return draw_step(logged.step, logged.sample)
+    return draw_step(logged.step, logged.sample, margin=logged.message.margin)

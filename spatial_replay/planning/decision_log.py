@@ -198,7 +198,7 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
 PLAN_VERSION: Final = 2
 """Version of the messages; a log of another version cannot be recomputed."""
 
-_MOST_LISTED: Final = 3
+MOST_LISTED: Final = 3
 """Conjuncts and causes that are listed of a map."""
 
 _LONGEST: Final = 400
@@ -407,6 +407,7 @@ def explained_decision(
     """
     layers = layers or _layers_of(step, planner)
     message = decision_message(step, planner.automaton.name, first_map)
+    message.margin = planner.settings.margin
     for edge, of_edge in zip(step.considered, message.considered, strict=True):
         for candidate, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
             explain(of_candidate, candidate, layers[candidate], planner.settings)
@@ -566,8 +567,7 @@ def brief_lines(decision: PlanDecision) -> Iterator[str]:
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}: {decision.reason}"
     if decision.considered:
         edge = decision.considered[-1]
-        never = f"; never {_some([guard.text for guard in edge.constraints])}" if edge.constraints else ""
-        yield f"  wanted   {_some([guard.text for guard in edge.progress])}{never}"
+        yield f"  wanted   {_some([guard.text for guard in edge.progress])}{_ban_text(edge)}"
         for candidate in edge.candidates:
             if candidate.chosen:
                 rows = [f"{key} {text}" for key, text in candidate_lines(candidate)]
@@ -576,6 +576,15 @@ def brief_lines(decision: PlanDecision) -> Iterator[str]:
         if rivals:
             yield f"  instead  {'; '.join(rivals)}"
     yield f"  {_outcome_text(decision)}" if decision.HasField("outcome") else "  no outcome"
+
+
+def _ban_text(edge: PlanEdge) -> str:
+    """Return what must never hold on the way, and what always has to."""
+    texts = [guard.text for guard in edge.constraints]
+    always = [denied for text in texts if (denied := _denied(text))]
+    never = [text for text in texts if not _denied(text)]
+    both = " and ".join(always if len(always) == 1 else (f"({text})" for text in always))
+    return (f"; always {both}" if always else "") + (f"; never {_some(never)}" if never else "")
 
 
 def _rival_text(candidate: PlanCandidate) -> str:
@@ -626,7 +635,7 @@ def _candidate_text(candidate: PlanCandidate) -> str:
     if candidate.rejected:
         return f"{name}: rejected, {candidate.rejected}"
     mark = "chosen" if candidate.chosen else "possible"
-    return f"{name}: {mark}, {candidate.best:.4g} at best; {_target_text(candidate.target)}"
+    return f"{name}: {mark}, {best_robustness(candidate):.4g} at best; {_target_text(candidate.target)}"
 
 
 def _maps(candidate: PlanCandidate) -> str:
@@ -662,24 +671,47 @@ def _some(texts: Sequence[str]) -> str:
     return (f"({texts[0]})" if more and count == 1 else either(texts[:count])) + more
 
 
+def limiting_conjuncts(candidate: PlanCandidate) -> list[PlanConjunct]:
+    """Return the conjuncts that limit free cells, most cells first."""
+    limiting = (conjunct for conjunct in candidate.conjuncts if conjunct.limits)
+    return sorted(limiting, key=lambda conjunct: -conjunct.limits)
+
+
+def best_robustness(candidate: PlanCandidate) -> float:
+    """Return the greatest robustness found: at the centre of a free cell, or at the target within one."""
+    target = candidate.target.robustness if candidate.HasField("target") else -math.inf
+    return max(candidate.best, target)
+
+
 def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
     """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
-    limiting = sorted(
-        (conjunct for conjunct in candidate.conjuncts if conjunct.limits),
-        key=lambda conjunct: -conjunct.limits,
-    )
-    for conjunct in limiting[:_MOST_LISTED]:
+    for conjunct in limiting_conjuncts(candidate)[:MOST_LISTED]:
         at_target = f", {conjunct.at_target:.4g} at the target" if conjunct.HasField("at_target") else ""
         yield "limited by", f"{conjunct.text} in {counted(conjunct.limits, 'cell')}{at_target}"
-    for cause in candidate.causes[:_MOST_LISTED]:
+    for cause in candidate.causes[:MOST_LISTED]:
         yield "blocked by", f"{cause_text(cause)} in {counted(cause.cells, 'cell')}"
     if candidate.HasField("room"):
-        room = candidate.room
-        yield (
-            "room",
-            f"{candidate.target.robustness:.4g} chosen, {room.possible:.4g} possible with less room "
-            f"({max(room.clearance, 0.0):.3g} of {room.wanted:.3g})",
-        )
+        yield "room", room_sentence(candidate)
+
+
+def room_sentence(candidate: PlanCandidate) -> str:
+    """Return what the room around a target costs; nothing if it costs nothing."""
+    if not candidate.HasField("room"):
+        return ""
+    room = candidate.room
+    return (
+        f"{candidate.target.robustness:.4g} chosen, {room.possible:.4g} possible with less room "
+        f"({max(room.clearance, 0.0):.3g} of {room.wanted:.3g})"
+    )
+
+
+def _denied(text: str) -> str:
+    """Return what `not (…)` denies; nothing of a text of another form."""
+    if not text.startswith("not (") or not text.endswith(")"):
+        return ""
+    inner = text.removeprefix("not (")[:-1]
+    depths = accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in inner)
+    return inner if min(depths, default=0) >= 0 else ""
 
 
 def cause_text(cause: PlanCause) -> str:
@@ -689,7 +721,23 @@ def cause_text(cause: PlanCause) -> str:
         cause.KIND_REACH: "the robot's reach",
         cause.KIND_FAILED: "a motion that failed there",
     }
+    if (denied := _denied(cause.text)) and cause.kind == cause.KIND_CONSTRAINT:
+        return f"{denied}, which would fail,"
     return cause.text or texts.get(cause.kind, "something unknown")
+
+
+def cause_sentence(cause: PlanCause) -> str:
+    """Return why an object must not be in a cell, with formulas between backquotes."""
+    texts = {
+        cause.KIND_OBJECT: f"{cause.text} stands there",
+        cause.KIND_OBSTACLE: "an obstacle of the workspace stands there",
+        cause.KIND_REACH: "the robot does not reach it",
+        cause.KIND_FAILED: "a motion to a place near it failed",
+    }
+    if cause.kind == cause.KIND_CONSTRAINT:
+        denied = _denied(cause.text)
+        return f"`{denied}` would fail" if denied else f"`{cause.text}` would hold"
+    return texts.get(cause.kind, "something that has to hold is unknown there")
 
 
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:

@@ -39,6 +39,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDeci
 from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,
+    best_robustness,
     brief_lines,
     candidate_lines,
     decision_from_payload,
@@ -721,7 +722,8 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
 def _map_rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
     if candidate is None:
         return {}
-    best = "nowhere free" if math.isinf(candidate.best) else f"{candidate.best:.4g}"
+    robustness = best_robustness(candidate)
+    best = "nowhere free" if math.isinf(robustness) else f"{robustness:.4g}"
     rows = {"best": [best]}
     if candidate.HasField("target"):
         target = candidate.target

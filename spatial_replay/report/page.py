@@ -315,8 +315,8 @@ def _rule(declarations: Mapping[str, str]) -> str:
 _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
 _SCRIPTS: Final = (
-    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "decisions", "scene", "camera",
-    "automaton",
+    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "map", "decisions", "scene",
+    "camera", "automaton",
 )  # fmt: skip
 """Files of browser/; after them comes the one that runs them."""
 

@@ -23,7 +23,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.requirements import requirements_of
@@ -56,17 +56,20 @@ from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.perception.image_sources import ImageTopic
 from spatial_replay.perception.opencv import Image, encode_jpeg
 from spatial_replay.planning.decision_log import (
-    candidate_lines,
-    cause_text,
+    MOST_LISTED,
+    best_robustness,
+    cause_sentence,
     decision_from_payload,
     joint_suffix,
     latest_decisions,
+    limiting_conjuncts,
     map_fields,
+    room_sentence,
 )
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import cut, json_fields, number_text, with_unit
+from spatial_replay.text import cut, json_fields, with_unit
 
 Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
 """Numbers of an array in the page: float64, float32, int32, uint16, uint8."""
@@ -792,6 +795,7 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         "chosen": drawn.is_chosen,
         "edge": None,
         "candidate": None,
+        "object": "",
         "title": "",
         "target": None,
     }
@@ -800,28 +804,45 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         return value
     candidate = owner.candidate
     turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
-    value |= _layer_values(drawn, candidate, packing)
+    value |= _layer_values(drawn, owner, packing)
     return value | {
         "edge": owner.edge,
         "candidate": owner.place,
+        "object": candidate.object,
         "title": f"{candidate.object}{turned}",
         "target": None if owner.target is None else _target_value(owner.target),
     }
 
 
-def _layer_values(drawn: _Drawn, candidate: PlanCandidate, packing: Packing) -> dict[str, Any]:
+def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, Any]:
     """Return what limits and what blocks each cell and, of the chosen map, the layer of each conjunct."""
     if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
         return {}
-    named = {number: f"{number}: {conjunct.text}" for number, conjunct in enumerate(candidate.conjuncts, 1)}
-    layer_names = [name for name in named.values() if name in drawn.fields] if drawn.is_chosen else []
-    return {
+    candidate = owner.candidate
+    named = [(number, f"{number}: {conjunct.text}") for number, conjunct in enumerate(candidate.conjuncts, 1)]
+    layers = [
+        {"number": number, "title": name, "values": packing.add(drawn.fields[name], "f4")}
+        for number, name in named
+        if drawn.is_chosen and name in drawn.fields
+    ]
+    value: dict[str, Any] = {
         "limited": packing.add(drawn.fields["limited_by"], "u2"),
         "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
         "limits": [conjunct.text for conjunct in candidate.conjuncts],
-        "blocks": [cause_text(cause) for cause in candidate.causes],
-        "layers": [{"title": name, "values": packing.add(drawn.fields[name], "f4")} for name in layer_names],
+        "blocks": [sentence_parts(cause_sentence(cause)) for cause in candidate.causes],
+        "layers": layers,
     }
+    if owner.target is not None:
+        value["at_target"] = [_finite(conjunct, "at_target") for conjunct in candidate.conjuncts]
+    if drawn.is_chosen and candidate.HasField("room") and "room" in drawn.fields:
+        value |= {"room": packing.add(drawn.fields["room"], "f4"), "wanted_room": candidate.room.wanted}
+    return value
+
+
+def _finite(message: Message, name: str) -> float | None:
+    """Return a number of a message; None if it is absent or not finite."""
+    number: float = getattr(message, name)
+    return number if message.HasField(name) and math.isfinite(number) else None
 
 
 def _decision_value(
@@ -836,6 +857,7 @@ def _decision_value(
             _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
             for edge in decision.considered
         ],
+        "margin": _finite(decision, "margin"),
         "maps": maps,
         "target": _target_value(decision.target) if decision.HasField("target") else None,
         "outcome": None,
@@ -870,11 +892,20 @@ def _guard_texts(guards: Sequence[PlanGuard]) -> list[str]:
 
 
 def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
+    best = best_robustness(candidate)
+    limits = [(conjunct.limits, ["", conjunct.text]) for conjunct in limiting_conjuncts(candidate)]
+    blocks = [(cause.cells, sentence_parts(cause_sentence(cause))) for cause in candidate.causes]
     return {
         **json_fields(candidate, "object", "rejected"),
-        "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
+        "best": best if math.isfinite(best) else None,
         "status": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
-        "why": [f"{key} {text}" for key, text in candidate_lines(candidate)],
+        "cells": sum(cells for cells, _ in (*limits, *blocks)),
+        "bars": [
+            {"kind": kind, "words": words, "cells": cells}
+            for kind, bars in (("limited by", limits), ("blocked", blocks))
+            for cells, words in bars[:MOST_LISTED]
+        ],
+        "room": room_sentence(candidate),
         "target": _target_value(candidate.target) if candidate.HasField("target") else None,
     }
 
@@ -888,6 +919,7 @@ def _target_value(target: PlanTarget) -> Mapping[str, Any]:
         "object": target.object,
         "at": points[:2] if is_drawn else None,
         "words": f"({target.x:.4g}, {target.y:.4g}){turned}",
-        "robustness": number_text(target.robustness),
+        "turn": target.turn,
+        "robustness": _finite(target, "robustness"),
         "way": points[2:] if is_drawn else [],
     }

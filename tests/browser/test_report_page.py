@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Error, Locator, Page, expect
 
 import spatial_replay as sr
 from perception.filmed import write_approach
 from planning.plans import record_plan_of
-from planning.test_map_layers import OBJECTS, SPEC, TIDYING
+from planning.test_map_layers import OBJECTS, SPEC, TIDYING, messages
 from report.report_pages import (
     RECORDINGS,
     report_of_recording,
@@ -23,6 +24,8 @@ from report.report_pages import (
     two_discs,
 )
 from spatial_replay.perception import load_tags, open_frames
+from spatial_replay.planning import read_decisions
+from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.replay.engine import load_files
 from spatial_replay.report.write import write_report
 from spatial_replay.runs.record_video import record_seen
@@ -512,11 +515,17 @@ def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -
     page = open_page("planned")
     card = page.locator(".card").nth(0)
     card.get_by_role("button").click()
-    expect(readout(page)).to_have_text("0.033 s / 18.133 s")
+    expect(readout(page)).to_have_text("0.033 s / 18.167 s")
     expect(card).to_have_attribute("aria-current", "true")
     card.locator("summary").click()
     expect(card).to_contain_text("Given up: no object can do it.")
-    expect(card.locator(".candidate", has_text="red chosen").locator("canvas")).to_be_visible()
+    # how many cells each demand limits, and each cause blocks
+    rows = card.locator(".candidate", has_text="red chosen").locator(".bars tr")
+    expect(rows.first).to_contain_text("limited by: red above blue")
+    shares = [
+        float(text.rstrip(" %")) for text in rows.locator("td.number").all_text_contents() if "<" not in text
+    ]
+    assert shares[0] > 50 and sum(shares) <= 101
     assert card.locator("canvas").first.evaluate(
         "each => each.getContext('2d').getImageData(0, 0, each.width, each.height).data.some(Boolean)"
     )
@@ -525,13 +534,17 @@ def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -
     assert page.evaluate("document.querySelector('.stage').toDataURL()") != with_map
 
 
-def test_a_map_shows_each_relation_and_says_what_limits_or_blocks_a_cell(open_page: Open) -> None:
+def test_a_map_shows_each_relation_and_answers_for_every_cell(
+    open_page: Open, pages: Mapping[str, Path]
+) -> None:
     page = open_page("layers")
-    card = page.locator(".card").nth(0)
-    card.locator("summary").click()
-    # of the orientations, the one of the target has them
-    figure = card.locator(".candidate figure", has=page.get_by_label("Layer of the map"))
-    made, choice = figure.locator("canvas"), figure.get_by_label("Layer of the map")
+    # that of the target, beside the decision
+    figure = page.locator(".card").nth(0).locator("> figure")
+    made, choice, answer = (
+        figure.locator("canvas"),
+        figure.get_by_label("Layer of the map"),
+        figure.locator(".answer"),
+    )
     titles = choice.locator("option").all_text_contents()
     assert titles[0] == "all that has to hold" and len(titles) > 1
     pictures = []
@@ -542,15 +555,56 @@ def test_a_map_shows_each_relation_and_says_what_limits_or_blocks_a_cell(open_pa
         page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         pictures.append(made.evaluate("each => each.toDataURL()"))
     assert len(set(pictures)) == len(titles)
-    made.scroll_into_view_if_needed()
+    log = pages["layers"].with_suffix(".mcap")
+    candidate = read_decisions(log).decisions[0].considered[-1].candidates[0]
+    number = next(turned.number for turned in candidate.maps if turned.turn == candidate.target.turn)
+    grid = messages(log)[number]
+    fields = map_fields(grid)
+    texts = [conjunct.text for conjunct in candidate.conjuncts]
     box = made.bounding_box()
     assert box is not None
-    said = set()
-    for row in range(1, 8):
-        for column in range(1, 8):
-            page.mouse.move(box["x"] + box["width"] * column / 8, box["y"] + box["height"] * row / 8)
-            said.add((made.get_attribute("title") or "").split(" by ")[0])
-    assert {"blocked"} < said
+    # by keys, the first cell is that of the target
+    made.press("ArrowUp")
+    answers = {_checked_answer(answer, grid, fields, texts)}
+    for row in range(2, 8, 2):
+        for column in range(2, 6):
+            made.click(position={"x": box["width"] * column / 8, "y": box["height"] * row / 8})
+            answers.add(_checked_answer(answer, grid, fields, texts))
+    assert {"Blocked", "fails", "holds"} == answers
+    # from where it is, keys go on by a cell, and the time stays
+    time, heading = readout(page).text_content(), answer.locator("thead").text_content()
+    made.press("ArrowLeft")
+    assert answer.locator("thead").text_content() != heading
+    _checked_answer(answer, grid, fields, texts)
+    assert readout(page).text_content() == time
+
+
+def _checked_answer(
+    answer: Locator, grid: GridMessage, fields: Mapping[str, np.ndarray], texts: Sequence[str]
+) -> str:
+    """Compare the table of a cell with the log, and return what it says: blocked, fails or holds."""
+    heads, words, *rows = answer.evaluate(
+        """each => [each.querySelector("thead").textContent, each.querySelector("p").textContent,
+            ...Array.from(each.querySelectorAll("tbody tr"), (row) => row.children[1].textContent)]"""
+    )
+    x, y = map(float, re.findall(r"-?[\d.]+", heads.replace(MINUS, "-"))[:2])
+    row, column = (
+        int((at - low) / size)
+        for at, low, size in (
+            (y, grid.pose.position.y, grid.cell_size.y),
+            (x, grid.pose.position.x, grid.cell_size.x),
+        )
+    )
+    numbers = [float(text.replace(MINUS, "-")) for text in rows]
+    layers = [fields[f"{place}: {text}"][row, column] for place, text in enumerate(texts, 1)]
+    np.testing.assert_allclose(numbers[: len(texts)], layers, rtol=1e-3, atol=1e-3)
+    robustness = fields["robustness"][row, column]
+    assert np.isnan(robustness) == words.startswith("Blocked: ")
+    if np.isnan(robustness):
+        return "Blocked"
+    np.testing.assert_allclose(numbers[-1], robustness, rtol=1e-3, atol=1e-3)
+    assert texts[fields["limited_by"][row, column] - 1] in words
+    return "fails" if robustness < 0 else "holds"
 
 
 def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:

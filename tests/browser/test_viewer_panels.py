@@ -276,15 +276,24 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
         for each in decision.pruned:
             expect(page.locator(".tasks")).to_contain_text(f"{each.source} → {each.target}")
     expect(page.locator(".card")).to_contain_text("Done at 10.467 s")
+    expect(page.locator(".card")).to_contain_text("Planned next: green to (")
     maps = sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)
-    expect(page.locator(".candidate canvas")).to_have_count(maps)
-    expect(page.locator(".card > figure canvas")).to_have_count(1)
+    # that of the target stands beside the decision
+    expect(page.locator(".candidate canvas")).to_have_count(maps - 1)
+    made = page.locator(".card > figure canvas")
+    expect(made).to_have_count(1)
+    expect(page.locator(".candidate", has_text="red chosen").locator(".bars")).to_contain_text(
+        "limited by: red above blue"
+    )
+    made.press("ArrowUp")
+    edge, answer = decisions[0].considered[-1], page.locator(".card > figure .answer")
+    conjuncts = next(each for each in edge.candidates if each.chosen).conjuncts
+    expect(answer.locator("tbody tr")).to_have_count(len(conjuncts) + 1)
+    expect(answer).to_contain_text("red above blue holds by")
     # a live source has neither numbers of maps nor, before it is played, the outcome
     live = open_panel("push", "decisions", "live")
     live.evaluate("viewer.play({sec: -1, nsec: 0}, {sec: 1, nsec: 0})")
-    expect(live.locator(".candidate canvas")).to_have_count(
-        sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)
-    )
+    expect(live.locator("canvas")).to_have_count(maps)
     expect(live.get_by_text("Done at")).to_have_count(0)
 
 

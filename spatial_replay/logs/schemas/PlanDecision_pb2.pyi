@@ -67,6 +67,7 @@ class PlanDecision(google.protobuf.message.Message):
     REASON_FIELD_NUMBER: builtins.int
     OUTCOME_FIELD_NUMBER: builtins.int
     LOST_FIELD_NUMBER: builtins.int
+    MARGIN_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time in nanoseconds of the sample that it was made on."""
     number: builtins.int
@@ -76,6 +77,8 @@ class PlanDecision(google.protobuf.message.Message):
     kind: global___PlanDecision.Kind.ValueType
     reason: builtins.str
     """The decision in words."""
+    margin: builtins.float
+    """Robustness that a target needs at least, by the settings."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
         """States of the automaton; several if its state is uncertain."""
@@ -114,9 +117,12 @@ class PlanDecision(google.protobuf.message.Message):
         reason: builtins.str = ...,
         outcome: global___PlanOutcome | None = ...,
         lost: global___PlanLoss | None = ...,
+        margin: builtins.float | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_number", b"_number", "_time_ns", b"_time_ns", "lost", b"lost", "number", b"number", "outcome", b"outcome", "target", b"target", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_number", b"_number", "_time_ns", b"_time_ns", "considered", b"considered", "kind", b"kind", "lost", b"lost", "number", b"number", "outcome", b"outcome", "pruned", b"pruned", "reason", b"reason", "specification", b"specification", "states", b"states", "target", b"target", "time_ns", b"time_ns"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_margin", b"_margin", "_number", b"_number", "_time_ns", b"_time_ns", "lost", b"lost", "margin", b"margin", "number", b"number", "outcome", b"outcome", "target", b"target", "time_ns", b"time_ns"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_margin", b"_margin", "_number", b"_number", "_time_ns", b"_time_ns", "considered", b"considered", "kind", b"kind", "lost", b"lost", "margin", b"margin", "number", b"number", "outcome", b"outcome", "pruned", b"pruned", "reason", b"reason", "specification", b"specification", "states", b"states", "target", b"target", "time_ns", b"time_ns"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_margin", b"_margin"]) -> typing.Literal["margin"] | None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_number", b"_number"]) -> typing.Literal["number"] | None: ...
     @typing.overload

@@ -94,10 +94,6 @@ function labelsOf(moves, places) {
   });
 }
 
-function overlapOf([left, top, right, bottom], [l, t, r, b]) {
-  return Math.max(0, Math.min(right, r) - Math.max(left, l)) * Math.max(0, Math.min(bottom, b) - Math.max(top, t));
-}
-
 function alongCurve([x0, y0], [x1, y1], share) {
   const [cx, cy] = controlOf([x0, y0], [x1, y1]), rest = 1 - share;
   const along = (from, by, to) => rest * rest * from + 2 * rest * share * by + share * share * to;

@@ -4,10 +4,7 @@ function makeDecisions(clock) {
   const place = body("decisions");
   if (!place) return;
   const cards = clock.run.decisions.map((decision) => makeDecision(clock, decision));
-  const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
-  if (hasMaps) {
-    place.append(mapKey());
-  }
+  if (clock.run.decisions.some((decision) => decision.maps.length)) place.append(mapKey());
   place.append(element("p", {class: "quiet"},
     "Edges are tried in the order of their paths' lengths, those that one motion takes first."));
   place.append(element("ol", {class: "cards"}, ...cards));
@@ -22,7 +19,7 @@ function makeDecisions(clock) {
 }
 
 function mapKey() {
-  const made = key([{ground: "map", words: "from what fails most to what holds most, 0 in the middle"},
+  const made = key([{ground: "map", words: "fails, 0, holds; the line is at the robustness that a target needs"},
     {ground: "hatched", words: "blocked"}]);
   const [block] = made.querySelectorAll("i");
   block.style.background = `linear-gradient(to right, ${MAP.join(", ")})`;
@@ -44,9 +41,9 @@ function makeDecision(clock, decision) {
     later.length ? element("p", {}, `Planned next: ${later.join(", then ")}.`) : null,
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
-    heading, meant ? makeMap(clock, meant, false) : null, makeRedone(clock, decision.redone),
+    heading, meant ? makeMap(clock, meant, decision, false) : null, makeRedone(clock, decision.redone),
     tried.length ? element("details", {}, element("summary", {}, summaryOf(decision)), ...tried,
-      element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, false)))) : null);
+      element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, decision, false)))) : null);
 }
 
 // What would have been decided otherwise, with its map beside the recorded one.
@@ -54,7 +51,7 @@ function makeRedone(clock, decision) {
   if (!decision) return null;
   const meant = chosenMap(decision);
   return element("section", {class: "redone"}, element("p", {}, element("b", {}, "Redone"), `: ${inShort(decision)}`),
-    element("p", {}, sentence(decision.reason)), meant ? makeMap(clock, meant, false) : null);
+    element("p", {}, sentence(decision.reason)), meant ? makeMap(clock, meant, decision, false) : null);
 }
 
 // The map that a decision's target was found on, if the page has it.
@@ -94,173 +91,35 @@ function makeEdge(clock, decision, edge, number) {
     edge.constraints.length ? element("p", {class: "quiet"}, "Never on the way") : null,
     edge.constraints.length ? guards(edge.constraints) : null,
     element("div", {class: "candidates"},
-      ...edge.candidates.map((candidate, place) => makeCandidate(clock, candidate, mapsOf(place), edge.once))),
+      ...edge.candidates.map((candidate, place) => makeCandidate(clock, decision, candidate, mapsOf(place), edge.once))),
     edge.pruned ? element("p", {class: "pruned"}, `Given up: ${sentence(edge.pruned)}`) : null);
 }
 
-function makeCandidate(clock, candidate, own, once) {
+function makeCandidate(clock, decision, candidate, maps, once) {
   const {object, target, rejected, best} = candidate;
   const status = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.status];
-  const why = rejected || `to ${target.words}, robustness ${target.robustness}${candidate.status === "chosen" ? once : ""}; at best ${best}`;
-  return element("div", {class: "candidate"}, ...own.map((map) => makeMap(clock, map, own.length > 1)),
-    element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`),
-    candidate.why?.length ? element("ul", {class: "quiet"}, ...candidate.why.map((line) => element("li", {}, line))) : null);
+  const more = best > target?.robustness ? `; at best ${numberText(best)}` : "";
+  const why = rejected || `to ${target.words}, robustness ${numberText(target.robustness ?? NaN)}${candidate.status === "chosen" ? once : ""}${more}`;
+  // the map of a decision's target stands beside its heading
+  const drawn = maps.filter((map) => !map.chosen);
+  return element("div", {class: "candidate"}, element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`),
+    makeBars(candidate), candidate.room ? element("p", {class: "quiet"}, candidate.room) : null,
+    ...drawn.map((map) => makeMap(clock, map, decision, maps.length > 1)));
 }
 
-function makeMap(clock, map, isTitled) {
-  let shown = map;
-  const {made, redraw} = canvas(`Gradient map of ${map.title || "a candidate"}`, (context, width, height) => {
-    const at = projection(map.low, map.high, width, height, 1);
-    drawMap(context, clock.run, shown, at);
-    if (!map.target) return;
-    drawWay(context, map.target.way, at, {colour: colour("ink"), width: 1.5, dash: [3, 4]});
-    drawTarget(context, map.target.at, at);
-  });
-  made.style.aspectRatio = String((map.high[0] - map.low[0]) / (map.high[1] - map.low[1]));
-  window.addEventListener("themechange", redraw);
-  if (map.limited) made.addEventListener("mousemove", (event) => { made.title = cellWords(clock.run, map, event, made); });
-  const layers = map.layers?.length ? layerChoice(clock.run, map, (layer) => { shown = layer; redraw(); }) : null;
-  return element("figure", {}, made, layers, isTitled ? element("figcaption", {}, map.title || "a candidate") : null);
+// How many cells each demand limits, and how many each cause blocks.
+function makeBars({bars, cells}) {
+  if (!bars.length) return null;
+  const most = Math.max(...bars.map((bar) => bar.cells));
+  return element("table", {class: "bars"}, element("tbody", {}, ...bars.map(({kind, words, cells: count}) => {
+    const block = element("i", {class: `block ${kind === "blocked" ? "hatched" : "neutral"}`});
+    block.style.width = `${Math.max(100 * count / most, 1)}%`;
+    return element("tr", {title: `${count} of ${cells} cells`},
+      element("th", {scope: "row"}, `${kind}: `, ...withCode(words)), element("td", {}, block),
+      element("td", {class: "number"}, shareText(count / cells)));
+  })));
 }
 
-// A choice between the map and each relation that it is made of.
-function layerChoice(run, map, show) {
-  const layers = map.layers.map((layer) => {
-    const scale = run.numbers(layer.values).reduce((most, each) => Math.max(most, Math.abs(each) || 0), 0);
-    return {...map, values: layer.values, scale, picture: undefined};
-  });
-  const options = ["all that has to hold", ...map.layers.map((layer) => layer.title)];
-  const choose = () => {
-    // a long relation does not fit
-    choice.title = options[choice.selectedIndex];
-    show([map, ...layers][choice.selectedIndex]);
-  };
-  const choice = element("select", {"aria-label": "Layer of the map", title: options[0], onchange: choose},
-    ...options.map((title) => element("option", {}, title)));
-  return choice;
-}
-
-// What a cell under the pointer says: what blocks it, or what limits it and its robustness.
-function cellWords(run, map, event, made) {
-  const box = made.getBoundingClientRect();
-  const at = projection(map.low, map.high, box.width, box.height, 1);
-  const rows = run.numbers(map.values).length / map.columns;
-  const column = Math.floor((event.clientX - box.left - at.x(map.low[0])) / at.scale / (map.high[0] - map.low[0]) * map.columns);
-  const row = Math.floor((at.y(map.low[1]) - event.clientY + box.top) / at.scale / (map.high[1] - map.low[1]) * rows);
-  if (row < 0 || row >= rows || column < 0 || column >= map.columns) return "";
-  const cell = row * map.columns + column, cause = run.numbers(map.blocked)[cell];
-  if (cause) return `blocked by ${map.blocks[cause - 1] ?? "something else"}`;
-  const limit = map.limits[run.numbers(map.limited)[cell] - 1];
-  return `${numberText(run.numbers(map.values)[cell])}${limit ? `, limited by ${limit}` : ""}`;
-}
-
-// The colours of a map, as palette.py has them, and how much of them covers the page.
-const MAP = ["#00204d", "#414d6b", "#7c7b78", "#bcae6c", "#ffea46"], OPACITY = 0.6;
-
-// The picture of a map, a pixel for each cell, lowest row at the bottom; what is blocked stays clear.
-function pictureOf(run, map) {
-  map.picture ??= painted(run, map);
-  return map.picture;
-}
-
-function painted(run, map) {
-  const values = run.numbers(map.values);
-  const rows = values.length / map.columns;
-  const made = document.createElement("canvas");
-  made.width = map.columns;
-  made.height = rows;
-  const context = made.getContext("2d");
-  const image = context.createImageData(map.columns, rows);
-  const colours = MAP.map(rgb), last = colours.length - 1;
-  for (let row = 0; row < rows; row++) {
-    for (let column = 0; column < map.columns; column++) {
-      const number = values[row * map.columns + column];
-      if (Number.isNaN(number)) continue;
-      const place = 4 * ((rows - 1 - row) * map.columns + column);
-      const share = map.scale > 0 ? Math.min(Math.max(number / map.scale, -1), 1) : 0;
-      const at = (share + 1) / 2 * last, low = Math.min(Math.floor(at), last - 1);
-      for (let part = 0; part < 3; part++) {
-        image.data[place + part] = colours[low][part] + (at - low) * (colours[low + 1][part] - colours[low][part]);
-      }
-      image.data[place + 3] = 255;
-    }
-  }
-  context.putImageData(image, 0, 0);
-  return made;
-}
-
-function rgb(text) {
-  return [1, 3, 5].map((place) => parseInt(text.slice(place, place + 2), 16));
-}
-
-// How a part of the plane is shown in a rectangle of the screen, as large as fits, y upwards.
-function projection(low, high, width, height, margin) {
-  const scale = Math.min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]));
-  const left = (width - scale * (high[0] - low[0])) / 2, bottom = (height + scale * (high[1] - low[1])) / 2;
-  return {
-    scale,
-    x: (x) => left + scale * (x - low[0]),
-    y: (y) => bottom - scale * (y - low[1]),
-  };
-}
-
-function drawMap(context, run, map, at) {
-  const left = at.x(map.low[0]), top = at.y(map.high[1]);
-  const width = at.x(map.high[0]) - left, height = at.y(map.low[1]) - top;
-  hatch(context, left, top, width, height);
-  context.save();
-  context.imageSmoothingEnabled = false;
-  context.globalCompositeOperation = "destination-out";
-  context.drawImage(pictureOf(run, map), left, top, width, height);
-  context.globalCompositeOperation = "source-over";
-  context.globalAlpha = OPACITY;
-  context.drawImage(pictureOf(run, map), left, top, width, height);
-  context.restore();
-}
-
-// Oblique lines, which stay where a map is clear.
-function hatch(context, left, top, width, height) {
-  context.save();
-  context.beginPath();
-  context.rect(left, top, width, height);
-  context.clip();
-  context.strokeStyle = colour("neutral");
-  context.lineWidth = 1;
-  context.beginPath();
-  for (let x = left - height; x < left + width; x += 7) {
-    context.moveTo(x, top + height);
-    context.lineTo(x + height, top);
-  }
-  context.stroke();
-  context.restore();
-}
-
-// Points x and y in turn, as a line.
-function drawWay(context, points, at, style) {
-  if (points.length < 4) return;
-  context.save();
-  context.strokeStyle = style.colour;
-  context.lineWidth = style.width;
-  context.setLineDash(style.dash ?? []);
-  context.lineJoin = "round";
-  context.beginPath();
-  for (let i = 0; i + 1 < points.length; i += 2) context.lineTo(at.x(points[i]), at.y(points[i + 1]));
-  context.stroke();
-  context.restore();
-}
-
-function drawTarget(context, target, at) {
-  if (!target) return;
-  const [x, y] = target;
-  context.save();
-  context.strokeStyle = colour("ink");
-  context.lineWidth = 2;
-  context.beginPath();
-  context.arc(at.x(x), at.y(y), 6, 0, 2 * Math.PI);
-  context.moveTo(at.x(x) - 10, at.y(y));
-  context.lineTo(at.x(x) + 10, at.y(y));
-  context.moveTo(at.x(x), at.y(y) - 10);
-  context.lineTo(at.x(x), at.y(y) + 10);
-  context.stroke();
-  context.restore();
+function shareText(share) {
+  return share < 0.005 ? "< 1 %" : `${Math.round(100 * share)} %`;
 }

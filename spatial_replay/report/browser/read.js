@@ -11,12 +11,14 @@ async function readRun(name = "") {
   const buffer = await unpacked(document.getElementById(`numbers${name}`).textContent);
   const numbers = ({kind, offset, length}) => new ARRAYS[kind](buffer, offset, length);
   const times = numbers(facts.times);
-  return {
+  const run = {
     ...facts,
     numbers,
     times,
     results: facts.results.map((result) => readResult(result, numbers, times)),
+    outlinesAt: (time) => outlinesAt(run, time),
   };
+  return run;
 }
 
 // A text with spaces for control characters, such as those that turn the direction of what follows.

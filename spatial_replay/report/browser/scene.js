@@ -4,7 +4,7 @@ const STEPS_OF_SCENE = 65535;
 const ABSENT = 65535;
 
 function makeScene(clock, name = "scene") {
-  const scene = readScene(clock.run);
+  const scene = sceneOf(clock.run);
   const place = body(name);
   if (!scene.times.length) {
     place.append(element("p", {}, "The log has no scene."));
@@ -52,6 +52,28 @@ function layerBox(label, name, layers, redraw) {
     redraw();
   }});
   return element("label", {}, box, label);
+}
+
+function sceneOf(run) {
+  run.drawnScene ??= readScene(run);
+  return run.drawnScene;
+}
+
+// The objects at a time, with their outlines: points x and y in turn.
+function outlinesAt(run, time) {
+  const scene = sceneOf(run);
+  const frame = indexAt(scene.times, time);
+  return scene.entities.filter((entity) => entity.kind === "object" && scene.times.length && isThere(entity, frame))
+    .map((entity) => ({name: entity.name, rings: ringsOf(entity, frame)}));
+}
+
+function ringsOf(entity, frame) {
+  let start = entity.starts[frame];
+  return entity.forms[entity.form[frame]].map((corners) => {
+    const ring = Array.from(entity.points.subarray(start, start + 2 * corners));
+    start += 2 * corners;
+    return ring;
+  });
 }
 
 function readScene(run) {
@@ -305,7 +327,7 @@ function drawViolation(context, {ends, label, text: atom}, at, [names, boxes], [
 function drawPlan(context, clock, {target, outcome, time}, at) {
   if (!target) return;
   drawWay(context, target.way, at, {colour: colour("ink"), width: 1.5, dash: [3, 4]});
-  drawTarget(context, target.at, at);
+  drawTarget(context, target.at, at, colour("ink"));
   if (!outcome) return;
   // a point for each sample, of which those up to now are shown
   const points = clock.run.numbers(outcome.travelled);
@@ -487,10 +509,6 @@ function roleWords(pointer) {
 
 function minusWords(text) {
   return text.replace(/-(?=\d)/g, "−");
-}
-
-function spaced(unit) {
-  return unit && ` ${unit}`;
 }
 
 function partWords({result, node}) {

@@ -1,0 +1,444 @@
+// A gradient map: its cells with the objects, the way and the target, axes and a scale with numbers, and a table
+// of the cell that is asked.
+
+// The colours of a map, as palette.py has them, and how much of them covers the scene.
+const MAP = ["#d55e00", "#f5f5f5", "#0072b2"], OPACITY = 0.6;
+// Cells are as light in dark pages, and so are their ground and what is drawn on them.
+const MAP_INK = "#24292f", MAP_GROUND = "#e4e4e4", MAP_HATCH = "#9a9a9a";
+// Room in pixels for the axes, and for the scale and its numbers.
+const FRAME = {left: 42, right: 66, top: 8, bottom: 22};
+const SCALE_WIDTH = 10;
+const NARROWEST = 300;
+
+// How a map in force is drawn: with the objects as they are when it is decided.
+function makeMap(clock, map, decision, isTitled) {
+  const {run} = clock;
+  let layer = map, cell = null;
+  const {made, redraw} = canvas(`Gradient map of ${map.title || "a candidate"}. Arrow keys ask a cell.`,
+    (context, width, height) => drawFigure(context, run, {map, layer, cell, decision}, width, height));
+  const inner = NARROWEST - FRAME.left - FRAME.right;
+  const slope = (map.high[1] - map.low[1]) / (map.high[0] - map.low[0]);
+  made.style.aspectRatio = `${NARROWEST} / ${Math.min(Math.max(inner * slope, 60), 600) + FRAME.top + FRAME.bottom}`;
+  made.className = "gradient-map";
+  made.tabIndex = 0;
+  made.setAttribute("role", "application");
+  window.addEventListener("themechange", redraw);
+  const answer = element("div", {class: "answer", "aria-live": "polite"},
+    element("p", {class: "quiet"}, "Press a cell: each demand there, and what blocks it."));
+  const ask = (asked) => {
+    cell = asked;
+    answer.replaceChildren(...answerOf(run, map, decision, asked));
+    redraw();
+  };
+  made.addEventListener("pointerdown", (event) => {
+    const asked = cellUnder(map, event, made);
+    if (asked) ask(asked);
+  });
+  made.addEventListener("keydown", (event) => {
+    const step = {ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowDown: [-1, 0], ArrowUp: [1, 0]}[event.key];
+    if (!step) return;
+    event.preventDefault();
+    // elsewhere on the page they move the time
+    event.stopPropagation();
+    ask(steppedCell(map, cell, step));
+  });
+  const layers = map.layers?.length ? layerChoice(run, map, (chosen) => { layer = chosen; redraw(); }) : null;
+  return element("figure", {}, made, layers, isTitled ? element("figcaption", {}, map.title || "a candidate") : null,
+    answer);
+}
+
+function rowsOf(map) {
+  return map.values.length / map.columns;
+}
+
+// The row and the column at a pointer; null beside the map.
+function cellUnder(map, event, made) {
+  const box = made.getBoundingClientRect();
+  const at = figureProjection(map, box.width, box.height);
+  const rows = rowsOf(map);
+  const share = [(event.clientX - box.left - at.x(map.low[0])) / (at.x(map.high[0]) - at.x(map.low[0])),
+    (event.clientY - box.top - at.y(map.low[1])) / (at.y(map.high[1]) - at.y(map.low[1]))];
+  const [column, row] = [Math.floor(share[0] * map.columns), Math.floor(share[1] * rows)];
+  return row < 0 || row >= rows || column < 0 || column >= map.columns ? null : [row, column];
+}
+
+// The cell a step on; the first one asked is that of the target, or in the middle.
+function steppedCell(map, cell, [up, right]) {
+  const rows = rowsOf(map);
+  if (!cell) {
+    return map.target?.at ? cellAt(map, map.target.at) : [Math.floor(rows / 2), Math.floor(map.columns / 2)];
+  }
+  const inside = (number, count) => Math.min(Math.max(number, 0), count - 1);
+  return [inside(cell[0] + up, rows), inside(cell[1] + right, map.columns)];
+}
+
+function cellAt(map, [x, y]) {
+  const rows = rowsOf(map);
+  const place = (number, axis, count) => Math.min(Math.max(
+    Math.floor((number - map.low[axis]) / (map.high[axis] - map.low[axis]) * count), 0), count - 1);
+  return [place(y, 1, rows), place(x, 0, map.columns)];
+}
+
+function centreOf(map, [row, column]) {
+  return [map.low[0] + (column + 0.5) / map.columns * (map.high[0] - map.low[0]),
+    map.low[1] + (row + 0.5) / rowsOf(map) * (map.high[1] - map.low[1])];
+}
+
+// Each demand in a cell and at the target, and in words what blocks or limits the cell.
+function answerOf(run, map, decision, cell) {
+  const place = cell[0] * map.columns + cell[1];
+  const number = (values) => (values ? run.numbers(values)[place] : 0);
+  const facts = {place, value: number(map.values), cause: number(map.blocked), limit: number(map.limited),
+    target: map.target ? map.target.robustness : null};
+  const rows = demandRows(run, map, facts);
+  const unit = run.lengths ? ` [${run.lengths}]` : "";
+  const heads = ["demand", `at (${centreOf(map, cell).map(numberText).join(", ")})${unit}`,
+    ...(map.target ? [`at the target${unit}`] : [])];
+  const words = element("p", {}, ...cellWords(run, map, decision, facts));
+  if (!rows.length) return [words];
+  return [words, element("table", {}, element("thead", {}, element("tr", {},
+    ...heads.map((head) => element("th", {scope: "col"}, head)))), element("tbody", {}, ...rows))];
+}
+
+// A row for each demand whose number in a cell is known, and one for all of them where the cell is free.
+function demandRows(run, map, {place, value, cause, limit, target}) {
+  const rows = [];
+  const add = (title, isLimit, numbers) => rows.push(element("tr", {class: isLimit ? "limits" : null},
+    element("th", {scope: "row"}, title, isLimit ? " limits" : null),
+    ...numbers.slice(0, map.target ? 2 : 1).map((number) => element("td", {class: number < 0 ? "number fails" : "number"},
+      number === null ? "–" : numberText(number)))));
+  (map.limits ?? []).forEach((text, index) => {
+    const layer = map.layers?.find(({number}) => number === index + 1);
+    const isLimit = !cause && limit === index + 1;
+    if (!layer && !isLimit) return;
+    add(element("code", {}, text), isLimit,
+      [layer ? run.numbers(layer.values)[place] : value, map.at_target?.[index] ?? null]);
+  });
+  if (!cause) add("all that has to hold", false, [value, target]);
+  return rows;
+}
+
+function cellWords(run, map, decision, {place, value, cause, limit, target}) {
+  if (cause) return ["Blocked: ", ...withCode(map.blocks[cause - 1] ?? ["something else"]), "."];
+  if (Number.isNaN(value)) return ["Blocked, or not known."];
+  const demand = map.limits?.[limit - 1] ?? "what has to hold";
+  const {margin} = decision;
+  if (value < 0) return [element("code", {}, demand), ` fails by ${numberText(-value)}${spaced(run.lengths)}.`];
+  const by = ` holds by ${numberText(value)}${spaced(run.lengths)}`;
+  if (margin && value < margin) return [element("code", {}, demand), `${by}, less than the ${numberText(margin)} needed.`];
+  const room = map.room && run.numbers(map.room)[place];
+  const rest = room !== undefined && room < map.wanted_room
+    ? ` The room around it is ${numberText(Math.max(room, 0))} of ${numberText(map.wanted_room)}.` : "";
+  const better = target === null ? "" : value > target ? ", more than at the target" : ", no more than at the target";
+  return [element("code", {}, demand), `${by}${better}.${rest}`];
+}
+
+function spaced(unit) {
+  return unit ? ` ${unit}` : "";
+}
+
+// A choice between the map and each relation that it is made of.
+function layerChoice(run, map, show) {
+  const layers = map.layers.map((layer) => {
+    const scale = run.numbers(layer.values).reduce((most, number) => Math.max(most, Math.abs(number) || 0), 0);
+    return {...map, values: layer.values, scale, picture: undefined};
+  });
+  const options = ["all that has to hold", ...map.layers.map((layer) => layer.title)];
+  const choose = () => {
+    // a long relation does not fit
+    choice.title = options[choice.selectedIndex];
+    show([map, ...layers][choice.selectedIndex]);
+  };
+  const choice = element("select", {"aria-label": "Layer of the map", title: options[0], onchange: choose},
+    ...options.map((title) => element("option", {}, title)));
+  return choice;
+}
+
+// Where a map lies within its figure.
+function figureProjection(map, width, height) {
+  const inner = projection(map.low, map.high, width - FRAME.left - FRAME.right, height - FRAME.top - FRAME.bottom, 0);
+  return {scale: inner.scale, x: (x) => FRAME.left + inner.x(x), y: (y) => FRAME.top + inner.y(y)};
+}
+
+function drawFigure(context, run, {map, layer, cell, decision}, width, height) {
+  const at = figureProjection(map, width, height);
+  const [left, top, right, bottom] = [at.x(map.low[0]), at.y(map.high[1]), at.x(map.high[0]), at.y(map.low[1])];
+  context.fillStyle = MAP_GROUND;
+  context.fillRect(left, top, right - left, bottom - top);
+  hatch(context, left, top, right - left, bottom - top, MAP_HATCH);
+  context.imageSmoothingEnabled = false;
+  context.drawImage(pictureOf(run, layer), left, top, right - left, bottom - top);
+  context.save();
+  context.beginPath();
+  context.rect(left, top, right - left, bottom - top);
+  context.clip();
+  if (decision.margin !== null) drawContour(context, run, layer, decision.margin, at);
+  const outlines = run.outlinesAt(decision.time);
+  for (const outline of outlines) drawOutline(context, outline, at, outline.name === map.object ? 2 : 1);
+  if (map.target) {
+    drawWay(context, map.target.way, at, {colour: MAP_INK, width: 1.5, dash: [3, 4]});
+    const moved = outlines.find(({name}) => name === map.object);
+    if (moved && map.target.at && map.target.way.length) drawOutline(context, movedOutline(moved, map.target), at, 1.5, [4, 3]);
+    drawTarget(context, map.target.at, at, MAP_INK);
+  }
+  if (cell) drawCell(context, map, cell, at);
+  drawNames(context, outlines, at, [left, top, right, bottom]);
+  context.restore();
+  context.strokeStyle = colour("line");
+  context.lineWidth = 1;
+  context.strokeRect(left, top, right - left, bottom - top);
+  drawAxes(context, map, at, [left, top, right, bottom]);
+  drawScale(context, layer.scale, decision.margin, [right + 8, top, bottom]);
+}
+
+function drawOutline(context, {rings}, at, width, dash = []) {
+  context.save();
+  context.strokeStyle = MAP_INK;
+  context.lineWidth = width;
+  context.setLineDash(dash);
+  for (const ring of rings) {
+    context.beginPath();
+    for (let i = 0; i + 1 < ring.length; i += 2) context.lineTo(at.x(ring[i]), at.y(ring[i + 1]));
+    context.closePath();
+    context.stroke();
+  }
+  context.restore();
+}
+
+// The outline of an object at its target: turned about its centre, where its way begins.
+function movedOutline({rings}, {at: [x, y], turn, way}) {
+  const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
+  return {rings: rings.map((ring) => ring.map((_, i) => {
+    const [u, v] = [ring[i - i % 2] - way[0], ring[i - i % 2 + 1] - way[1]];
+    return i % 2 ? y + sin * u + cos * v : x + cos * u - sin * v;
+  }))};
+}
+
+// Names at the upper right of outlines; one that would cover another is left out.
+function drawNames(context, outlines, at, [left, top, right, bottom]) {
+  context.font = FONT;
+  context.textBaseline = "middle";
+  context.textAlign = "left";
+  const boxes = [];
+  for (const {name, rings} of outlines) {
+    const points = rings.flat();
+    const xs = points.filter((_, i) => i % 2 === 0).map(at.x), ys = points.filter((_, i) => i % 2).map(at.y);
+    if (Math.max(...xs) < left || Math.min(...xs) > right || Math.max(...ys) < top || Math.min(...ys) > bottom) continue;
+    const text = shortened(name, 24), width = context.measureText(text).width;
+    const x = Math.max(Math.min(Math.max(...xs) + 3, right - width - 2), left + 2);
+    const y = Math.min(Math.max(Math.min(...ys) - 7, top + 8), bottom - 8);
+    const box = [x, y - 7, x + width, y + 7];
+    if (boxes.some((placed) => overlapOf(placed, box) > 0)) continue;
+    boxes.push(box);
+    context.lineWidth = 3;
+    context.lineJoin = "round";
+    context.strokeStyle = "rgb(255 255 255 / 0.8)";
+    context.strokeText(text, x, y);
+    context.fillStyle = MAP_INK;
+    context.fillText(text, x, y);
+  }
+}
+
+function overlapOf([left, top, right, bottom], [l, t, r, b]) {
+  return Math.max(0, Math.min(right, r) - Math.max(left, l)) * Math.max(0, Math.min(bottom, b) - Math.max(top, t));
+}
+
+// A frame around a cell that shows, however small the cell is.
+function drawCell(context, map, cell, at) {
+  const [x, y] = centreOf(map, cell);
+  const half = Math.max(at.scale * (map.high[0] - map.low[0]) / map.columns / 2, 4);
+  for (const [ink, width] of [["white", 4], [MAP_INK, 1.5]]) {
+    context.strokeStyle = ink;
+    context.lineWidth = width;
+    context.strokeRect(at.x(x) - half, at.y(y) - half, 2 * half, 2 * half);
+  }
+}
+
+// The edges between cells that reach the margin and free ones that do not.
+function drawContour(context, run, map, margin, at) {
+  const values = run.numbers(map.values), rows = rowsOf(map);
+  const x = (column) => at.x(map.low[0] + column / map.columns * (map.high[0] - map.low[0]));
+  const y = (row) => at.y(map.low[1] + row / rows * (map.high[1] - map.low[1]));
+  const parts = (one, two) => !Number.isNaN(one) && !Number.isNaN(two) && (one >= margin) !== (two >= margin);
+  context.strokeStyle = MAP_INK;
+  context.lineWidth = 1;
+  context.beginPath();
+  for (let row = 0; row < rows; row++) {
+    for (let column = 0; column < map.columns; column++) {
+      const place = row * map.columns + column;
+      if (column + 1 < map.columns && parts(values[place], values[place + 1])) {
+        context.moveTo(x(column + 1), y(row));
+        context.lineTo(x(column + 1), y(row + 1));
+      }
+      if (row + 1 < rows && parts(values[place], values[place + map.columns])) {
+        context.moveTo(x(column), y(row + 1));
+        context.lineTo(x(column + 1), y(row + 1));
+      }
+    }
+  }
+  context.stroke();
+}
+
+// A round step that divides a length into a few parts.
+function roundStep(length, parts) {
+  const power = 10 ** Math.floor(Math.log10(length / parts));
+  return power * ([1, 2, 5].find((factor) => length / (factor * power) <= parts) ?? 10);
+}
+
+function drawAxes(context, map, at, [left, top, right, bottom]) {
+  context.font = FONT;
+  context.fillStyle = context.strokeStyle = colour("quiet");
+  context.lineWidth = 1;
+  context.beginPath();
+  const ticks = (axis, size, room) => {
+    const step = roundStep(map.high[axis] - map.low[axis], Math.max(size / room, 1));
+    const first = Math.ceil(map.low[axis] / step - 1e-9), last = Math.floor(map.high[axis] / step + 1e-9);
+    return Array.from({length: Math.max(last - first + 1, 0)}, (_, index) => Number(((first + index) * step).toPrecision(12)));
+  };
+  context.textAlign = "center";
+  context.textBaseline = "top";
+  for (const tick of ticks(0, right - left, 48)) {
+    context.moveTo(at.x(tick), bottom);
+    context.lineTo(at.x(tick), bottom + 4);
+    context.fillText(numberText(tick), at.x(tick), bottom + 6);
+  }
+  context.textAlign = "right";
+  context.textBaseline = "middle";
+  for (const tick of ticks(1, bottom - top, 32)) {
+    context.moveTo(left - 4, at.y(tick));
+    context.lineTo(left, at.y(tick));
+    context.fillText(numberText(tick), left - 6, at.y(tick));
+  }
+  context.stroke();
+}
+
+// The scale of the colours, with numbers at its ends, at 0 and at the margin.
+function drawScale(context, scale, margin, [left, top, bottom]) {
+  const gradient = context.createLinearGradient(0, bottom, 0, top);
+  MAP.forEach((shade, index) => gradient.addColorStop(index / (MAP.length - 1), shade));
+  context.fillStyle = gradient;
+  context.fillRect(left, top, SCALE_WIDTH, bottom - top);
+  context.font = FONT;
+  context.textAlign = "left";
+  context.textBaseline = "middle";
+  const y = (number) => (top + bottom) / 2 - (scale > 0 ? number / scale : 0) * (bottom - top) / 2;
+  const rows = [];
+  for (const number of [0, ...(scale > 0 ? [scale, -scale] : []), ...(margin ? [margin] : [])]) {
+    if (Math.abs(number) > scale * (1 + 1e-9)) continue;
+    const height = y(number), row = Math.min(Math.max(height, top + 5), bottom - 5);
+    context.fillStyle = number === margin ? colour("ink") : colour("quiet");
+    context.fillRect(left, height - 0.5, SCALE_WIDTH + 3, 1);
+    if (rows.some((other) => Math.abs(other - row) < 12)) continue;
+    rows.push(row);
+    context.fillText(numberText(Number(number.toPrecision(3))), left + SCALE_WIDTH + 5, row);
+  }
+}
+
+// The picture of a map, a pixel for each cell, lowest row at the bottom; what is blocked stays clear.
+function pictureOf(run, map) {
+  map.picture ??= painted(run, map);
+  return map.picture;
+}
+
+function painted(run, map) {
+  const values = run.numbers(map.values);
+  const rows = values.length / map.columns;
+  const made = document.createElement("canvas");
+  made.width = map.columns;
+  made.height = rows;
+  const context = made.getContext("2d");
+  const image = context.createImageData(map.columns, rows);
+  const colours = MAP.map(rgb), last = colours.length - 1;
+  for (let row = 0; row < rows; row++) {
+    for (let column = 0; column < map.columns; column++) {
+      const number = values[row * map.columns + column];
+      if (Number.isNaN(number)) continue;
+      const place = 4 * ((rows - 1 - row) * map.columns + column);
+      const share = map.scale > 0 ? Math.min(Math.max(number / map.scale, -1), 1) : 0;
+      const at = (share + 1) / 2 * last, low = Math.min(Math.floor(at), last - 1);
+      for (let part = 0; part < 3; part++) {
+        image.data[place + part] = colours[low][part] + (at - low) * (colours[low + 1][part] - colours[low][part]);
+      }
+      image.data[place + 3] = 255;
+    }
+  }
+  context.putImageData(image, 0, 0);
+  return made;
+}
+
+function rgb(text) {
+  return [1, 3, 5].map((place) => parseInt(text.slice(place, place + 2), 16));
+}
+
+// How a part of the plane is shown in a rectangle of the screen, as large as fits, y upwards.
+function projection(low, high, width, height, margin) {
+  const scale = Math.min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]));
+  const left = (width - scale * (high[0] - low[0])) / 2, bottom = (height + scale * (high[1] - low[1])) / 2;
+  return {
+    scale,
+    x: (x) => left + scale * (x - low[0]),
+    y: (y) => bottom - scale * (y - low[1]),
+  };
+}
+
+// The map under the scene.
+function drawMap(context, run, map, at) {
+  const left = at.x(map.low[0]), top = at.y(map.high[1]);
+  const width = at.x(map.high[0]) - left, height = at.y(map.low[1]) - top;
+  hatch(context, left, top, width, height, colour("neutral"));
+  context.save();
+  context.imageSmoothingEnabled = false;
+  context.globalCompositeOperation = "destination-out";
+  context.drawImage(pictureOf(run, map), left, top, width, height);
+  context.globalCompositeOperation = "source-over";
+  context.globalAlpha = OPACITY;
+  context.drawImage(pictureOf(run, map), left, top, width, height);
+  context.restore();
+}
+
+// Oblique lines, which stay where a map is clear.
+function hatch(context, left, top, width, height, ink) {
+  context.save();
+  context.beginPath();
+  context.rect(left, top, width, height);
+  context.clip();
+  context.strokeStyle = ink;
+  context.lineWidth = 1;
+  context.beginPath();
+  for (let x = left - height; x < left + width; x += 7) {
+    context.moveTo(x, top + height);
+    context.lineTo(x + height, top);
+  }
+  context.stroke();
+  context.restore();
+}
+
+// Points x and y in turn, as a line.
+function drawWay(context, points, at, style) {
+  if (points.length < 4) return;
+  context.save();
+  context.strokeStyle = style.colour;
+  context.lineWidth = style.width;
+  context.setLineDash(style.dash ?? []);
+  context.lineJoin = "round";
+  context.beginPath();
+  for (let i = 0; i + 1 < points.length; i += 2) context.lineTo(at.x(points[i]), at.y(points[i + 1]));
+  context.stroke();
+  context.restore();
+}
+
+function drawTarget(context, target, at, ink) {
+  if (!target) return;
+  const [x, y] = target;
+  context.save();
+  context.strokeStyle = ink;
+  context.lineWidth = 2;
+  context.beginPath();
+  context.arc(at.x(x), at.y(y), 6, 0, 2 * Math.PI);
+  context.moveTo(at.x(x) - 10, at.y(y));
+  context.lineTo(at.x(x) + 10, at.y(y));
+  context.moveTo(at.x(x), at.y(y) - 10);
+  context.lineTo(at.x(x), at.y(y) + 10);
+  context.stroke();
+  context.restore();
+}
