@@ -227,6 +227,9 @@ def test_the_run_is_first_shown_where_it_went_wrong(open_page: Open) -> None:
     page = open_page("violated")
     expect(readout(page)).to_have_text("4.000 s / 9.967 s")
     expect(page.locator(".caption")).to_contain_text("fails by")
+    expect(page.locator("#scene .key").last).to_contain_text(
+        "trail of spoon and plate: spoon dist plate <= 0.08"
+    )
     page = open_page("violated", at="#t=2")
     expect(readout(page)).to_have_text("2.000 s / 9.967 s")
     expect(readout(open_page("satisfied"))).to_have_text("9.967 s / 9.967 s")
@@ -255,6 +258,11 @@ def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
     expect(row(page, "plate_first").locator(".what")).to_contain_text("pending")
     expect(page.locator("#tree .head")).to_contain_text("between")
     expect(row(page, "plate_first").locator(".number").nth(1)).to_contain_text("…")
+    # each node has its own lane, and a press on it moves the time
+    lane = row(page, "plate_first").locator("canvas")
+    lane.click(position={"x": 1, "y": 4})
+    expect(page.locator("#tree .which")).to_contain_text(re.compile(r"at 0\.[01]"))
+    expect(row(page, "plate_first").locator("xpath=..")).to_have_attribute("open", "")
 
 
 def test_choosing_an_event_goes_there(open_page: Open) -> None:
@@ -267,6 +275,12 @@ def test_choosing_an_event_goes_there(open_page: Open) -> None:
     page.locator(".event", has_text="is permanently violated").first.focus()
     page.keyboard.press("Enter")
     expect(readout(page)).to_have_text("4.000 s / 9.967 s")
+    # a press below the slider goes to the nearest event
+    ticks = page.locator(".ticks")
+    box = ticks.bounding_box()
+    assert box is not None
+    ticks.click(position={"x": box["width"] * 0.61, "y": 6})
+    expect(readout(page)).to_have_text("6.000 s / 9.967 s")
 
 
 def test_what_is_violated_is_explained_at_once(open_page: Open) -> None:

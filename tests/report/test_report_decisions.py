@@ -10,6 +10,7 @@ from foxglove_schemas_protobuf.Grid_pb2 import Grid
 
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
+    PlanCause,
     PlanDecision,
     PlanEdge,
     PlanMap,
@@ -55,8 +56,30 @@ def test_failed_attempts_are_listed() -> None:
     assert (reported["time"], reported["kind"], reported["target"]) == (1.0, "no path", None)
     (edge,) = reported["edges"]
     assert (edge["path"], edge["aim"], edge["pruned"]) == ([0, 1], False, "no object can do it")
-    assert edge["candidates"][0]["best"] == "nowhere free"
+    assert edge["candidates"][0]["best"] is None
     assert [(each["title"], each["edge"], each["candidate"]) for each in reported["maps"]] == [("cup", 0, 0)]
+
+
+def test_the_best_robustness_is_never_below_that_of_the_target() -> None:
+    planned = decision(0)
+    candidate = planned.considered[0].candidates[0]
+    candidate.rejected, candidate.best = "", 0.03
+    # refined between the centres of cells
+    candidate.target.CopyFrom(PlanTarget(object="cup", robustness=0.031))
+    candidate.causes.add(kind=PlanCause.KIND_CONSTRAINT, text="not (cup dist (jug) >= 1)", cells=3)
+    candidate.causes.add(kind=PlanCause.KIND_CONSTRAINT, text="not (a) and (b)", cells=2)
+    candidate.conjuncts.add(text="cup leftof jug", limits=5)
+    (edge,) = value_of(planned)["decisions"][0]["edges"]
+    (value,) = edge["candidates"]
+    assert value["best"] == value["target"]["robustness"] == 0.031
+    assert (value["cells"], value["bars"]) == (
+        10,
+        [
+            {"kind": "limited by", "words": ["", "cup leftof jug"], "cells": 5},
+            {"kind": "blocked", "words": ["", "cup dist (jug) >= 1", " would fail"], "cells": 3},
+            {"kind": "blocked", "words": ["", "not (a) and (b)", " would hold"], "cells": 2},
+        ],
+    )
 
 
 def test_later_motions_are_listed() -> None:

@@ -49,7 +49,7 @@ function drawAutomaton(automaton) {
   const moves = automaton.moves.filter((move) => move.source !== move.target).map((move) => ({
     ...move,
     made: svg("path", {class: "move", d: curve(places.get(move.source), places.get(move.target)),
-      "marker-end": "url(#tip)"}, svg("title", {}, move.guard)),
+      "marker-end": "url(#tip)"}),
   }));
   const states = new Map(automaton.states.map(
     (state) => [state.number, drawState(state, places.get(state.number))]));
@@ -59,8 +59,13 @@ function drawAutomaton(automaton) {
     "aria-label": `Automaton with ${automaton.summary}`, class: wide < 6 * COLUMN ? "small" : null,
   }, svg("defs", {}, tip("tip"), tip("tip-ahead")),
   svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
-  ...moves.map((move) => move.made), ...states.values(), ...labelsOf(moves, places));
+  ...moves.map((move) => move.made), ...moves.map(pointerArea), ...states.values(), ...labelsOf(moves, places));
   return {made, moves, states, set: null};
+}
+
+// A wide and clear copy of a move, which is easy to point at.
+function pointerArea({made, guard}) {
+  return svg("path", {class: "area", d: made.getAttribute("d")}, svg("title", {}, guard));
 }
 
 function tip(id) {
@@ -75,19 +80,19 @@ const LONGEST_LABEL = 16;
 const SHARES = [0.5, 0.4, 0.6, 0.32, 0.68, 0.25, 0.75];
 const LETTER = 5.6, LINE = 12;
 
-// The guards of the moves, with short names for long propositions, beside their curves: each at the place where it
-// covers least of states and of the labels before it.
+// The guards of the moves, with short names for long propositions, beside their curves: each at the first place where
+// it covers no state and no label before it. Without such a place, a move has its guard under the pointer alone.
 function labelsOf(moves, places) {
   const taken = [...places.values()].map(([x, y]) => [x - RADIUS, y - RADIUS, x + RADIUS, y + RADIUS]);
-  return moves.filter((move) => move.label).map(({source, target, label, guard}) => {
+  return moves.filter((move) => move.label).flatMap(({source, target, label, guard}) => {
     const text = label.length > LONGEST_LABEL ? `${label.slice(0, LONGEST_LABEL - 1)}…` : label;
     const half = text.length * LETTER / 2;
     const boxes = SHARES.map((share) => {
       const [x, y] = alongCurve(places.get(source), places.get(target), share);
       return [x - half, y - LINE, x + half, y];
     });
-    const covered = boxes.map((box) => taken.reduce((sum, other) => sum + overlapOf(box, other), 0));
-    const box = boxes[covered.indexOf(Math.min(...covered))];
+    const box = boxes.find((place) => taken.every((other) => overlapOf(place, other) === 0));
+    if (!box) return [];
     taken.push(box);
     return svg("text", {class: "guard", x: (box[0] + box[2]) / 2, y: box[3], "text-anchor": "middle", dy: "-0.3em"},
       text, svg("title", {}, guard));

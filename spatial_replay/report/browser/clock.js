@@ -193,7 +193,7 @@ function makeTransport(clock, events) {
     play,
     button("Next event", "next", () => jump(clock, events, 1)),
     button("To the last sample", "last", () => clock.seek(clock.end)),
-    slider, now, speed, themeButton(), helper, help);
+    element("div", {class: "time"}, slider, eventTicks(clock, events)), now, speed, themeButton(), helper, help);
   clock.on("time", () => {
     const share = clock.end > clock.start ? (clock.time - clock.start) / (clock.end - clock.start) : 0;
     slider.value = share * STEPS;
@@ -208,6 +208,31 @@ function makeTransport(clock, events) {
   window.addEventListener("keydown", (event) => {
     if (act(event, clock, events)) event.preventDefault();
   });
+}
+
+// Half the width of the slider's thumb, by which its ends lie inside, in pixels.
+const THUMB = 8;
+
+// A tick for each event below the slider; a press goes to the nearest one.
+function eventTicks(clock, events) {
+  if (!events.length || clock.end <= clock.start) return null;
+  const place = (event, width) => THUMB + (event.time - clock.start) / (clock.end - clock.start) * (width - 2 * THUMB);
+  const {made, redraw} = canvas(`${events.length} events over time`, (context, width, height) => {
+    for (const event of events) {
+      context.fillStyle = colour(STATUSES[event.status].colour === "neutral" ? "quiet" : `${STATUSES[event.status].colour}-line`);
+      context.fillRect(place(event, width) - 1, 3, 2, 9);
+    }
+  });
+  made.className = "ticks";
+  made.title = "Press to go to the nearest event; keys N and P";
+  made.addEventListener("pointerdown", (pointer) => {
+    const box = made.getBoundingClientRect();
+    const distance = (event) => Math.abs(place(event, box.width) - (pointer.clientX - box.left));
+    clock.pause();
+    goTo(clock, events.reduce((nearest, event) => (distance(event) < distance(nearest) ? event : nearest)));
+  });
+  window.addEventListener("themechange", redraw);
+  return made;
 }
 
 const ICONS = {

@@ -3,6 +3,7 @@
 
 // The colours of a map, as palette.py has them, and how much of them covers the scene.
 const MAP = ["#d55e00", "#f5f5f5", "#0072b2"], OPACITY = 0.6;
+const MAP_COLOURS = MAP.map(rgb);
 // Cells are as light in dark pages, and so are their ground and what is drawn on them.
 const MAP_INK = "#24292f", MAP_GROUND = "#e4e4e4", MAP_HATCH = "#9a9a9a";
 // Room in pixels for the axes, and for the scale and its numbers.
@@ -348,22 +349,28 @@ function painted(run, map) {
   made.height = rows;
   const context = made.getContext("2d");
   const image = context.createImageData(map.columns, rows);
-  const colours = MAP.map(rgb), last = colours.length - 1;
   for (let row = 0; row < rows; row++) {
     for (let column = 0; column < map.columns; column++) {
       const number = values[row * map.columns + column];
       if (Number.isNaN(number)) continue;
       const place = 4 * ((rows - 1 - row) * map.columns + column);
-      const share = map.scale > 0 ? Math.min(Math.max(number / map.scale, -1), 1) : 0;
-      const at = (share + 1) / 2 * last, low = Math.min(Math.floor(at), last - 1);
-      for (let part = 0; part < 3; part++) {
-        image.data[place + part] = colours[low][part] + (at - low) * (colours[low + 1][part] - colours[low][part]);
-      }
+      const shade = mixOf(map.scale > 0 ? number / map.scale : 0);
+      for (let part = 0; part < 3; part++) image.data[place + part] = shade[part];
       image.data[place + 3] = 255;
     }
   }
   context.putImageData(image, 0, 0);
   return made;
+}
+
+// The colour of a number from −1 to 1, as red, green and blue.
+function mixOf(number) {
+  const at = (Math.min(Math.max(number, -1), 1) + 1) / 2 * (MAP.length - 1), low = Math.min(Math.floor(at), MAP.length - 2);
+  return MAP_COLOURS[low].map((part, index) => part + (at - low) * (MAP_COLOURS[low + 1][index] - part));
+}
+
+function shadeOf(number) {
+  return `rgb(${mixOf(number).map(Math.round).join(" ")})`;
 }
 
 function rgb(text) {

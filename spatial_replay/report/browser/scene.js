@@ -16,7 +16,7 @@ function makeScene(clock, name = "scene") {
   });
   made.className = "stage";
   made.style.aspectRatio = String(aspectOf(scene));
-  const caption = element("p", {class: "caption"});
+  const caption = element("p", {class: "caption"}), trail = element("p", {class: "key"});
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
     layerBox("names", "labels", layers, redraw), layerBox("trails", "trails", layers, redraw),
@@ -24,7 +24,8 @@ function makeScene(clock, name = "scene") {
   key([{ground: "positive", words: scene.entities.some((each) => each.shades)
     ? "its requirements in the chosen result hold now" : "its requirements hold now"},
     {ground: "negative", words: "one is permanently violated"},
-    {ground: "neutral", words: "no requirement, still to come, or unknown"}]));
+    {ground: "neutral", words: "no requirement, still to come, or unknown"}]), trail);
+  clock.on("result", () => trail.replaceChildren(...trailKey(clock, scene)));
   let before = null;
   const show = () => {
     const frame = indexAt(scene.times, clock.time);
@@ -143,7 +144,10 @@ function drawScene(context, clock, scene, layers, width, height) {
   const decision = decisionAt(clock.run, clock.time);
   const map = decision && chosenMap(decision);
   if (layers.map && map) drawMap(context, clock.run, map, at);
-  if (layers.trails) drawTrails(context, scene, frame, at);
+  if (layers.trails) {
+    drawTrails(context, scene, frame, at);
+    drawTightTrails(context, clock, scene, at, [width, height]);
+  }
   const labels = [];
   const colourAt = coloursOf(clock, scene, frame);
   const marked = failedObjects(clock);
@@ -357,6 +361,70 @@ function drawTrails(context, scene, frame, at) {
     if (entity.kind === "object") drawTrail(context, entity, first, frame, at);
   }
   context.restore();
+}
+
+// The objects that decide the chosen result, and the number of its deciding part in each frame; null without one.
+function tightnessOf(clock, scene) {
+  const {run, result: chosen} = clock;
+  const result = run.results[chosen];
+  const names = result?.pointer?.objects ?? [];
+  const node = result && (result.nodes[result.decided] ?? result.nodes[0]);
+  if (!names.length || !node) return null;
+  result.tightness ??= Float64Array.from(scene.times, (time) => {
+    const place = placeIn(result, indexAt(run.times, time));
+    return place === null || place >= result.samples ? NaN : node.series[NOW][place] * node.divisor;
+  });
+  const scale = result.tightness.reduce((most, number) => (Number.isFinite(number) ? Math.max(most, Math.abs(number)) : most), 0);
+  return scale > 0 ? {names, node, numbers: result.tightness, scale} : null;
+}
+
+const TRAIL_SHADES = 16;
+
+// The whole trails of the deciding objects, in the colours of the number that decides: where it got tight.
+function drawTightTrails(context, clock, scene, at, size) {
+  const tightness = tightnessOf(clock, scene);
+  if (!tightness) return;
+  const key = [clock.result, ...size].join();
+  if (scene.tight?.key !== key) scene.tight = {key, paths: tightPaths(scene, tightness, at)};
+  context.save();
+  context.lineCap = "round";
+  context.strokeStyle = colour("quiet");
+  context.lineWidth = 4.5;
+  for (const {path} of scene.tight.paths) context.stroke(path);
+  context.lineWidth = 3;
+  for (const {path, shade} of scene.tight.paths) {
+    context.strokeStyle = shade;
+    context.stroke(path);
+  }
+  context.restore();
+}
+
+function tightPaths(scene, {names, numbers, scale}, at) {
+  const paths = Array.from({length: TRAIL_SHADES}, (_, index) => ({path: new Path2D(), shade: shadeOf(2 * (index + 0.5) / TRAIL_SHADES - 1)}));
+  for (const entity of scene.entities.filter(({kind, name}) => kind === "object" && names.includes(name))) {
+    entity.middles ??= middlesOf(entity);
+    for (let frame = 1; frame < scene.times.length; frame++) {
+      const [x0, y0, x1, y1] = entity.middles.subarray(2 * frame - 2, 2 * frame + 2);
+      if (Number.isNaN(x0 + x1 + numbers[frame]) || (x0 === x1 && y0 === y1)) continue;
+      const share = (Math.min(Math.max(numbers[frame] / scale, -1), 1) + 1) / 2;
+      const {path} = paths[Math.min(Math.floor(share * TRAIL_SHADES), TRAIL_SHADES - 1)];
+      path.moveTo(at.x(x0), at.y(y0));
+      path.lineTo(at.x(x1), at.y(y1));
+    }
+  }
+  return paths;
+}
+
+// The scale of those colours, in words and numbers.
+function trailKey(clock, scene) {
+  const tightness = tightnessOf(clock, scene);
+  if (!tightness) return [];
+  const {names, node, scale} = tightness;
+  const block = element("i", {class: "block"});
+  block.style.cssText = `width: 5rem; height: 0.6rem; background: linear-gradient(to right, ${MAP.join(", ")})`;
+  const unit = spaced(declaredUnit(node) || (node.divisor === 1 ? "" : clock.run.lengths));
+  return [element("span", {}, numberText(-scale), block, `${numberText(scale)}${unit}`),
+    element("span", {}, `trail of ${names.join(" and ")}: `, element("code", {}, shortened(node.text, 48)), " at each place")];
 }
 
 // A line through the middles of an object, with a gap where it was absent.

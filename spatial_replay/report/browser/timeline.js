@@ -61,7 +61,6 @@ function lanesOf(clock, result, number) {
 }
 
 function makeLane(clock, result, node, number) {
-  const stretches = stretchesOf(clock.run, result, node);
   const isResult = node.parent === null;
   const sign = mark("unknown");
   const name = isResult ? result.title : node.name;
@@ -70,17 +69,28 @@ function makeLane(clock, result, node, number) {
     "aria-pressed": isResult ? String(number === clock.result) : null,
     onclick: () => clock.choose(number),
   }, sign, element("span", {}, name));
-  const strip = canvas(`How ${name} stands over time`, (context, width, height) => {
-    const fills = {positive: colour("positive"), negative: colour("negative"), neutral: colour("neutral")};
-    for (const stretch of stretches) drawStretch(context, clock, stretch, fills, width, height);
-  });
-  strip.made.className = "strip";
-  scrub(strip.made, clock);
+  const strip = nodeLane(clock, result, node, `How ${name} stands over time`);
   return {
     made: element("div", {class: "lane"}, label, strip.made),
     redraw: strip.redraw,
     update: () => setMark(sign, statusOf(clock.run, result, node, placeIn(result, clock.sample))),
   };
+}
+
+// How a node stands over time, within the view.
+function nodeLane(clock, result, node, title = `How ${node.text} stands over time`) {
+  let stretches = null;
+  const strip = canvas(title, (context, width, height) => {
+    // a lane that nobody sees costs nothing
+    stretches ??= stretchesOf(clock.run, result, node);
+    const fills = {positive: colour("positive"), negative: colour("negative"), neutral: colour("neutral")};
+    for (const stretch of stretches) drawStretch(context, clock, stretch, fills, width, height);
+  });
+  strip.made.className = "strip";
+  scrub(strip.made, clock);
+  // within a heading it folds nothing
+  strip.made.addEventListener("click", (event) => event.preventDefault());
+  return strip;
 }
 
 // What fails is drawn higher than what holds, and that higher than what is unknown; what is final is full.
@@ -91,10 +101,10 @@ function drawStretch(context, clock, [from, to, status], fills, width, height) {
   const left = shareOf(clock, from) * width, right = shareOf(clock, to) * width;
   if (right < 0 || left > width) return;
   const begin = Math.max(left, 0), size = Math.max(Math.min(right, width) - begin, 1);
-  const high = HEIGHTS[status] * (height - 6);
+  const air = height > 12 ? 3 : 1, high = HEIGHTS[status] * (height - 2 * air);
   context.globalAlpha = OPACITIES[status];
   context.fillStyle = fills[STATUSES[status].colour];
-  context.fillRect(begin, height - 3 - high, size, high);
+  context.fillRect(begin, height - air - high, size, high);
 }
 
 // Moves the cursor when the pointer is pressed or dragged on an element that spans the view.

@@ -7,10 +7,13 @@ function makeTree(clock) {
     element("span", {class: "what"}, "node"));
   const list = element("ul", {class: "tree", "aria-label": "Nodes of the formula"});
   place.append(title, head, list);
-  let rows = [];
+  let rows = [], lanes = [];
+  const redraw = () => lanes.forEach((lane) => lane.redraw());
+  clock.on("view", redraw);
+  window.addEventListener("themechange", redraw);
   clock.on("result", () => {
     const result = clock.run.results[clock.result];
-    rows = [];
+    [rows, lanes] = [[], []];
     title.replaceChildren();
     if (!result) {
       list.replaceChildren(element("li", {}, "Nothing was evaluated."));
@@ -20,6 +23,11 @@ function makeTree(clock) {
     head.replaceChildren(head.firstChild,
       ...["so far", "between", "now"].map((words) => element("span", {class: "number"}, words + unit)));
     list.replaceChildren(branch(result.nodes[0], rows));
+    lanes = rows.map((row) => {
+      const lane = nodeLane(clock, result, row.node);
+      row.parts[0].parentElement.append(lane.made);
+      return lane;
+    });
     lightPath(list, rows, result);
   });
   clock.on("time", () => {
