@@ -132,44 +132,80 @@ class Monitored(NamedTuple):
     places: Mapping[str, tuple[int, int]]
 
 
-@dataclass(frozen=True, eq=False)
-class Update:
-    """The numbers and verdicts after a sample.
+class Settlement(NamedTuple):
+    """What a monitor knows beside its numbers; most samples leave it as it is.
 
     Attributes:
-        numbers: for each result spec (N, 4), as in `SpecUpdate`.
-        monitored: what they are numbers of.
-        settled: what `violations` are found from.
-        satisfied: the specs that are permanently satisfied; why is found when asked for (`reason`).
-        remarks: a warning for each object and signal of the specification that is missing for too long.
+        settled: what `Update.violations` are found from.
+        satisfied, remarks: see `Update`.
     """
 
-    time_ns: int
-    numbers: Sequence[Floats | None]
-    monitored: Monitored
     settled: tuple[Settled, ...] = ()
     satisfied: tuple[Settled, ...] = ()
     remarks: tuple[Diagnostic, ...] = ()
 
-    @cached_property
+
+class Update:
+    """The numbers and verdicts after a sample. It stays as it is when others follow."""
+
+    # no frozen dataclass, which takes half a microsecond more to make
+    __slots__ = ("_monitored", "_numbers", "_settlement", "_specs", "_time_ns")
+
+    def __init__(
+        self, time_ns: int, numbers: Sequence[Floats | None], monitored: Monitored, settlement: Settlement
+    ) -> None:
+        """Take the numbers (N, 4) of each result spec, and the specs that they are numbers of."""
+        self._time_ns = time_ns
+        self._numbers = numbers
+        self._monitored = monitored
+        self._settlement = settlement
+        self._specs: tuple[SpecUpdate, ...] | None = None
+
+    @property
+    def time_ns(self) -> int:
+        return self._time_ns
+
+    @property
+    def numbers(self) -> Sequence[Floats | None]:
+        """For each result spec (N, 4), as in `SpecUpdate`; read-only."""
+        for numbers in self._numbers:
+            if numbers is not None:
+                numbers.setflags(write=False)
+        return self._numbers
+
+    @property
     def specs(self) -> tuple[SpecUpdate, ...]:
         """One for each result spec, in the order of the text."""
-        of_specs = zip(self.monitored.specs, self.numbers, strict=True)
-        return tuple([SpecUpdate(spec, numbers, names, unit) for (spec, names, unit), numbers in of_specs])
+        if self._specs is None:
+            of_specs = zip(self._monitored.specs, self.numbers, strict=True)
+            self._specs = tuple(
+                [SpecUpdate(spec, rows, names, unit) for (spec, names, unit), rows in of_specs]
+            )
+        return self._specs
 
     @property
     def places(self) -> Mapping[str, tuple[int, int]]:
         """For each name, its index in `specs` and its node."""
-        return self.monitored.places
+        return self._monitored.places
 
-    @cached_property
+    @property
     def violations(self) -> tuple[Violation, ...]:
         """Permanent violations, in the order in which they became certain; computed on demand.
 
         The parts of a conjunction are reported apart. None under the paper's semantics, where later samples
         may change every verdict.
         """
-        return tuple(each.violation for each in self.settled)
+        return tuple([settled.violation for settled in self._settlement.settled])
+
+    @property
+    def satisfied(self) -> tuple[Settled, ...]:
+        """The specs that are permanently satisfied; why is found when asked for (`reason`)."""
+        return self._settlement.satisfied
+
+    @property
+    def remarks(self) -> tuple[Diagnostic, ...]:
+        """A warning for each object and signal of the specification that is missing for too long."""
+        return self._settlement.remarks
 
     @property
     def verdict(self) -> Verdict:
@@ -289,6 +325,7 @@ class Monitor:
         self._start = self._wait()
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
+        self._settlement = Settlement()
         self._unknown: dict[int, Settled] = {}
 
     def note_unknown(self) -> None:
@@ -367,16 +404,15 @@ class Monitor:
                 f"a sample at {at} follows one at {last}; give samples in the order of their times"
             )
         remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
+        if remarks is not self._settlement.remarks:
+            self._settlement = self._settlement._replace(remarks=remarks)
         self._last_ns = time_ns
-        if not self._start.has_begun(sample):
-            return Update(time_ns, self._numbers, self._monitored, remarks=remarks)
-        self._numbers = numbers = self._live.extend(sample)
-        settled: tuple[Settled, ...] = ()
-        satisfied: tuple[Settled, ...] = ()
-        if self._violations is not None:
-            self._violations.extend(sample, numbers)
-            settled, satisfied = self._violations.settled, self._violations.satisfied
-        return Update(time_ns, numbers, self._monitored, settled, satisfied, remarks)
+        if self._start.begin_ns is not None or self._start.has_begun(sample):
+            self._numbers = self._live.extend(sample)
+            log = self._violations
+            if log is not None and log.extend(sample, self._numbers):
+                self._settlement = Settlement(log.settled, log.satisfied, remarks)
+        return Update(time_ns, self._numbers, self._monitored, self._settlement)
 
 
 class _Start:
@@ -725,8 +761,7 @@ class ViolationLog:
         self._specification = specification
         self._start_ns = start_ns
         self._samples: deque[Sample] = deque(maxlen=REMEMBERED)
-        self._first_ns = 0
-        self._dropped = False
+        self._first_ns: int | None = None
         self._open = [
             (index, spec, list(conjuncts_of(spec.formula, spec.name)))
             for index, spec in enumerate(specification.results)
@@ -735,14 +770,12 @@ class ViolationLog:
         self.settled: tuple[Settled, ...] = ()
         self.satisfied: tuple[Settled, ...] = ()
 
-    def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> None:
-        """Take in a sample and the numbers (N, 4) of each result after it."""
-        samples = self._samples
-        if len(samples) == REMEMBERED:
-            self._dropped = True
-        elif not samples:
+    def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> bool:
+        """Take in a sample and the numbers (N, 4) of each result after it; return whether it settled any."""
+        if self._first_ns is None:
             self._first_ns = sample.time_ns
-        samples.append(sample)
+        self._samples.append(sample)
+        settled, satisfied = self.settled, self.satisfied
         for index, spec, conjuncts in self._open:
             after = numbers[index]
             if after is None:
@@ -754,6 +787,7 @@ class ViolationLog:
                 whole = Conjunct(0, spec.name, spec.formula)
                 found = self._settled(spec, whole, Verdict.SATISFIED, float(after[0, 2]))
                 self.satisfied = (*self.satisfied, found)
+        return self.settled is not settled or self.satisfied is not satisfied
 
     def unknown(self, spec: NamedSpec) -> Settled:
         """Return a result that is unknown since the newest sample, if the run ends there."""
@@ -770,6 +804,7 @@ class ViolationLog:
 
     def _settled(self, spec: NamedSpec, conjunct: Conjunct, verdict: Verdict, number: float) -> Settled:
         samples = tuple(self._samples)
+        first_ns = self._first_ns or 0
         return Settled(
             spec,
             compile_formula(spec.formula),
@@ -779,7 +814,7 @@ class ViolationLog:
             number,
             samples,
             next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns),
-            not self._dropped,
-            self._first_ns,
+            samples[0].time_ns == first_ns,
+            first_ns,
             self._units,
         )

@@ -392,7 +392,6 @@ class LiveStream:
         self._start_ns = start_ns
         self._first_ns: int | None = None
         self._position = -1
-        self._newest: Floats | None = None
 
     @property
     def finals(self) -> list[Floats | None]:
@@ -404,18 +403,20 @@ class LiveStream:
         """Add the next sample, whose time comes after the last one's.
 
         Returns:
-            (N, 4) for each formula, read-only: value, now, lower and upper of each node. Before the start,
+            (N, 4) for each formula: value, now, lower and upper of each node. Before the start,
             None, or NaN under semantics without continuations to wait for.
         """
-        samples = self._leaves.look_at(sample)
         if not self._is_online:
-            return self._extend_apart(sample, samples)
-        if sample.time_ns < self._start_ns:
-            return [None] * len(self._evaluators)
-        leaves = self._leaves.values(samples)
-        self._newest = leaves
+            return self._extend_apart(sample)
         time_ns = sample.time_ns
-        return [run.add_sample(leaves, first_leaf, time_ns) for run, first_leaf in self._online_runs]
+        if time_ns < self._start_ns:
+            self._leaves.look_at(sample)
+            return [None] * len(self._evaluators)
+        room = self._leaves.fill_room(sample)
+        numbers: list[Floats | None] = []
+        for run, first_leaf in self._online_runs:
+            numbers.append(run.add_sample(room, first_leaf, time_ns))
+        return numbers
 
     def leaves(self, place: int) -> Floats:
         """Return the leaves (C, A, 1) of a formula in the newest evaluated sample.
@@ -423,24 +424,24 @@ class LiveStream:
         Raises:
             UsageError: no sample has been evaluated, or under the paper's semantics.
         """
-        if self._newest is None:
+        room = self._leaves.room
+        if not (room.channels and self._is_online):
             raise UsageError("no sample has been evaluated, or under the paper's semantics; add a sample")
-        return self._newest[:, self._own_leaves[place]]
+        return room.leaves[: room.channels, self._own_leaves[place]].copy()
 
-    def _extend_apart(self, sample: Sample, samples: Sequence[Sample | None]) -> list[Floats | None]:
+    def _extend_apart(self, sample: Sample) -> list[Floats | None]:
         self._position += 1
         if self._first_ns is None:
             self._first_ns = sample.time_ns
         if sample.time_ns < self._start_ns:
+            self._leaves.look_at(sample)
             return [np.full((len(each.program.reports), 4), np.nan) for each in self._evaluators]
-        values = self._leaves.values(samples)
+        values = self._leaves.fill_room(sample).measure()
         position, time_ns = np.array([self._position]), np.array([sample.time_ns])
         results: list[Floats | None] = []
         for evaluator, run, own in zip(self._evaluators, self._runs, self._own_leaves, strict=True):
             leaves = evaluator.leaves_within_log(values[:, own], position, time_ns, self._first_ns)
-            numbers = run.extend(leaves, time_ns)[:, :, 0]
-            numbers.flags.writeable = False
-            results.append(numbers)
+            results.append(run.extend(leaves, time_ns)[:, :, 0])
         return results
 
 

@@ -169,7 +169,7 @@ class Observer:
 
     def symbol(self, sample: Sample) -> Symbol:
         """Return the value of each proposition in a sample."""
-        values = self._leaves.values(self._leaves.look_at(sample))
+        values = self._leaves.fill_room(sample).measure()
         lower, upper = values[0, :, 0].tolist(), values[min(1, len(values) - 1), :, 0].tolist()
         bounds = zip(lower, upper, strict=True)
         return tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in bounds)

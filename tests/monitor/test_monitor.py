@@ -20,6 +20,7 @@ from spatial_replay import (
     Sample,
     SpecificationError,
     TraceError,
+    TrackedObject,
     UsageError,
     parse_specification,
 )
@@ -223,6 +224,29 @@ def test_nodes_are_read_one_by_one_or_as_numbers():
         spec.numbers[0, 0] = 1
     with pytest.raises(UsageError, match="3 is not a sample"):
         monitor.update(3)
+
+
+def test_updates_and_leaves_that_are_held_stay_as_they_are() -> None:
+    """Unknown and uncertain values, violations and a warning come while earlier updates are held."""
+    text = "spec near = G (a dist b <= 2)\nspec high = F[0, 2] (p >= 1)"
+    samples = [
+        Sample(k, {"a": Footprint.disc(k, 0, 0.1), "b": thing}, {"p": float("nan") if k % 5 == 2 else k % 3})
+        for k, thing in enumerate(
+            [Footprint.disc(0, 1, 0.1)] * 4 + [TrackedObject(Footprint.disc(3, 1, 0.1), uncertainty=0.25)] * 8
+        )
+    ]
+    monitor = Monitor(parse_specification(text), missing_after=None)
+    held = [(monitor.update(sample), monitor.leaves(1)) for sample in samples]
+    for count, (update, leaves) in enumerate(held, start=1):
+        again = Monitor(parse_specification(text), missing_after=None)
+        *_, newest = [again.update(sample) for sample in samples[:count]]
+        assert update.time_ns == samples[count - 1].time_ns
+        for before, after in zip(update.numbers, newest.numbers, strict=True):
+            assert before.tobytes() == after.tobytes()
+        assert leaves.tobytes() == again.leaves(1).tobytes()
+        assert list(map(str, update.violations)) == list(map(str, newest.violations))
+    with pytest.raises(AttributeError):
+        held[0][0].time_ns = 5
 
 
 def test_a_monitor_that_is_reset_is_as_good_as_new() -> None:

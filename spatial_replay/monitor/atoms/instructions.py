@@ -163,15 +163,17 @@ TILE = 128
 
 
 @inlined
-def _copy_to(source: Floats, row: int, begin: int, count: int, target: Floats) -> None:
+def _copy_to(source: Floats, row: int, begin: int, count: int, columns: Floats, target: int) -> None:
     for k in range(count):
-        target[k] = source[row, begin + k]
+        columns[target, k] = source[row, begin + k]
 
 
 @inlined
-def _copy_from(source: Floats, target: Floats, channel: int, row: int, begin: int, count: int) -> None:
+def _copy_from(
+    columns: Floats, source: int, leaves: Floats, channel: int, leaf: int, begin: int, count: int
+) -> None:
     for k in range(count):
-        target[channel, row, begin + k] = source[k]
+        leaves[channel, leaf, begin + k] = columns[source, k]
 
 
 @elementwise
@@ -183,7 +185,7 @@ def run_instructions(
     spreads: Floats,
     signals: Floats,
     closest: Floats,
-    members: Flags,
+    members: Flags | Integers,
     outputs: Integers,
     leaves: Floats,
     begin: int,
@@ -191,93 +193,96 @@ def run_instructions(
 ) -> None:
     """Run the instructions over some samples; leaf j is what instruction outputs[j] gives."""
     channels = leaves.shape[0]
-    columns = np.empty((code.shape[0], channels, min(TILE, end - begin)))
+    columns = np.empty((code.shape[0] * channels, min(TILE, end - begin)))
     for t in range(begin, end, TILE):
         count = min(TILE, end - t)
         for i in range(code.shape[0]):
             op, a, b, c = code[i, 0], code[i, 1], code[i, 2], code[i, 3]
             for channel in range(channels):
                 mirror = channel ^ 1 if channels > 1 else channel
-                target = columns[i, channel]
-                first, second, opposite = columns[a, channel], columns[b, channel], columns[a, mirror]
+                # rows by their numbers: a slice of an array takes as long as ten samples
+                target, opposite = i * channels + channel, a * channels + mirror
+                first, second = a * channels + channel, b * channels + channel
                 # a loop for each operation: a single one would ask for each sample which it is
                 if op == CONSTANT:
                     for k in range(count):
-                        target[k] = constants[a]
+                        columns[target, k] = constants[a]
                 elif op == MEASURED:
                     sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
-                    _copy_to(values, a, t, count, target)
+                    _copy_to(values, a, t, count, columns, target)
                     if sign:
                         for k in range(count):
-                            target[k] += sign * spreads[a, t + k]
+                            columns[target, k] += sign * spreads[a, t + k]
                 elif op == SIGNAL:
                     for k in range(count):
                         value = signals[a, t + k]
-                        target[k] = np.nan if -np.inf < value <= TEXTS else value
+                        columns[target, k] = np.nan if -np.inf < value <= TEXTS else value
                 elif op == CLOSEST:
                     for k in range(count):
-                        target[k] = closest[a, channel, t + k]
+                        columns[target, k] = closest[a, channel, t + k]
                 elif op == ADD:
                     for k in range(count):
-                        target[k] = first[k] + second[k]
+                        columns[target, k] = columns[first, k] + columns[second, k]
                 elif op == NEGATE:
                     for k in range(count):
-                        target[k] = -opposite[k]
+                        columns[target, k] = -columns[opposite, k]
                 elif op == LEAST:
                     for k in range(count):
-                        least = min(first[k], second[k])
-                        is_number = first[k] == first[k] and second[k] == second[k]
-                        target[k] = least if is_number else np.nan
+                        left, right = columns[first, k], columns[second, k]
+                        is_number = left == left and right == right
+                        columns[target, k] = min(left, right) if is_number else np.nan
                 elif op == GREATEST:
                     for k in range(count):
-                        greatest = max(first[k], second[k])
-                        is_number = first[k] == first[k] and second[k] == second[k]
-                        target[k] = greatest if is_number else np.nan
+                        left, right = columns[first, k], columns[second, k]
+                        is_number = left == left and right == right
+                        columns[target, k] = max(left, right) if is_number else np.nan
                 elif op == HOLDS:
                     anything = np.inf if channel % 2 else -np.inf
                     for k in range(count):
-                        is_number = first[k] == first[k] and opposite[k] == opposite[k]
-                        target[k] = first[k] if is_number else anything
+                        number, mirrored = columns[first, k], columns[opposite, k]
+                        is_number = number == number and mirrored == mirrored
+                        columns[target, k] = number if is_number else anything
                 elif op == AND:
                     for k in range(count):
-                        target[k] = min(first[k], second[k])
+                        columns[target, k] = min(columns[first, k], columns[second, k])
                 elif op == EQUAL:
                     for k in range(count):
                         value = signals[a, t + k]
                         equal = np.inf if value == constants[b] else -np.inf
                         is_alike = value == value and (value <= TEXTS) == (constants[b] <= TEXTS)
-                        target[k] = equal if is_alike else np.nan
+                        columns[target, k] = equal if is_alike else np.nan
                 elif op == DIVIDE:
                     for k in range(count):
-                        target[k] = first[k] / constants[b]
+                        columns[target, k] = columns[first, k] / constants[b]
                 elif op == MULTIPLY:
                     for k in range(count):
-                        target[k] = first[k] * constants[b]
+                        columns[target, k] = columns[first, k] * constants[b]
                 elif op == QUOTIENT:
                     for k in range(count):
-                        target[k] = first[k] / second[k]
+                        columns[target, k] = columns[first, k] / columns[second, k]
                 elif op == HAS_VALUE:
                     for k in range(count):
-                        has_value = np.inf if first[k] == first[k] else -np.inf
-                        target[k] = has_value if second[k] == second[k] else np.nan
+                        left, right = columns[first, k], columns[second, k]
+                        has_value = np.inf if left == left else -np.inf
+                        columns[target, k] = has_value if right == right else np.nan
                 elif op == OR:
                     for k in range(count):
-                        target[k] = max(first[k], second[k])
+                        columns[target, k] = max(columns[first, k], columns[second, k])
                 else:
                     for k in range(count):
-                        value = second[k]
+                        value = columns[second, k]
                         # unknown membership: the body may or may not count, so its interval is all reals
                         if members[c, t + k] < 0:
                             value = np.inf if channel % 2 else -np.inf
                         if members[c, t + k] == 0:
-                            target[k] = first[k]
+                            columns[target, k] = columns[first, k]
                         elif op == AND_MEMBER:
-                            target[k] = min(first[k], value)
+                            columns[target, k] = min(columns[first, k], value)
                         else:
-                            target[k] = max(first[k], value)
+                            columns[target, k] = max(columns[first, k], value)
         for j in range(len(outputs)):
             for channel in range(channels):
-                _copy_from(columns[outputs[j], channel], leaves, channel, j, t, count)
+                _copy_from(columns, outputs[j] * channels + channel, leaves, channel, j, t, count)
 
 
 MAX_BINDINGS = 20_000

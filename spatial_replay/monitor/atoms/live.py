@@ -24,7 +24,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Flags, Floats, Integers, starts_from_counts
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.footprint import (
     BOTTOM,
     PARTS,
@@ -141,12 +141,12 @@ class PackedPlan(NamedTuple):
     Attributes:
         whole: where each array begins and ends, and then those of whole numbers.
         real: the others.
-        leaves: how many leaves it computes.
+        room: for how many numbers `measure_sample` takes room, besides three for each of the objects'.
     """
 
     whole: Integers
     real: Floats
-    leaves: int
+    room: int
 
     @property
     def nbytes(self) -> int:
@@ -161,7 +161,13 @@ class PackedPlan(NamedTuple):
             begin = sum(map(len, among))
             whole[0][2 * number : 2 * number + 2] = begin, begin + array.size
             among.append(array.ravel())
-        return cls(np.concatenate(whole), np.concatenate(real), len(arrays.outputs))
+        measured, closest = len(arrays.geometric) + len(arrays.yaws), len(arrays.closest_enlargement)
+        operands = len(arrays.enlargement)
+        room = 3 * measured + 4 * closest + len(arrays.is_group)
+        room += 3 * operands + 2 + int(arrays.listed_start[operands])
+        room += 6 * int(arrays.extent[:3].sum()) + 2
+        room += 2 * len(arrays.region_radius) + 3 * len(arrays.region_vertices)
+        return cls(np.concatenate(whole), np.concatenate(real), room)
 
 
 @inlined
@@ -218,7 +224,7 @@ def _places_at(plan: PlanArrays) -> int:
 
 
 @inlined
-def _rows_of_sample(plan: PlanArrays, sample: Floats) -> SampleRows:
+def _rows_of_sample(plan: PlanArrays, sample: Floats, room: Floats) -> SampleRows:
     """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
     samples, regions, places = plan.extent[0], plan.extent[1], plan.extent[2]
     here, rows = samples + regions, samples + regions + places
@@ -231,12 +237,12 @@ def _rows_of_sample(plan: PlanArrays, sample: Floats) -> SampleRows:
             count = int(sample[at])
             at += _OF_PART + 2 * count
             corners += count
-    whole, real = np.empty(2 * rows + parts + 2, np.int64), np.empty(4 * rows + parts + 6 * corners)
     starts, heights = rows, 4 * rows + parts
+    real, whole = room[: heights + 6 * corners], room[heights + 6 * corners :].view(np.int64)
     made = SampleRows(
         classes=whole[:rows],
         part_start=whole[starts : starts + rows + 1],
-        vertex_start=whole[starts + rows + 1 :],
+        vertex_start=whole[starts + rows + 1 : starts + rows + parts + 2],
         vertices=real[heights : heights + 2 * corners].reshape((corners, 2)),
         radius=real[4 * rows : heights],
         bottom=real[:rows],
@@ -298,14 +304,14 @@ def _is_hidden(plan: PlanArrays, rows: SampleRows, row: int) -> bool:
 
 
 @inlined
-def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats) -> None:
+def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats, room: Floats) -> None:
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
     if len(values) == 0:
         return
     operands, required = len(plan.enlargement), len(plan.listed_start) - 1 - len(values)
-    of_operands, measured = np.empty(operands + 1), np.empty((len(plan.geometric), 1))
-    room = np.empty(2 * operands + 1 + plan.listed_start[operands], np.int64)
-    widths, hidden, members = room[:operands], room[operands : 2 * operands + 1], room[2 * operands + 1 :]
+    of_operands, begin = room[: operands + 1], operands + 1 + len(plan.geometric)
+    measured, lists = room[operands + 1 : begin].reshape((-1, 1)), room[begin:].view(np.int64)
+    widths, hidden, members = lists[:operands], lists[operands : 2 * operands + 1], lists[2 * operands + 1 :]
     of_operands[operands], hidden[operands] = 0.0, 0  # for no operand, -1
     for operand in range(operands):
         begin, end = plan.listed_start[operand], plan.listed_start[operand + 1]
@@ -379,7 +385,7 @@ def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
 
 
 @inlined
-def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
+def _members(plan: PlanArrays, classes: Integers, members: Integers) -> None:
     """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
     first = len(plan.enlargement) + len(plan.closest_enlargement)
     for m in range(len(members)):
@@ -391,7 +397,7 @@ def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
 
 @inlined
 def _channels_of(
-    values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Flags, constants: Floats
+    values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Integers, constants: Floats
 ) -> int:
     """Return the number of channels needed: 4 with uncertainty, 2 with anything unknown, else 1."""
     channels = 1
@@ -418,28 +424,36 @@ def _channels_of(
 
 
 @kernel
-def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats) -> int:
+def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leaves: Floats) -> int:
     """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
 
     Args:
         whole, real: of a `PackedPlan`.
         sample: 0 or `ABSENT` for each sample, then the value of each signal. If the plan distinguishes
             classes, the class code of each place follows. Last comes each place's `packed` object: without
-            parts if it is absent, with -1 parts if its place is unknown.
+            parts if it is absent, with -1 parts if its place is unknown. Room to work in begins at `end`.
         leaves: (MOST_CHANNELS, A, 1), receives them.
 
     Returns:
         C, in how many channels they are.
     """
     plan = plan_at(whole, real)
-    count, members = len(plan.geometric) + len(plan.yaws), np.empty((len(plan.is_group), 1), np.int8)
-    results, closest = np.empty((2, count, 1)), np.empty((len(plan.closest_enlargement), 4, 1))
-    values, spreads = results[0], results[1]
-    if count + len(members) + len(closest) > 0:  # not signals alone
-        rows = _rows_of_sample(plan, sample)
+    count, groups, pairs = (
+        len(plan.geometric) + len(plan.yaws),
+        len(plan.is_group),
+        len(plan.closest_enlargement),
+    )
+    room = sample[end:]  # a new array would take as long as a distance
+    values, spreads = room[:count].reshape((-1, 1)), room[count : 2 * count].reshape((-1, 1))
+    closest = room[2 * count : 2 * count + 4 * pairs].reshape((-1, 4, 1))
+    members = room[2 * count + 4 * pairs : 2 * count + 4 * pairs + groups].view(np.int64).reshape((-1, 1))
+    if count + groups + pairs > 0:  # not signals alone
+        begin, operands = 2 * count + 4 * pairs + groups, len(plan.enlargement)
+        after = begin + 3 * operands + 2 + len(plan.geometric) + plan.listed_start[operands]
+        rows = _rows_of_sample(plan, sample, room[after:])
         _members(plan, rows.classes, members)
         _closest(plan, rows, closest)
-        _measure(plan, rows, values, spreads)
+        _measure(plan, rows, values, spreads, room[begin:after])
     signals = sample[plan.extent[0] : plan.extent[0] + plan.extent[3]].reshape((-1, 1))
     channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
     for t in range(1):  # as in `_measure`
@@ -450,12 +464,40 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats
     return channels
 
 
-def leaves_of_sample(plan: PackedPlan, sample: bytes) -> Floats:
-    """Return the leaves of one sample, (C, A, 1), from the bytes of what `measure_sample` takes."""
-    leaves = np.empty((MOST_CHANNELS, plan.leaves, 1))
-    # writable, since kernels are compiled for that
-    channels = measure_sample(plan.whole, plan.real, np.frombuffer(bytearray(sample)), leaves)
-    return leaves[:channels]
+class SampleRoom:
+    """The newest sample of a stream, as kernels take it; the next one takes its place.
+
+    Attributes:
+        whole, real: of the plan that it fits into.
+        numbers, end: what `measure_sample` takes as `sample`.
+        leaves: (MOST_CHANNELS, A, 1), once they are measured.
+        channels: in how many of them the leaves differ; 0 until they are measured.
+    """
+
+    __slots__ = ("_bytes", "channels", "end", "leaves", "numbers", "real", "whole")
+
+    def __init__(self, leaves: int) -> None:
+        self.whole, self.real = np.zeros(0, np.int64), np.zeros(0)
+        self.leaves, self.channels = np.empty((MOST_CHANNELS, leaves, 1)), 0
+        self._bytes, self.end = bytearray(), 0
+
+    def fill(self, plan: PackedPlan, layout: Struct, numbers: Sequence[float], objects: list[bytes]) -> None:
+        """Take the next sample: a plan for it, its numbers, and the packed objects of its places."""
+        self.whole, self.real, self.channels = plan.whole, plan.real, 0
+        packed = b"".join(objects)
+        begin, end = layout.size, layout.size + len(packed)
+        size = end + 8 * plan.room + 3 * len(packed)
+        if size > len(self._bytes):
+            self._bytes = bytearray(2 * size)
+            self.numbers = np.frombuffer(self._bytes)
+        layout.pack_into(self._bytes, 0, *numbers)
+        self._bytes[begin:end] = packed
+        self.end = end >> 3
+
+    def measure(self) -> Floats:
+        """Return the leaves of the sample, (C, A, 1)."""
+        self.channels = measure_sample(self.whole, self.real, self.numbers, self.end, self.leaves)
+        return self.leaves[: self.channels]
 
 
 Leaves: TypeAlias = Sequence[Atom | Quantified]
@@ -595,21 +637,26 @@ class LeafPlan:
         steps = (
             numbers.get(signal.terms) if isinstance(signal, ReportStep) else None for signal in code.signals
         )
-        self._signals = tuple(zip(code.signals, steps, strict=True))
+        self._signals = tuple(
+            (signal.name if type(signal) is Signal else None, signal, step)
+            for signal, step in zip(code.signals, steps, strict=True)
+        )
         self._has_classes = bool(frame.classes)
         count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
-        self._pack = Struct(f"={count}d").pack
+        self._layout = Struct(f"={count}d")
 
-    def numbers(
+    def fill(
         self,
+        room: SampleRoom,
         samples: Sequence[Sample | None],
         stands_for: Mapping[str, str],
         code_of: Callable[[str | None], int],
         reports: RecentReports,
-    ) -> bytes:
-        """Flatten samples for `measure_sample`, as the bytes of doubles.
+    ) -> None:
+        """Flatten samples for `measure_sample`.
 
         Args:
+            room: receives them.
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
             code_of: returns that of a class.
@@ -619,18 +666,18 @@ class LeafPlan:
         numbers = [0.0]
         if len(samples) > 1:
             numbers = [0.0 if sample else ABSENT for sample in samples]
-        steps = [_step(rate, newest, reports, stands_for) for rate in self._rates]
-        for signal, rate in self._signals:
-            if rate is not None:
+        steps = [_step(rate, newest, reports, stands_for) for rate in self._rates] if self._rates else []
+        for plain_name, signal, rate in self._signals:
+            if plain_name is not None:
+                numbers.append(newest.signals.get(plain_name, nan))
+            elif rate is not None:
                 numbers.append(steps[rate])
             elif isinstance(signal, Present):
                 name = stands_for.get(signal.term.name, signal.term.name)
                 numbers.append(name in newest.objects or name in newest.unknown)
             else:
                 numbers.append(_signal(signal, newest, reports))
-        if not self._places:
-            return self._pack(*numbers)
-        packed = [b""]
+        packed: list[bytes] = []
         lookups = [newest.objects.get]
         if len(samples) > 1:
             lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
@@ -654,8 +701,7 @@ class LeafPlan:
             packed.append(_HIDDEN if name in unknown else _NOT_THERE)
             if self._has_classes:
                 numbers.append(code_of(unknown[name]) if name in unknown else 0.0)
-        packed[0] = self._pack(*numbers)
-        return b"".join(packed)
+        room.fill(self.packed, self._layout, numbers, packed)
 
 
 def _signal(signal: Signal, sample: Sample, reports: RecentReports) -> float:
@@ -802,25 +848,30 @@ class SampleLeaves:
         self._code_of = lru_cache(_MOST_CLASSES)(partial(_class_code, self._frame.classes))
         self._plans: dict[tuple[frozenset[Member], _Counts], LeafPlan] = {}
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
+        self._looks_back = len(self._frame.delays) > 1 or bool(
+            next(chain.from_iterable(map(rates_of, formulas)), None)
+        )
+        self.room = SampleRoom(len(formulas))
 
-    def look_at(self, sample: Sample) -> list[Sample | None]:
+    def look_at(self, sample: Sample) -> Sequence[Sample | None]:
         """Add the next sample; return it and those that it looks back at."""
+        if not self._looks_back:
+            return (sample,)
         self._reports.add(sample)
         return self._recent.add(sample)
 
-    def values(self, samples: Sequence[Sample | None]) -> Floats:
-        """Compute the leaves of all formulas, (C, A, 1).
-
-        Args:
-            samples: what `look_at` gave.
+    def fill_room(self, sample: Sample) -> SampleRoom:
+        """Add the next sample, and flatten it and those that it looks back at for kernels.
 
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
+        samples = self.look_at(sample)
         plan, stands_for = self._only_plan, _NOTHING
         if plan is None:
             plan, stands_for = self._fitting_plan(samples)
-        return leaves_of_sample(plan.packed, plan.numbers(samples, stands_for, self._code_of, self._reports))
+        plan.fill(self.room, samples, stands_for, self._code_of, self._reports)
+        return self.room
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in some samples, and their names in it."""

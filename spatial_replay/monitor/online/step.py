@@ -16,6 +16,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Empty, Floats, Integers
+from spatial_replay.monitor.atoms.live import SampleRoom, measure_sample
 from spatial_replay.monitor.online import codes, windows
 from spatial_replay.monitor.online.codes import CHANNELS, in_channels
 from spatial_replay.monitor.online.program import Program
@@ -224,6 +225,44 @@ def run_samples(
         report(rows, history, memory, work, channels, begin, count)
 
 
+@kernel
+def run_sample(
+    whole: Integers, real: Floats, sample: Floats, end: int, leaves: Floats, rows: Integers,
+    history: Floats, times: Integers, memory: Floats, work: Floats, numbers: Floats, channels: int,
+    first_leaf: int, time_ns: int, position: int, begin: int, start_ns: int, run_channels: int, phases: int,
+) -> int:  # fmt: skip
+    """Measure the leaves of one sample and run it through a program, as `run_samples` does.
+
+    Args:
+        whole, real, sample, end, leaves: as `measure_sample` takes them.
+        numbers: (N, 4), receives value, now, lower and upper of each node.
+        channels: in how many the leaves are; 0 if they are not measured yet.
+        run_channels: in how many the state is. In fewer than the leaves, nothing is run.
+
+    Returns:
+        In how many channels the leaves are.
+    """
+    if channels == 0:
+        channels = measure_sample(whole, real, sample, end, leaves)
+        for c in range(channels, CHANNELS):
+            for leaf in range(leaves.shape[1]):
+                leaves[c, leaf, 0] = leaves[c % channels, leaf, 0]
+    if channels > run_channels:
+        return channels
+    if phases & BEGIN:
+        times[0, begin] = time_ns
+    run_samples(
+        rows, leaves[:run_channels], history, times, memory, work, first_leaf, 0, 1, position, begin,
+        start_ns, phases,
+    )  # fmt: skip
+    if phases & FINISH:
+        series = NUMBERS * (rows[0, codes.HEAD_PARTS] + rows[0, codes.HEAD_REPORTS])
+        for node in range(numbers.shape[0]):
+            for k in range(SERIES):
+                numbers[node, k] = work[series + SERIES * node + k, 0]
+    return channels
+
+
 class _OpenPart:
     """State of `run_windows` between samples, for one part in one channel."""
 
@@ -306,8 +345,8 @@ class OnlineRun:
         series_at = NUMBERS * (parts + reports)
         self._numbers = self._work[NUMBERS * parts : series_at].reshape(reports, NUMBERS, shape[1])
         self._series = self._work[series_at : series_at + SERIES * reports].reshape(reports, SERIES, shape[1])
-        self._series_of_one = self._series[:, :, 0]
-        self._newest = 0, [0, 0]  # where the numbers of the newest sample stand
+        self._shape = reports, SERIES
+        self._newest = 0  # where the numbers of the newest sample stand
         self._open = [
             (number, [_OpenPart(rows, room)])
             for number, rows in enumerate(program.part_rows)
@@ -322,8 +361,8 @@ class OnlineRun:
     @property
     def final(self) -> Floats:
         """(N, 2): lower and upper end of each node's value if the run ends here."""
-        newest, ends = self._newest
-        return np.asarray(self._numbers[:, ends, newest] + 0.0)
+        ends = [0, 0] if self._channels == 1 else [6, 7]
+        return np.asarray(self._numbers[:, ends, self._newest] + 0.0)
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
@@ -348,7 +387,7 @@ class OnlineRun:
         series, done = empty((len(self._program.reports), SERIES, len(times_ns))), 0
         while done < len(times_ns):
             count = self._make_room(min(self._tile, len(times_ns) - done))
-            self._add(leaves, 0, times_ns[done : done + count], done, count)
+            self._add(leaves, times_ns[done : done + count], done, count)
             series[:, :, done : done + count] = self._series[:, :, :count]
             done += count
         return series
@@ -366,49 +405,66 @@ class OnlineRun:
             parts += [parts[channel % before].copy(self.room) for channel in range(before, channels)]
         self._see_history()
 
-    def add_sample(self, leaves: Floats, first_leaf: int, time_ns: int) -> Floats:
-        """Add one sample; return value, now, lower and upper of each node, (N, 4), read-only.
+    def add_sample(self, room: SampleRoom, first_leaf: int, time_ns: int) -> Floats:
+        """Add one sample; return value, now, lower and upper of each node, (N, 4).
 
         Args:
-            leaves: (C, A, 1), of which those of the program begin at `first_leaf`.
+            room: the sample; its leaves are measured if need be, and those of the program begin at
+                `first_leaf`.
         """
-        if len(leaves) != self._channels:
-            self.widen(len(leaves))
-            leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
-        self._make_room(1)
-        self._add(leaves, first_leaf, time_ns, 0, 1)
-        numbers = self._series_of_one.copy()
-        numbers.setflags(write=False)
+        program, position = self._program, self._position
+        if not program.keeps_history:
+            self._offset = position
+        elif position - self._offset == self.room:
+            self._make_room(1)
+        begin = position - self._offset
+        if position == 0:
+            self._start_ns = time_ns
+        numbers = np.empty(self._shape)
+        phases = BEGIN if self._open else BEGIN | FINISH
+        while True:
+            room.channels = channels = run_sample(
+                room.whole, room.real, room.numbers, room.end, room.leaves, *self._arrays, numbers,
+                room.channels, first_leaf, time_ns, position, begin, self._start_ns, self._channels, phases,
+            )  # fmt: skip
+            if channels > self._channels:
+                self.widen(channels)
+            elif phases & FINISH:
+                break
+            else:
+                self._run_all_open(begin, 1)
+                phases = FINISH
+        self._position, self._newest = position + 1, 0
         return numbers
 
-    def _add(self, leaves: Floats, first_leaf: int, times_ns: Integers | int, t: int, count: int) -> None:
+    def _add(self, leaves: Floats, times_ns: Integers, t: int, count: int) -> None:
         """Add samples for which there is room, of leaves in as many channels as the run has.
 
         Args:
-            first_leaf: where the leaves of the program begin.
             times_ns: of the samples; their leaves stand from `t` on.
         """
         if not self._program.keeps_history:
             self._offset = self._position
         begin = self._position - self._offset
-        if isinstance(times_ns, int):
-            self._stamps[begin] = times_ns
-        else:
-            self._stamps[begin : begin + count] = times_ns
+        self._stamps[begin : begin + count] = times_ns
         if self._position == 0:
             self._start_ns = int(self._stamps[begin])
         arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
-        numbers = first_leaf, t, count, self._position, begin, self._start_ns
+        numbers = 0, t, count, self._position, begin, self._start_ns
         if not self._open:
             run_samples(*arrays, *numbers, BEGIN | FINISH)
         else:
             run_samples(*arrays, *numbers, BEGIN)
-            for number, parts in self._open:
-                for channel, part in enumerate(parts):
-                    self._run_open(number, channel, part, begin, count)
+            self._run_all_open(begin, count)
             run_samples(*arrays, *numbers, FINISH)
         self._position += count
-        self._newest = count - 1, [0, 0] if self._channels == 1 else [6, 7]
+        self._newest = count - 1
+
+    def _run_all_open(self, begin: int, count: int) -> None:
+        """Run the parts with windows in all channels."""
+        for number, parts in self._open:
+            for channel, part in enumerate(parts):
+                self._run_open(number, channel, part, begin, count)
 
     def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
         """Run a part in one channel, and enter what it says."""
@@ -429,8 +485,9 @@ class OnlineRun:
             rows[4 + is_high], rows[6 + is_high] = says[2 + is_high], says[0]
 
     def _see_history(self) -> None:
-        """Take views of what the recent samples are."""
+        """Take views of the recent samples, and all arrays that `run_sample` takes."""
         self._stamps = self._times[0, : self.room]
+        self._arrays = self._program.rows, self._history, self._times, self._memory, self._work
         self._channel_history = [self._history[channel] for channel in range(CHANNELS)]
 
     def _rings(self) -> Integers:
