@@ -37,6 +37,7 @@ def test_without_the_papers_recordings_the_page_says_so(tmp_path: Path) -> None:
     text = page(tmp_path, "examples", "table", "social")
     assert text.count("not at hand") == 2
     assert text.count("<h2") == 3
+    assert "46 transitions" in text
 
 
 def test_the_papers_runs_have_its_numbers(tmp_path: Path, data_folder: Path) -> None:

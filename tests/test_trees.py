@@ -196,7 +196,7 @@ def test_a_replay_of_a_bag_has_the_ticks_of_nav2_on_the_clock_of_the_samples(tmp
             (topic, 0.5, [("Navigate", 1, "RUNNING"), ("FollowPath", 3, "RUNNING")]),
             (topic, 1.25, [("Plan", 2, "SUCCESS"), ("FollowPath", 3, "FAILURE")]),
             (topic, 1.5, [("FollowPath", 3, "IDLE"), ("Spin", 4, "SKIPPED")]),
-            # another tree numbers its nodes anew
+            # another tree numbers its nodes from 1 again
             (topic, 1.75, [("Dock", 1, "RUNNING")]),
         ],
     )

@@ -81,7 +81,7 @@ class Nav2Tree:
         for change in log.event_log:
             key = getattr(change, "uid", change.node_name)
             if key in self._nodes and self._nodes[key].name != change.node_name:
-                # another tree was loaded, and numbers its nodes anew
+                # another tree was loaded, and numbers its nodes from 1 again
                 self._nodes.clear()
             is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
             status = change.current_status if is_active else "INVALID"
