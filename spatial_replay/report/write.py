@@ -269,28 +269,30 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
     if diff.is_empty:
         yield element("p", "Nothing differs.")
     if isinstance(diff, SpecificationDiff):
-        for spec_diff in diff.specs:
+        for spec_diff in sorted(
+            diff.specs, key=lambda spec_diff: not _is_flipped(spec_diff.old, spec_diff.new)
+        ):
             if spec_diff.edits or spec_diff.is_different:
-                yield _change(
-                    spec_diff.title, spec_diff.new.verdict, list(spec_diff.sentences(diff.first_ns)), first_ns
-                )
+                verdicts = spec_diff.old.verdict, spec_diff.new.verdict
+                yield _change(spec_diff.title, verdicts, list(spec_diff.sentences(diff.first_ns)), first_ns)
         for names, where in ((diff.removed, diff.old), (diff.added, diff.new)):
             yield from (element("p", text(f"{name}: only in {where.filename}")) for name in names)
         return
     if diff.is_empty:
         return
-    for spec in diff.specs:
-        yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.zeros_ns)), first_ns)
+    for spec in sorted(diff.specs, key=lambda spec: not _is_flipped(spec.a, spec.b)):
+        verdicts = spec.a.verdict, spec.b.verdict
+        yield _change(spec.a.title, verdicts, list(spec.sentences(diff.zeros_ns)), first_ns)
     if diff.objects:
-        yield _change("who moved differently", None, diff.movements, first_ns)
+        yield _change("who moved differently", (), diff.movements, first_ns)
     if diff.signals:
-        yield _change("signals with other values", None, diff.signal_changes, first_ns)
+        yield _change("signals with other values", (), diff.signal_changes, first_ns)
     for which, names in (("A", diff.only_a), ("B", diff.only_b)):
         if names:
             yield element("p", text(f"Only in {which}: {', '.join(names)}"))
     if diff.decision is not None:
         title = f"decision {diff.decision.number} is the first that differs"
-        yield _change(title, None, list(map(Sentence, diff.decision.lines())), first_ns)
+        yield _change(title, (), list(map(Sentence, diff.decision.lines())), first_ns)
 
 
 def _decision_panels(decision: DecisionDiff | None, labels: tuple[str, str]) -> list[Html]:
@@ -301,10 +303,15 @@ def _decision_panels(decision: DecisionDiff | None, labels: tuple[str, str]) -> 
     return [panel(name, text(f"{label}: decision {decision.number}")) for name, label in names]
 
 
+def _is_flipped(old: SpecResult, new: SpecResult) -> bool:
+    return old.verdict != new.verdict
+
+
 def _change(
-    title: str, verdict: str | None, sentences: Sequence[Sentence], first_ns: tuple[int, int]
+    title: str, verdicts: Sequence[str], sentences: Sequence[Sentence], first_ns: tuple[int, int]
 ) -> Html:
-    marks = [] if verdict is None else [chip(verdict)]
+    """Return one change, with its verdict or, where that has flipped, both."""
+    marks = [mark for verdict in dict.fromkeys(verdicts) for mark in (text(" → "), chip(verdict))][1:]
     name = element("span", text(title), **{"class": "name"})
     summary = element("div", *marks, name, **{"class": "summary"})
     lines = [element("p", *_with_run(sentence, first_ns)) for sentence in sentences]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -35,6 +36,10 @@ def test_two_specifications_are_shown_at_the_sample_at_which_they_part(page: Pag
     page.goto((tmp_path / "diff.html").as_uri())
     expect(page.locator("html[data-ready]")).to_have_count(1)
     expect(page.locator("#verdicts-body")).to_contain_text("F[0s, 4s]")
+    # flipped results come first, with both verdicts
+    expect(page.locator(".change .summary").first).to_contain_text(
+        re.compile("satisfied → .*violated.*table_set")
+    )
     expect(page.locator(".now")).to_contain_text("5.433 s")
     # the curves part here: the legend reads both
     expect(page.locator(".legend-entry").nth(0)).to_contain_text("0.1543")
