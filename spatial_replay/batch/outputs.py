@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal
 from urllib.parse import quote
 from xml.sax.saxutils import escape, quoteattr
@@ -16,6 +17,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from spatial_replay import __version__
+from spatial_replay.batch.curves import Curve, draw_curves, read_curves
 from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
 from spatial_replay.batch.run import BatchResult, Wanted
 from spatial_replay.batch.run_table import (
@@ -44,7 +46,7 @@ from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.page import asset, html_page, text
 from spatial_replay.report.panels import sentence_parts
 from spatial_replay.report.write import write_report
-from spatial_replay.text import counted, cut, first_lines, printable
+from spatial_replay.text import counted, cut, first_lines, printable, with_unit
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -366,20 +368,26 @@ _MOST_LOGS: Final = 2_000
 _MOST_SPECS: Final = 60
 """Columns of the matrix, and distributions."""
 _BINS: Final = 24
-_WIDTH: Final = 240.0
+_WIDTH: Final = 480.0
 _HEIGHT: Final = 60.0
 _STYLES: Final = ("browser/page.css", "batch:overview.css")
 
 
-def overview_page(table: pa.Table, name: str, reports: Mapping[tuple[str, str], str]) -> bytes:
+def overview_page(
+    table: pa.Table,
+    name: str,
+    reports: Mapping[tuple[str, str], str],
+    curves: Mapping[str, Sequence[Curve]] = MappingProxyType({}),
+) -> bytes:
     """Return the page, in UTF-8; equal tables give equal bytes.
 
     Args:
         table: of a run.
         name: of the suite.
         reports: for cases and logs by name, the address of the page about them, relative to this one.
+        curves: by case, those of the logs with a page.
     """
-    body = [_header(table, name), element("main", *_panels(table, reports))]
+    body = [_header(table, name), element("main", *_panels(table, reports, curves))]
     scripts = [asset("batch:overview.js")]
     return html_page(f"{name}: {_headline(table)}", body, scripts, _STYLES, marks=" data-read")
 
@@ -398,7 +406,9 @@ def _header(table: pa.Table, name: str) -> Html:
     return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})
 
 
-def _panels(table: pa.Table, reports: Mapping[tuple[str, str], str]) -> Iterator[Html]:
+def _panels(
+    table: pa.Table, reports: Mapping[tuple[str, str], str], curves: Mapping[str, Sequence[Curve]]
+) -> Iterator[Html]:
     by_spec = totals(table)
     yield _panel("Specifications", _totals(by_spec))
     worst = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
@@ -407,7 +417,8 @@ def _panels(table: pa.Table, reports: Mapping[tuple[str, str], str]) -> Iterator
     flaky = first_lines([result.text for result in flaky_results(table)], _MOST_FLAKY)
     if flaky:
         yield _panel("Flaky", element("ul", *(element("li", text(line)) for line in flaky)))
-    yield _panel("Robustness", element("div", *_plots(table, by_spec[:_MOST_SPECS]), **{"class": "plots"}))
+    plots = _plots(table, by_spec[:_MOST_SPECS], curves)
+    yield _panel("Robustness", element("div", *plots, **{"class": "plots"}))
     yield _panel("Logs", *_matrix(table, by_spec[:_MOST_SPECS], reports))
 
 
@@ -463,7 +474,9 @@ def _with_code(sentence: str) -> Iterator[Html]:
         yield element("code", text(piece)) if number % 2 else text(piece)
 
 
-def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
+def _plots(
+    table: pa.Table, by_spec: Sequence[Total], curves: Mapping[str, Sequence[Curve]]
+) -> Iterator[Html]:
     import pyarrow.compute as pc
 
     has_cases = len({total.group["case"] for total in by_spec}) > 1
@@ -473,16 +486,19 @@ def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
             pc.and_(pc.equal(table["case"], group["case"]), pc.equal(table["file"], group["file"])),
             pc.equal(table["spec"], group["spec"]),
         )
-        numbers = np.asarray(table.filter(fits).column("robustness").to_numpy(), np.float64)
+        rows = table.filter(fits)
+        numbers = np.asarray(rows.column("robustness").to_numpy(), np.float64)
         finite = numbers[np.isfinite(numbers)]
+        unit = next(filter(None, rows.column("unit").to_pylist()), "")
         if len(finite):
             case = group["case"] if has_cases else None
             title = " · ".join(filter(None, (case, total.requirement, group["spec"])))
             caption = element("figcaption", text(title), **_tip(total.about))
-            yield element("figure", caption, _histogram(finite))
+            of_spec = [curve for curve in curves.get(group["case"], ()) if group["spec"] in ("", curve.spec)]
+            yield element("figure", caption, _histogram(finite, unit), draw_curves(of_spec, unit))
 
 
-def _histogram(numbers: Floats) -> Html:
+def _histogram(numbers: Floats, unit: str) -> Html:
     """Return a distribution as a drawing; a bin lies on one side of 0, where the verdict changes."""
     low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
     if low == high:
@@ -504,8 +520,14 @@ def _histogram(numbers: Floats) -> Html:
     zero = f"{below * step:.2f}"
     axis = element("line", x1=zero, x2=zero, y1="0", y2=f"{_HEIGHT + 3:.0f}")
     labels = [
-        element("text", f"{low:.4g}", x="0", y=f"{_HEIGHT + 12:.0f}"),
-        element("text", f"{high:.4g}", x=f"{_WIDTH:.0f}", y=f"{_HEIGHT + 12:.0f}", **{"text-anchor": "end"}),
+        element("text", with_unit(low, unit), x="0", y=f"{_HEIGHT + 12:.0f}"),
+        element(
+            "text",
+            with_unit(high, unit),
+            x=f"{_WIDTH:.0f}",
+            y=f"{_HEIGHT + 12:.0f}",
+            **{"text-anchor": "end"},
+        ),
     ]
     name = f"Distribution of robustness from {low:.4g} to {high:.4g}"
     view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
@@ -536,7 +558,7 @@ def _matrix(
         words = f"The {len(cells):,} worst of {counted(logs, 'log')}; the table of the run has them all."
         yield element("p", words)
     cases = {case for case, _, _ in columns}
-    yield element("p", "Marked results fail.")
+    yield _filter()
     titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
     abouts = [total.about for total in by_spec]
     label = [_sortable(LABEL, "")] if is_judged else []
@@ -549,6 +571,18 @@ def _matrix(
             row_cells.insert(0, _label_cell(next(iter(of_log.values()))))
         body.append(element("tr", element("td", _linked(report, reports)), *row_cells))
     yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
+
+
+def _filter() -> Html:
+    """Return what the rows of the matrix can be filtered by, and buttons that go through those that fail."""
+    words = element("input", type="search", placeholder="name", **{"aria-label": "Name of a log"})
+    box = element("label", element("input", type="checkbox", id="only-failing"), " only failing")
+    steps = [
+        element("button", f"{word} failing", type="button", **{"class": "step", "data-step": step})
+        for word, step in (("Previous", "-1"), ("Next", "1"))
+    ]
+    left = element("span", "", id="left", role="status")
+    return element("p", "Marked results fail. ", words, box, *steps, left, id="filter")
 
 
 def _agrees(row: Values) -> bool:
@@ -650,8 +684,11 @@ def write_pages(
             advance(1)
     pages = {key: path for key, path in pages.items() if path.exists()}
     links = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
+    curves: dict[str, list[Curve]] = {}
+    for (case, log), path in pages.items():
+        curves.setdefault(case, []).extend(read_curves(path, log, links[case, log]))
     with replacing(folder / INDEX) as stream:
-        stream.write(overview_page(result.table, name, links))
+        stream.write(overview_page(result.table, name, links, curves))
     return pages
 
 

@@ -28,6 +28,7 @@ def test_logs_are_sorted_by_what_is_pressed_and_lead_to_their_reports(
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto((tmp_path / "pages/index.html").as_uri())
+    failing = ["run-1.jsonl", "run-10.jsonl"]
     worst_first = ["run-10.jsonl", "run-1.jsonl", "run-2.jsonl", "run-0.jsonl"]
     assert logs_of(page) == worst_first
     page.get_by_role("button", name="log").click()
@@ -39,7 +40,22 @@ def test_logs_are_sorted_by_what_is_pressed_and_lead_to_their_reports(
     apart.get_by_role("button").click()
     assert logs_of(page) == worst_first[::-1]
     expect(apart).to_have_attribute("aria-sort", "descending")
-    page.locator("#matrix a", has_text="run-10").click()
+    # rows are filtered, and those that fail are gone through
+    page.get_by_label("Name of a log").fill("RUN-1")
+    expect(page.get_by_role("status")).to_have_text("2 of 4 listed")
+    page.get_by_label("Name of a log").fill("")
+    page.get_by_label("only failing").check()
+    expect(page.locator("#matrix tbody tr:visible")).to_have_count(len(failing))
+    for name in failing:
+        page.get_by_role("button", name="Next failing").click()
+        expect(page.locator("#matrix tr.here")).to_contain_text(name)
+        expect(page.locator("#matrix a:focus")).to_have_text(f"logs/{name}")
+    # the curves of a spec are on one axis, the worst on top
+    curves = page.locator("figure", has_text="apart").locator(".curves a")
+    expect(curves).to_have_count(len(failing))
+    expect(curves.last).to_have_attribute("aria-label", "logs/run-10.jsonl, violated")
+    curves.last.focus()
+    page.keyboard.press("Enter")
     expect(page.locator("html[data-ready]")).to_have_count(1)
     expect(page.locator("#verdicts-body")).to_contain_text("cart and person are 0.1 apart")
     context.close()

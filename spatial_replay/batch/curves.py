@@ -1,0 +1,136 @@
+"""Curves of the logs that have a page, on one axis for each spec of the page over all logs."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.notebook.figures import Html, element
+from spatial_replay.text import number_text, with_unit
+
+MOST_CURVES: Final = 60
+"""Curves of a spec, at most: the worst."""
+_MOST_POINTS: Final = 120
+_WIDTH: Final = 480.0
+_HEIGHT: Final = 120.0
+_FACTS: Final = re.compile(rb'<script type="application/json" id="facts">(.*?)</script>', re.DOTALL)
+_NUMBERS: Final = re.compile(
+    rb'<script type="application/octet-stream" id="numbers">(.*?)</script>', re.DOTALL
+)
+
+
+class Curve(NamedTuple):
+    """The robustness of one result of a log, from its first sample to each one.
+
+    Attributes:
+        title: of the log, with the object of a template.
+        address: of the page about the log.
+        spec: name of the result.
+        times, values: (N,) each; NaN where it is not known.
+    """
+
+    title: str
+    address: str
+    spec: str
+    verdict: str
+    times: Floats
+    values: Floats
+
+
+def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
+    """Yield the curves of the results that a page about a log shows.
+
+    Args:
+        address: of the page, relative to the page over all logs.
+    """
+    content = page.read_bytes()
+    facts, numbers = _FACTS.search(content), _NUMBERS.search(content)
+    if facts is None or numbers is None:
+        return
+    run, data = json.loads(facts[1]), zlib.decompress(base64.b64decode(numbers[1]))
+    times = _array(run["times"], data)
+    for number, result in enumerate(run["results"]):
+        samples = result["samples"]
+        places = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_POINTS)).astype(np.int64))
+        if not samples:
+            continue
+        # of the root, what it is up to each sample
+        values = _array(result["series"], data)[:samples]
+        title = f"{log}: {result['object']}" if result["object"] else log
+        yield Curve(
+            title,
+            f"{quote(address)}#r={number}",
+            result["name"],
+            result["verdict"],
+            times[result["first"] + places],
+            values[places],
+        )
+
+
+def _array(reference: Mapping[str, Any], data: bytes) -> Floats:
+    kind, offset, length = (reference[name] for name in ("kind", "offset", "length"))
+    return np.frombuffer(data, f"<{kind}", length, offset).astype(np.float64)
+
+
+def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
+    """Return the curves of a spec as a drawing, the worst on top, each a link to its page."""
+    finite = [curve for curve in curves if np.isfinite(curve.values).any()]
+    worst_last = sorted(finite, key=lambda curve: -_final(curve))[-MOST_CURVES:]
+    if not worst_last:
+        return Html("")
+    end = max(float(curve.times[-1]) for curve in worst_last) or 1.0
+    numbers = np.concatenate([curve.values[np.isfinite(curve.values)] for curve in worst_last])
+    low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
+    size = high - low or 1.0
+    zero = _HEIGHT * high / size
+    links = [
+        element(
+            "a",
+            *_lines(curve, end, high, size),
+            href=curve.address,
+            **{"aria-label": f"{curve.title}, {curve.verdict}"},
+        )
+        for curve in worst_last
+    ]
+    bottom = f"{_HEIGHT + 12:.0f}"
+    parts = [
+        element("line", x1="0", x2=f"{_WIDTH:.0f}", y1=f"{zero:.2f}", y2=f"{zero:.2f}"),
+        *links,
+        element("text", with_unit(high, unit), x="0", y="9"),
+        element("text", "0 s", x="0", y=bottom),
+        element("text", f"{number_text(end)} s", x=f"{_WIDTH:.0f}", y=bottom, **{"text-anchor": "end"}),
+    ]
+    if low < 0.0:
+        parts.append(element("text", with_unit(low, unit), x="0", y=f"{_HEIGHT - 3:.0f}"))
+    view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
+    return element(
+        "svg", *parts, viewBox=view, role="group", **{"aria-label": "Robustness over time", "class": "curves"}
+    )
+
+
+def _final(curve: Curve) -> float:
+    return float(curve.values[np.isfinite(curve.values)][-1])
+
+
+def _lines(curve: Curve, end: float, high: float, size: float) -> Iterator[Html]:
+    """Yield the tip of a curve, a wide clear line to point at, and the line itself."""
+    yield element("title", f"{curve.title}, {curve.verdict}")
+    is_known = np.isfinite(curve.values)
+    pieces, is_open = list[str](), False
+    for time, value, known in zip(curve.times, curve.values, is_known, strict=True):
+        if known:
+            letter = "L" if is_open else "M"
+            pieces.append(f"{letter}{_WIDTH * time / end:.1f} {_HEIGHT * (high - value) / size:.1f}")
+        is_open = bool(known)
+    line = "".join(pieces)
+    yield element("path", d=line, **{"class": "area"})
+    yield element("path", d=line, **{"class": "bad" if curve.verdict == "violated" else "quiet"})
