@@ -312,6 +312,10 @@ def _nothing(text: str, folder: Path) -> str:
         return f"{text}: no log matches this pattern; check it, and the folder it starts from"
     # unlike a path's own, this test takes names that no file can have
     if os.path.isdir(folder / text):  # noqa: PTH112
+        try:
+            open_data_set(folder / text)
+        except SpatialReplayError as error:
+            return str(error)
         return f"{text}: no log in this folder; logs end in {', '.join(LOG_ENDINGS)}"
     return f"{text}: no such file; check the path"
 

@@ -135,7 +135,7 @@ def _bodies(data_set: DataSet) -> tuple[list[dict[str, Any]], list[str]]:
     try:
         columns = data_set.columns(data_set.episodes[0].number, _any_rate(data_set), ())
     except (UsageError, LogError) as error:
-        return [], [str(error)]
+        return [], [str(error).removeprefix(f"{data_set.name} ")]
     bodies = [
         {
             "name": body.name,
@@ -208,10 +208,10 @@ def _lines(
         return
     if not data_set.names_bodies:
         yield "a mapping says which of these are objects: --suggest-mapping"
-    elif data_set.fps or data_set.has_times:
-        yield "it names its objects, so it needs no mapping"
-    else:
-        yield "it names its objects; a mapping with `fps:` is enough"
+    elif bodies:
+        has_times = data_set.fps or data_set.has_times
+        rest = ", so it needs no mapping" if has_times else "; a mapping with `fps:` is enough"
+        yield f"it names its objects{rest}"
     first = f"{shlex.quote(str(data_set.path))}#{data_set.episodes[0].number}"
     yield f"each episode is a log: spatial-replay info {first}"
 

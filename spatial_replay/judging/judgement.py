@@ -18,7 +18,6 @@ from spatial_replay.batch.run_table import RUN, Values, worst_rows
 from spatial_replay.batch.suite import Suite
 from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import UsageError
-from spatial_replay.judging.failures import Failure, first_failures
 from spatial_replay.judging.labels import Labels, SuccessLabel, read_labels
 from spatial_replay.judging.statistics import Rate, pass_hat_k
 from spatial_replay.logs.formats.datasets import data_set_address
@@ -91,8 +90,8 @@ class JudgedEpisode:
         reason: a sentence on what decided.
         task, seed: where the data set has them.
         log: its path or address.
-        failure, failure_at: the first failure that happened in it, see `first_failures`; only of a failed
-            episode that is judged with a file of failures.
+        failure, failure_at: the name and the time in seconds of the first failure that happened in it; of
+            a failed episode that is judged with a file of failures.
         stage, progress: those at its end, if stages are wanted; see `annotate.stages`.
     """
 
@@ -138,6 +137,7 @@ class Judgement:
         comparison: with earlier episodes, if there are any.
         failure_file: the name of the file of failures, or "".
         stages: names of the stages of the task, the farthest from success first; none unless they are wanted.
+        data_set_remarks: messages about whole data sets.
     """
 
     name: str
@@ -149,6 +149,7 @@ class Judgement:
     comparison: Comparison | None = None
     failure_file: str = ""
     stages: tuple[str, ...] = ()
+    data_set_remarks: tuple[str, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -216,11 +217,12 @@ class Judgement:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Messages about the labels."""
+        """Messages about the data sets and the labels."""
         rate = self.label_rate
         if 1 < rate.episodes == rate.successes:
-            return (f"all {rate.episodes:,} labels are successes: the data set may hold successes only",)
-        return ()
+            remark = f"all {rate.episodes:,} labels are successes: the data set may hold successes only"
+            return (*self.data_set_remarks, remark)
+        return self.data_set_remarks
 
     @property
     def document(self) -> dict[str, Any]:
@@ -314,9 +316,16 @@ class PreparedJudgement:
             for log, path in paths.items()
         )
         if self.failure_file:
-            failures = first_failures(batch.table, self.failure_file)
+            failures = _first_failures(batch.table, self.failure_file)
             rows = tuple(_with_failure(row, failures.get(log)) for row, log in zip(rows, paths, strict=True))
-        return Judgement(self.name, *self.spec, rows, batch, failure_file=self.failure_file)
+        return Judgement(
+            self.name,
+            *self.spec,
+            rows,
+            batch,
+            failure_file=self.failure_file,
+            data_set_remarks=self.labels.remarks,
+        )
 
     def explain(
         self,
@@ -358,7 +367,7 @@ def prepare_judgement(
     Args:
         labels: see `read_labels`.
         result: the name of a spec; by default the last one that no other spec uses.
-        has_failures: whether the first file of the suite has failures, see `first_failures`.
+        has_failures: whether the first file of the suite has failures, see `_first_failures`.
 
     Raises:
         UsageError, SpecificationError: see `batch.run.prepare` and `read_labels`.
@@ -464,10 +473,41 @@ def _judged_episode(
     )
 
 
-def _with_failure(row: JudgedEpisode, failure: Failure | None) -> JudgedEpisode:
+def _with_failure(row: JudgedEpisode, failure: _Failure | None) -> JudgedEpisode:
     if failure is None or row.is_success is not False:
         return row
     return replace(row, failure=failure.name, failure_at=failure.at)
+
+
+class _Failure(NamedTuple):
+    """A failure of an episode.
+
+    Attributes:
+        name: the title of the spec that it satisfies or, without one, its name.
+        at: seconds from the begin of the episode; None if only its end decides.
+    """
+
+    name: str
+    at: float | None
+
+
+def _first_failures(table: pa.Table, file: str) -> dict[str, _Failure]:
+    """Return the first failure in each log, by the log's name, from the results of a batch.
+
+    _Failures that only the end of the log decides come last. At equal times, the first in the file counts.
+    """
+    import pyarrow.compute as pc
+
+    is_failure = pc.and_(pc.equal(table["file"], file), pc.equal(table["verdict"], "satisfied"))
+    columns = ["log", "spec", "title", "satisfied_at_ns", "zero_ns", "line"]
+    rows = table.filter(is_failure).select(columns).to_pylist()
+    rows.sort(key=lambda row: (row["satisfied_at_ns"] is None, row["satisfied_at_ns"] or 0, row["line"]))
+    failures: dict[str, _Failure] = {}
+    for row in rows:
+        time_ns = row["satisfied_at_ns"]
+        at = None if time_ns is None else (time_ns - row["zero_ns"]) / 1e9
+        failures.setdefault(row["log"], _Failure(row["title"] or row["spec"], at))
+    return failures
 
 
 def _undecided_reason(row: Values, allow: AbstractSet[str]) -> str:

@@ -46,10 +46,11 @@ class SuccessLabel(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """Labels by the paths of logs, and the files that they were read from."""
+    """Labels by the paths of logs, the files that they were read from, and remarks on the data sets."""
 
     by_path: Mapping[str, SuccessLabel]
     files: tuple[Path, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def read_labels(
@@ -72,10 +73,12 @@ def read_labels(
         reading = reading._replace(label=labels)
     by_path: dict[str, SuccessLabel] = {}
     folders: dict[Path, None] = {}
+    remarks: dict[str, None] = {}
     for log in logs:
         address = data_set_address(log.path)
         data_set = None if address is None else open_data_set(address[0])
         if address is not None and data_set is not None:
+            remarks |= dict.fromkeys(f"{data_set.name}: {remark}" for remark in data_set.remarks)
             label = _stored_label(data_set, address[1], reading)
             # a file replaces all labels of the data set: a mixture has a rate of neither
             by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
@@ -91,7 +94,7 @@ def read_labels(
             raise UsageError(f"--labels {file}: it has no entry for a judged episode; give another file")
         for path, success in successes.items():
             by_path[path] = by_path.get(path, SuccessLabel(None))._replace(success=success, is_unstored=False)
-    return Labels(by_path, tuple(files))
+    return Labels(by_path, tuple(files), tuple(remarks))
 
 
 def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> SuccessLabel:

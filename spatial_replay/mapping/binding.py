@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from collections.abc import Mapping as Table
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from decimal import Decimal
 from fnmatch import fnmatchcase
@@ -322,22 +322,22 @@ class Binding:
     """
 
     style: Style
-    numbers: Get | None
     width: int
     position: tuple[int, ...]
-    orientation: tuple[int, ...]
-    yaw: int | None
-    sizes: tuple[int, ...]
-    shape_sizes: tuple[float | int, ...]
-    height: tuple[float | int, ...]
-    uncertainty: float | int | None
-    polygon: Get | None
-    has_rings: bool
-    covariance: Get | None
-    class_gets: tuple[Get, ...]
-    class_names: Table[object, str]
-    frame: tuple[Get, bool] | None
-    lifetime: TimeGetter | None
+    numbers: Get | None = None
+    orientation: tuple[int, ...] = ()
+    yaw: int | None = None
+    sizes: tuple[int, ...] = ()
+    shape_sizes: tuple[float | int, ...] = ()
+    height: tuple[float | int, ...] = ()
+    uncertainty: float | int | None = None
+    polygon: Get | None = None
+    has_rings: bool = False
+    covariance: Get | None = None
+    class_gets: tuple[Get, ...] = ()
+    class_names: Table[object, str] = field(default_factory=dict)
+    frame: tuple[Get, bool] | None = None
+    lifetime: TimeGetter | None = None
     unset: tuple[tuple[int, FieldPath, float], ...] = ()
     outer_frame: Get | None = None
     own_stamp: TimeGetter | None = None

@@ -15,12 +15,11 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Floats, concatenated
 from spatial_replay.logs.formats.episodes import Body, DataSet, Feature
 from spatial_replay.mapping.binding import Binding
 from spatial_replay.mapping.detections import (
     Detections,
-    Poses,
     Solids,
     heights_from_numbers,
     poses_from_numbers,
@@ -214,7 +213,9 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
     if shape is not None and shape.outline:
         raise UsageError(f"{places.key}.shape: a feature has no list of corners; give [[x, y], …]")
     uncertainty = entry.uncertainty
-    binding = _binding(
+    binding = Binding(
+        style="keys",
+        width=0,
         position=tuple(map(column, position)),
         orientation=tuple(map(column, quaternion)),
         yaw=None if entry.yaw is None else column(places.single("yaw", entry.yaw.field)),
@@ -232,35 +233,6 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
         replace(binding, width=len(columns)),
         tuple(columns),
         quaternion,
-    )
-
-
-def _binding(
-    position: tuple[int, ...],
-    orientation: tuple[int, ...],
-    yaw: int | None,
-    shape_sizes: tuple[float | int, ...],
-    height: tuple[float | int, ...],
-    uncertainty: float | int | None,
-) -> Binding:
-    return Binding(
-        style="keys",
-        numbers=None,
-        width=0,
-        position=position,
-        orientation=orientation,
-        yaw=yaw,
-        sizes=(),
-        shape_sizes=shape_sizes,
-        height=height,
-        uncertainty=uncertainty,
-        polygon=None,
-        has_rings=False,
-        covariance=None,
-        class_gets=(),
-        class_names={},
-        frame=None,
-        lifetime=None,
     )
 
 
@@ -293,11 +265,7 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
         message=np.concatenate([thing.message for thing in objects]),
         name=np.repeat(np.arange(len(objects)), counts),
         class_code=np.concatenate([thing.class_code for thing in objects]),
-        poses=Poses(
-            np.concatenate([thing.poses.position for thing in objects]),
-            np.concatenate([thing.poses.rotation for thing in objects]),
-            np.concatenate([thing.poses.yaw for thing in objects]),
-        ),
+        poses=concatenated([thing.poses for thing in objects]),
         solids=Solids(
             owner=np.concatenate([part.owner + begin for part, begin in zip(solids, first, strict=False)]),
             kind=np.concatenate([part.kind for part in solids]),
@@ -323,15 +291,15 @@ def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
         raise UsageError(f"shapes.{body.name}: a body has no fields; give numbers")
     has_turn = body.quaternions is not None
     numbers = body.positions if body.quaternions is None else np.hstack([body.positions, body.quaternions])
-    binding = _binding(
+    binding = Binding(
+        style="keys",
+        width=numbers.shape[1],
         position=(0, 1, 2),
         orientation=(3, 4, 5, 6) if has_turn else (),
-        yaw=None,
         shape_sizes=tuple(float(size) for size in shape.sizes),
         height=tuple(float(bound) for bound in shape.height or ()),
-        uncertainty=None,
     )
-    return detections_of(MessageLayout(shape=shape), replace(binding, width=numbers.shape[1]), numbers)
+    return detections_of(MessageLayout(shape=shape), binding, numbers)
 
 
 def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) -> Floats:

@@ -317,6 +317,17 @@ def test_labels_of_other_episodes_are_refused() -> None:
 
 
 @pytest.mark.usefixtures("push")
+def test_remarks_on_a_data_set_are_printed_and_unknown_versions_refused() -> None:
+    info = json.loads(Path("push_v3/meta/info.json").read_text())
+    for change, message, code in (
+        ({"total_episodes": 9}, "push_v3: meta/info.json says 9 episodes, and meta has 4", 0),
+        ({"codebase_version": "v1.6"}, "push_v3 is LeRobot v1.6; v2.0 to v3.x are read", 2),
+    ):
+        Path("push_v3/meta/info.json").write_text(json.dumps(info | change))
+        assert message in judge_set("push_v3", code=code)
+
+
+@pytest.mark.usefixtures("push")
 def test_a_shaped_reward_is_no_label() -> None:
     text = judge_set("push_v3", "--labels", "next.reward", code=2)
     assert re.search(r"push_v3: next\.reward is no label: it has 0\.\d+; a label has 0 and 1", text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,54 +10,6 @@ import pytest
 
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
-
-DATA = os.environ.get("SPATIAL_REPLAY_DATA")
-needs_data = pytest.mark.skipif(DATA is None, reason="SPATIAL_REPLAY_DATA names no folder")
-
-
-@needs_data
-@pytest.mark.parametrize(
-    ("name", "answers"),
-    [
-        ("push_v3", "answers"),
-        ("push_v21", "answers"),
-        ("push_v3_thirdparty", "answers"),
-        ("push_v3_stopped", "stopped_answers"),
-    ],
-)
-def test_lerobot_gives_the_positions_of_the_simulator(name: str, answers: str) -> None:
-    folder = Path(DATA or "") / "learning" / "lerobot"
-    data_set = open_data_set(folder / name)
-    assert data_set is not None and data_set.fps == 80 and not data_set.remarks
-    for answer in json.loads((folder / f"{answers}.json").read_text()):
-        columns = data_set.columns(answer["episode"])
-        assert len(columns.times_ns) == answer["frames"] and columns.label == answer["success_any"]
-        assert not columns.remarks and not columns.unjudged
-        for pose in answer["poses"]:
-            state = columns.features["observation.environment_state"][pose["frame"]]
-            assert np.abs(state[:3] - pose["puck"]).max() < 1e-7
-            assert np.abs(state[7:] - pose["goal"]).max() < 1e-7
-            assert columns.times_ns[pose["frame"]] == round(pose["timestamp"] * 1e9)
-
-
-@needs_data
-def test_ogbench_gives_the_positions_of_the_simulator() -> None:
-    folder = Path(DATA or "") / "learning" / "ogbench"
-    data_set = open_data_set(folder / "cube-double-tiny.npz")
-    assert data_set is not None and len(data_set.episodes) == 4
-    for answer in json.loads((folder / "answers.json").read_text()):
-        columns = data_set.columns(answer["episode"], data_set_reading(fps=20))
-        for pose in answer["poses"]:
-            qpos = columns.features["qpos"][pose["step"]]
-            assert np.abs(qpos[14:17] - pose["block_0"][:3]).max() < 1e-6
-            assert np.abs(qpos[21:24] - pose["block_1"][:3]).max() < 1e-6
-            assert columns.times_ns[pose["step"]] == pose["step"] * 50_000_000
-
-
-def data_set_reading(**options: float):  # type: ignore[no-untyped-def]
-    from spatial_replay.logs.formats.episodes import EpisodeReading
-
-    return EpisodeReading(**options)  # type: ignore[arg-type]
 
 
 def lerobot(folder: Path, frames: dict[str, list[object]], **info: object) -> Path:
@@ -83,6 +34,10 @@ def test_rows_are_found_by_their_episode_whatever_the_files_are_called(tmp_path:
     data_set = open_data_set(lerobot(tmp_path / "set", frames, features=features))
     assert data_set is not None
     assert [episode.number for episode in data_set.episodes] == [7, 9]
+    assert data_set.remarks == (
+        "meta names files that are not in data/: episode_000007.parquet, episode_000009.parquet;"
+        " episode_index counts",
+    )
     assert data_set.columns(9).features["state"].tolist() == [[3.0]]
     assert data_set.features[0].places == ("x",)
     with pytest.raises(UsageError, match="set has no episode 8; it has 2 episodes, set#7 to set#9"):

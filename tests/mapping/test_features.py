@@ -12,6 +12,7 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.formats.datasets import open_data_set
 from spatial_replay.mapping.mapping_file import parse_mapping
 
 DATA = os.environ.get("SPATIAL_REPLAY_DATA")
@@ -62,7 +63,11 @@ def test_lerobot_episodes_have_the_positions_of_the_simulator(
 ) -> None:
     folder, mapping = Path(DATA or "") / "learning" / "lerobot", tmp_path / "push.yaml"
     mapping.write_text(PUSH)
+    data_set = open_data_set(folder / name)
+    assert data_set is not None and data_set.fps == 80 and not data_set.remarks
     for answer in json.loads((folder / f"{answers}.json").read_text()):
+        columns = data_set.columns(answer["episode"], features=())
+        assert columns.label == answer["success_any"] and not columns.remarks and not columns.unjudged
         trace = sr.read_trace(f"{folder / name}#{answer['episode']}", mapping=mapping)
         assert trace.names == ("goal", "hand", "puck") and len(trace) == answer["frames"]
         pucks, goals = positions(trace, "puck"), positions(trace, "goal")

@@ -30,7 +30,7 @@ from spatial_replay.logs.formats.episodes import (
     integer_or_none,
 )
 from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
-from spatial_replay.text import counted
+from spatial_replay.text import counted, listed
 
 _SUCCESS: Final = "next.success"
 _TIME_ERROR_S: Final = 1e-3
@@ -82,6 +82,11 @@ class _LeRobot(DataSet):
             end: file for file in self._files for end in (file.name, f"{file.parent.name}/{file.name}")
         }
         self._rows: dict[Path, Mapping[int, _Rows]] = {}
+        # copies with the metadata of both versions have the files of neither
+        is_third_party = version.startswith("v3") and (path / "meta" / "episodes.jsonl").exists()
+        lost = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
+        if lost and not is_third_party:
+            remarks.append(f"meta names files that are not in data/: {listed(lost, 3)}; episode_index counts")
         total = info.get("total_episodes")
         if isinstance(total, int) and total != len(self.episodes):
             remarks.append(
@@ -123,6 +128,10 @@ class _LeRobot(DataSet):
         fps, all_frames = self.required_fps(reading), np.arange(count, dtype=np.float64)
         frames = arrays.get("frame_index", all_frames)
         remarks, unjudged = tuple(_remarks(arrays, frames, fps, episode.frames)), ""
+        named, files = self._file_by_end.get(self._file_of[episode.number]), [rows.file for rows in group]
+        if named is not None and named not in files:
+            place = files[0].relative_to(self.path)
+            remarks += (f"its rows are in {place}, and not in {named.relative_to(self.path)} as meta says",)
         back = np.flatnonzero(np.diff(frames) <= 0)
         if len(back):
             at = int(back[0])
