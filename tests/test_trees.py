@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import spatial_replay as sr
 from bags.bag_files import write_ros2
+from report.report_pages import page_of
 from spatial_replay.logs.messages import BEHAVIOUR_TREE
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.planning import Grid, Workspace, moved_object, read_decisions
@@ -215,6 +216,11 @@ def test_a_replay_of_a_bag_has_the_ticks_of_nav2_on_the_clock_of_the_samples(tmp
     ]
     assert sr.replay_log(log, NEAR, output=again).certificate == replayed.certificate
     assert ticks_of(again) == ticks
+    sr.write_report(log, NEAR, output=tmp_path / "drive.html")
+    first, second = page_of(tmp_path / "drive.html").facts["ticks"][-2:]
+    assert [node["name"] for node in first["nodes"]] == ["Navigate", "Plan", "FollowPath", "Spin"]
+    assert (first["times"], first["statuses"]) == ([1.5], ["1200"])
+    assert (second["times"], second["statuses"]) == ([1.75], ["1"])
 
 
 def test_the_trees_of_two_robots_have_a_root_each_on_the_clock_of_headers(tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ from spatial_replay.report.panels import (
     start_of,
     tree_value,
 )
+from spatial_replay.report.ticks import MOST_TICKS, ticks_value
 from spatial_replay.spec.formula import Quantified, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.text import Sentence, json_fields, json_number
@@ -128,6 +129,7 @@ class RunReport:
         redone: what would have been decided otherwise, if the log has that.
         pictures: see `pictures_of`.
         planned_for: the file that decisions were made for, if another one is evaluated; else "".
+        ticks: messages of the robot's behaviour tree.
     """
 
     replayed: Replayed
@@ -140,6 +142,7 @@ class RunReport:
     decisions: ReportedDecisions
     redone: ReportedDecisions
     planned_for: str
+    ticks: tuple[bytes, ...] = ()
     pictures: Mapping[str, Any] = field(default_factory=lambda: NO_PICTURES)
 
     @property
@@ -295,6 +298,7 @@ def page_data(report: RunReport) -> PageData:
         "scene": scene_value(report.scene, kept_ns, first_ns, _places(report), packing),
         "events": event_values(report.events, first_ns),
         "decisions": decisions["decisions"],
+        "ticks": ticks_value(report.ticks, first_ns),
         "camera": dict(report.pictures),
     }
     omissions = tuple(_omissions(report, len(times_ns), len(kept_ns), decisions["maps_left_out"]))
@@ -432,5 +436,7 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
         yield f"Of trees with more than {MOST_NODES} nodes the uppermost {MOST_NODES} are shown."
     if len(report.events) > MOST_EVENTS:
         yield f"The first {MOST_EVENTS:,} of {len(report.events):,} events are listed."
+    if len(report.ticks) > MOST_TICKS:
+        yield f"The first {MOST_TICKS:,} of {len(report.ticks):,} ticks of the behaviour tree are shown."
     if maps:
         yield f"{maps:,} gradient maps are left out."

@@ -72,6 +72,8 @@ def panels(report: RunReport) -> Html:
         sentence = f"They were made for another specification: {report.planned_for}, as it was recorded."
         note = [element("p", text(sentence), **{"class": "axes"})] if report.planned_for else []
         sections.append(panel("decisions", "Decisions", *note))
+    if report.ticks:
+        sections.append(panel("ticks", "Behaviour tree"))
     return element("main", *sections, id="main", tabindex="-1")
 
 
@@ -315,8 +317,8 @@ def _rule(declarations: Mapping[str, str]) -> str:
 _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
 _SCRIPTS: Final = (
-    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "map", "decisions", "scene",
-    "camera", "automaton",
+    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "map", "decisions", "behaviour",
+    "scene", "camera", "automaton",
 )  # fmt: skip
 """Files of browser/; after them comes the one that runs them."""
 

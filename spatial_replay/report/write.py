@@ -50,6 +50,7 @@ _COLLECTED: Final = frozenset(
         log_topics.GRADIENT_MAP,
         log_topics.REDONE_DECISION,
         log_topics.REDONE_MAP,
+        log_topics.BEHAVIOUR_TREE,
     )
 )
 
@@ -61,6 +62,7 @@ class Collector:
         self.scene = ReportedScene()
         self.decisions, self.redone = ReportedDecisions(), ReportedDecisions()
         self.events: list[Event] = []
+        self.ticks: list[bytes] = []
         self.paths: defaultdict[tuple[str, str | None], StatePath] = defaultdict(StatePath)
 
     def add(self, messages: Messages) -> None:
@@ -81,6 +83,8 @@ class Collector:
                     self.redone.add_decision(payload)
                 case log_topics.REDONE_MAP:
                     self.redone.add_map(sequence, payload)
+                case log_topics.BEHAVIOUR_TREE:
+                    self.ticks.append(payload)
 
 
 def refuse_output(output: Path, inputs: Sequence[Path] = ()) -> None:
@@ -147,6 +151,7 @@ def report_of(
         collector.decisions,
         collector.redone,
         planned_for(source, replay.files),
+        tuple(collector.ticks),
     )
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
     replay.draw_samples(replayed.results, missing_ns, collector.scene.insert)

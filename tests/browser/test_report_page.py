@@ -23,6 +23,8 @@ from report.report_pages import (
     report_of_trace,
     two_discs,
 )
+from spatial_replay.logs.messages import BEHAVIOUR_TREE
+from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.perception import load_tags, open_frames
 from spatial_replay.planning import read_decisions
 from spatial_replay.planning.decision_log import map_fields
@@ -42,6 +44,21 @@ HOSTILE = (
 MINUS = "\N{MINUS SIGN}"
 
 
+def report_of_ticks(page: Path) -> None:
+    """The page of a run of three seconds whose behaviour tree fails after one of them."""
+    log = page.with_suffix(".mcap")
+    with sr.Recorder(log) as recorder:
+        channel = recorder.channel(BEHAVIOUR_TREE, schema=BehaviourTree)
+        for second, (carry, motion) in enumerate(((1, 1), (3, 3), (2, 2), (0, 0))):
+            recorder.write(sr.Sample(second * 10**9, {"cup": sr.Footprint.disc(second, 0, 1)}))
+            tick = BehaviourTree(time_ns=second * 10**9)
+            tick.nodes.add(name="motion", type="Sequence", status=motion)
+            tick.nodes.add(name="carry", type="Action", parent=0, status=carry)
+            if second < 3:
+                channel.write(second * 10**9, tick)
+    write_report(open_source(log), [sr.parse_specification("G cup dist cup <= 1")], page)
+
+
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     """The pages of some runs, by what is special about them."""
@@ -52,6 +69,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     record_plan_of(folder / "layers.mcap", SPEC, OBJECTS, TIDYING)
     write_report(open_source(folder / "layers.mcap"), [], folder / "layers.html")
     report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
+    report_of_ticks(folder / "ticks.html")
     broken = folder / "broken.mcap"
     broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:900_000])
     source = open_source(broken)
@@ -523,6 +541,18 @@ def test_a_result_without_an_automaton_says_why(open_page: Open) -> None:
     expect(open_page("violated").locator("#automaton")).to_contain_text(
         "table_set has no automaton: F[0s, 4s] counts seconds, an automaton counts samples."
     )
+
+
+def test_a_behaviour_tree_has_the_statuses_of_the_cursor_and_leads_to_failures(open_page: Open) -> None:
+    page = open_page("ticks")
+    panel = page.locator("#ticks")
+    failures = panel.locator(".event")
+    expect(failures).to_have_count(2)
+    failures.last.click()
+    expect(readout(page)).to_have_text("1.000 s / 3.000 s")
+    expect(panel.locator(".nodes li")).to_have_text(["✕motion Sequence, failure", "✕carry Action, failure"])
+    page.keyboard.press("End")
+    expect(panel.locator(".nodes li").last).to_have_attribute("data-status", "success")
 
 
 def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -> None:

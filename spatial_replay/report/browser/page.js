@@ -14,6 +14,7 @@ function makePage(run) {
   makeAutomaton(clock);
   makeEvents(clock);
   makeDecisions(clock);
+  makeBehaviourTree(clock);
   linkAddress(clock);
   document.documentElement.dataset.ready = "true";
 }

@@ -1,0 +1,49 @@
+"""The ticks of a robot's behaviour tree on a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import Any, Final
+
+from google.protobuf.message import DecodeError
+
+from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+
+MOST_TICKS: Final = 4_000
+"""Ticks of a page, at most: the first ones."""
+
+
+def ticks_value(payloads: Sequence[bytes], first_ns: int) -> Sequence[Mapping[str, Any]]:
+    """Return stretches of ticks of one tree: its nodes, and the time and the status of each node per tick."""
+    ticks = _iter_ticks(payloads[:MOST_TICKS])
+    values = []
+    for nodes, group in groupby(ticks, key=_shape):
+        stretch = list(group)
+        depths: list[int] = []
+        for index, (_, _, parent) in enumerate(nodes):
+            depths.append(depths[parent] + 1 if parent is not None and parent < index else 0)
+        values.append(
+            {
+                "nodes": [
+                    {"name": name, "type": kind, "depth": depth}
+                    for (name, kind, _), depth in zip(nodes, depths, strict=True)
+                ],
+                "times": [(tick.time_ns - first_ns) / 1e9 for tick in stretch],
+                "statuses": ["".join(str(node.status % 10) for node in tick.nodes) for tick in stretch],
+            }
+        )
+    return values
+
+
+def _iter_ticks(payloads: Sequence[bytes]) -> Iterator[BehaviourTree]:
+    """Yield the ticks; one that cannot be decoded is skipped."""
+    for payload in payloads:
+        try:
+            yield BehaviourTree.FromString(payload)
+        except DecodeError:
+            continue
+
+
+def _shape(tick: BehaviourTree) -> Sequence[tuple[str, str, int | None]]:
+    return [(node.name, node.type, node.parent if node.HasField("parent") else None) for node in tick.nodes]
