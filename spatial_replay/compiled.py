@@ -69,6 +69,9 @@ class Compiler:
         # a module that another thread is still importing is in `sys.modules`, too
         self._compiler: Any = None
         self.lock = threading.RLock()
+        # held while files are opened that a forked process must not keep
+        self.fork_lock = threading.Lock()
+        self.turns = set[int]()
 
     @cached_property
     def folder(self) -> Path | None:
@@ -174,7 +177,12 @@ class Compiler:
     def renew(self) -> None:
         """Begin the thread again in a forked process, which has none of its parent's."""
         self.lock = threading.RLock()
+        self.fork_lock.release()
         self._loading.clear()
+        # the lock would last as long as the last process that has it open
+        for descriptor in self.turns:
+            os.close(descriptor)
+        self.turns.clear()
         if self.loader is not None:
             self.loader = None
             self.await_code()
@@ -385,15 +393,18 @@ def _compile_in_child(task: str, folder: Path, lock: int) -> int:
         "SPATIAL_REPLAY_KERNELS": "compiled",
         "SPATIAL_REPLAY_CACHE": str(folder.parent),
     }
-    return subprocess.call(
-        [sys.executable, "-P", "-c", _CHILD, task, *sys.path],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        pass_fds=(lock,),
-    )
+    # a fork meanwhile would keep the pipe open whose end says that the child has begun
+    with _process.fork_lock:
+        child = subprocess.Popen(
+            [sys.executable, "-P", "-c", _CHILD, task, *sys.path],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            pass_fds=(lock,),
+        )
+    return child.wait()
 
 
 def kernels() -> Iterator[_Kernel[..., Any]]:
@@ -552,7 +563,11 @@ def _view(value: Any) -> object:
 
 
 _process: Final = Compiler()
-os.register_at_fork(after_in_child=_process.renew)
+os.register_at_fork(
+    before=_process.fork_lock.acquire,
+    after_in_parent=_process.fork_lock.release,
+    after_in_child=_process.renew,
+)
 
 
 def cores() -> int:
@@ -647,13 +662,19 @@ def turn(folder: Path | None, kernel: str) -> Iterator[int]:
     if folder is None:
         yield -1
         return
-    descriptor = _opened_lock(folder, f"{kernel}.lock")
+    with _process.fork_lock:
+        descriptor = _opened_lock(folder, f"{kernel}.lock")
+        _process.turns.add(descriptor)
     try:
         with suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield descriptor
     finally:
-        os.close(descriptor)
+        with _process.fork_lock:
+            # a process forked by this thread has closed it
+            if descriptor in _process.turns:
+                _process.turns.remove(descriptor)
+                os.close(descriptor)
 
 
 def _opened_lock(folder: Path, name: str = "lock") -> int:
