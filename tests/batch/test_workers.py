@@ -129,7 +129,7 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(fleet: Path, processes: 
     ) as process:
         # as a terminal does it: to the first process, the server of workers, and those that are there so far
         while len(processes_in(fleet)) < processes and process.poll() is None:
-            time.sleep(0.001)
+            time.sleep(0.01)
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in said) == (130, False), said

@@ -74,7 +74,8 @@ def least(intervals: Sequence[Interval]) -> Interval:
 
 
 def greatest(intervals: Sequence[Interval]) -> Interval:
-    return -least([-interval for interval in intervals])
+    return Interval(max((i.low for i in intervals), default=-math.inf),
+                    max((i.high for i in intervals), default=-math.inf))  # fmt: skip
 
 
 def combine(operator: str, operands: Sequence[Interval]) -> Interval:
@@ -136,6 +137,7 @@ class Prefix:
         self.leaf = leaf
         self.goes_on = goes_on
         self._known: dict[tuple[int, int], Interval] = {}
+        self._read: dict[tuple[int, int, int], Interval] = {}
 
     def rho(self, formula: Formula, t: int) -> Interval:
         key = (id(formula), t)
@@ -192,6 +194,12 @@ class Prefix:
 
     def _operand(self, formula: Temporal, place: int, t: int) -> Interval:
         """An operand as its operator reads it: without the samples in which a rate has no value."""
+        key = (id(formula), place, t)
+        if key not in self._read:
+            self._read[key] = self._read_operand(formula, place, t)
+        return self._read[key]
+
+    def _read_operand(self, formula: Temporal, place: int, t: int) -> Interval:
         operand = formula.operands[place]
         leaves_out = {"GHUSW": (True, False), "FO": (False, False), "R": (False, True)}
         is_given = next((how for names, how in leaves_out.items() if formula.operator in names), None)
@@ -224,12 +232,9 @@ class Prefix:
     def _until(
         self, formula: Temporal, t: int, left: Callable[[int], Interval], right: Callable[[int], Interval]
     ) -> Interval:
-        found = [
-            least([right(u), *(left(w) for w in range(t, u))])
-            for u in self._ahead(formula, t)
-        ]  # fmt: skip
         still = [left(w) for w in range(t, len(self.times_ns))]
-        return greatest(found + [least([later, *still]) for later in self._open(formula, t)])
+        met = [least([right(u), *still[: u - t]]) for u in self._ahead(formula, t)]
+        return greatest(met + [least([later, *still]) for later in self._open(formula, t)])
 
     def _ahead(self, formula: Temporal, t: int) -> list[int]:
         """The samples in the window of a future operator."""

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from spatial_replay.compiled import cache_folder
 
 _LOOP = """
 import hashlib, os, select, sys
@@ -42,7 +45,17 @@ def _loop(
     )  # fmt: skip
 
 
+def _copy_cache(cache: Path) -> None:
+    """Copy the machine code of these tests, but for the kernel of samples and the notes that all is there."""
+    # all of it takes two minutes of processor time
+    folder = cache_folder()
+    if folder is not None:
+        missing = shutil.ignore_patterns("*.compiled", "*.lock", "live.measure_sample-*")
+        shutil.copytree(folder, cache / folder.name, ignore=missing)
+
+
 def test_a_first_monitor_loads_the_code_of_a_child_process_also_after_a_fork(tmp_path: Path) -> None:
+    _copy_cache(tmp_path)
     with _loop(tmp_path, "fork") as loop:
         assert loop.stdin is not None
         assert loop.stdout is not None
@@ -57,6 +70,7 @@ def test_a_first_monitor_loads_the_code_of_a_child_process_also_after_a_fork(tmp
     # later ones begin with it; without the note that all is there, only those that wait do
     with _loop(tmp_path, "1") as later:
         assert later.communicate()[1] == ""
+    assert [*tmp_path.rglob("live.measure_sample-*.nbi")]
     for note in tmp_path.rglob("*.compiled"):
         note.unlink()
     with _loop(tmp_path, "1", wait="wait") as waiting:
