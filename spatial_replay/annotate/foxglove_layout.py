@@ -98,7 +98,7 @@ def scene_panel(
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
     of = f" of {planned_for} as recorded" if planned_for else ""
-    legend = f" (map{of}: dark blue fails, grey is 0, yellow holds)" if GRADIENT_MAP in topics else ""
+    legend = f" (map{of}: vermillion fails, white is 0, blue holds)" if GRADIENT_MAP in topics else ""
     return _titled("3D!scene", f"Scene{legend}" if axes == OUR_AXES else f"Scene{legend}, {axes}", config)
 
 

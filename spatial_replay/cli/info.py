@@ -73,6 +73,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
 @click.option("--panels", is_flag=True, help="With --layout: one with the panels of the extension.")
+@click.option("--blueprint", is_flag=True, help="Write a blueprint for Rerun instead, to the file of -o.")
 @click.option(
     "--panel",
     is_flag=True,
@@ -89,6 +90,7 @@ def info(
     specification: str | None,
     layout: bool,
     panels: bool,
+    blueprint: bool,
     panel: bool,
     output: Path | None,
     reading: Reading,
@@ -114,6 +116,7 @@ def info(
       spatial-replay info annotated.mcap --specification -o used.spatial
       spatial-replay info annotated.mcap --layout -o layout.json
       spatial-replay info annotated.mcap --layout --panels -o layout.json
+      spatial-replay info annotated.mcap --blueprint -o run.rbl
       spatial-replay info --panel
     """
     contents = {
@@ -122,6 +125,7 @@ def info(
         "--decisions": decisions is not None,
         "--specification": specification is not None,
         "--layout": layout,
+        "--blueprint": blueprint,
         "--panel": panel,
     }
     names = [name for name, is_given in contents.items() if is_given]
@@ -147,6 +151,8 @@ def info(
             stream.write(resources.files("spatial_replay.annotate").joinpath(_EXTENSION).read_bytes())
         show(f"wrote {output}")
         return ExitCode.SATISFIED
+    if blueprint:
+        return _write_blueprint(log, output)
     with printing_to(output, input_files(log, reading=reading)):
         code = _print_data_set(log, as_json, suggest_mapping, names, reading)
         if code is not None:
@@ -280,6 +286,29 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
     for name, share in fitness.objects.items():
         lines.append(f"    {json.dumps(name, ensure_ascii=False)}: {share:g}")
     show(*lines)
+    return ExitCode.SATISFIED
+
+
+def _write_blueprint(log: LogFile, output: Path | None) -> int:
+    """Write which panels show an annotated log in Rerun."""
+    from spatial_replay.annotate.rerun_blueprint import blueprint_rows, write_blueprint
+    from spatial_replay.logs.mcap.read import McapSource
+    from spatial_replay.logs.messages import STANDING
+    from spatial_replay.logs.output_file import refuse_inputs
+    from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
+    from spatial_replay.sources.open_log import open_source
+
+    if output is None:
+        raise UsageError("--blueprint writes a file that is no text; name it with -o run.rbl")
+    refuse_inputs(output, [Path(str(log))])
+    source = open_source(log)
+    batches = source.iter_payloads(STANDING) if isinstance(source, McapSource) else ()
+    payload = next((payload for batch, _ in batches for payload in batch), None)
+    if payload is None:
+        raise UsageError(f"{source.name} has no results to show; replay -o writes a log that has them")
+    rows = blueprint_rows(StandingUpdate.FromString(payload))
+    write_blueprint(rows, Path(source.name).stem, output)
+    show(f"wrote {output}")
     return ExitCode.SATISFIED
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import zipfile
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 
@@ -14,9 +15,13 @@ from mcap.writer import Writer
 from replay.runs import SPECIFICATION, PiecewiseSource
 from replay.runs import run as recorded_run
 from spatial_replay import parse_specification
+from spatial_replay.annotate.rerun_blueprint import blueprint_rows
 from spatial_replay.cli import run
+from spatial_replay.logs.messages import STANDING
+from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.replay.engine import run_replay
+from spatial_replay.sources import open_source
 
 CUBE = '{"name": "cube", "class": "block", "polygon": [[0, 0], [1, 0], [1, 1]]}'
 LOST_CUBE = '{"name": "cube", "class": "block", "polygon": [[NaN, 0], [1, 0], [1, 1]]}'
@@ -336,6 +341,31 @@ def test_the_layout_stored_in_a_log_is_printed(tmp_path: Path, capsys: pytest.Ca
     run_replay(PiecewiseSource(recorded_run(), 12), [parse_specification(SPECIFICATION)], output=annotated)
     assert run(["info", str(annotated), "--layout"]) == 0
     assert "3D!scene" in json.loads(capsys.readouterr().out)["configById"]
+
+
+def test_a_blueprint_for_rerun_names_the_results_and_its_library(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, annotated = tmp_path / "run.jsonl", tmp_path / "annotated.mcap"
+    log.write_text(Path("recordings/table.jsonl").read_text())
+    output = ["-o", str(tmp_path / "run.rbl")]
+    assert run(["info", str(log), "--blueprint", *output]) == 2
+    assert "run.jsonl has no results to show; replay -o writes a log that has them" in capsys.readouterr().err
+    run(["replay", str(log), "--spec", "recordings/table_edited.spatial", "-o", str(annotated)])
+    assert run(["info", str(annotated), "--blueprint"]) == 2
+    assert "name it with -o run.rbl" in capsys.readouterr().err
+    payloads = [payload for batch, _ in open_source(annotated).iter_payloads(STANDING) for payload in batch]
+    first, last = (StandingUpdate.FromString(payload) for payload in (payloads[0], payloads[-1]))
+    rows = blueprint_rows(first)
+    assert rows[0] == ("table_set", "", ".results[0]", "#0072b2")
+    # a place in a message stands for one result in all of them
+    assert [row.title for row in rows] == [result.name for result in last.results]
+    code = run(["info", str(annotated), "--blueprint", *output])
+    if find_spec("rerun") is None:
+        assert code == 2
+        assert "a blueprint needs rerun, which is not installed" in capsys.readouterr().err
+    else:
+        assert code == 0 and (tmp_path / "run.rbl").stat().st_size
 
 
 def test_for_a_log_without_a_layout_the_error_says_how_to_get_one(
