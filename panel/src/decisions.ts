@@ -1,18 +1,19 @@
 // The panel of a planner's decisions: candidates, the chosen map, and the edges given up.
 
 import {
-  element, inShort, makeDecision, numberText, printable, secondsText,
+  element, inShort, makeDecision, nodeRow, numberText, printable, secondsText,
   type DrawnBar, type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnOutline, type DrawnTarget,
 } from "report-drawing";
 import { createElement, type ReactElement } from "react";
 
 import { TimedList } from "./event-list";
-import { wide, type DecisionMessage, type GridMessage, type SceneMessage, type TargetMessage } from "./messages";
+import { wide, type DecisionMessage, type GridMessage, type SceneMessage, type TargetMessage, type TreeMessage } from "./messages";
 import type { Cursor, View, Viewer } from "./viewer";
 
 const DECISION = "/plan/decision";
 const MAP = "/plan/gradient_map";
 const SCENE = "/spatial/scene";
+const TREE = "/plan/behaviour_tree";
 /** Cells of all maps that are kept: 16 MiB. */
 const MOST_CELLS = 1 << 22;
 const MOST_GUARDS = 4;
@@ -36,10 +37,12 @@ interface Owner {
 
 export class DecisionsView implements View {
   readonly topics = [DECISION, MAP];
-  readonly currentTopics = [SCENE];
+  readonly currentTopics = [SCENE, TREE];
   readonly body = element("div", { class: "panel-body decisions" });
   private readonly card = element("ol", { class: "cards" });
   private readonly pruned = element("div", { class: "tasks" });
+  private readonly nodes = element("ul", { class: "nodes" });
+  private readonly tree = element("details", { open: true, hidden: true }, element("summary", {}, "Behaviour tree"), this.nodes);
   private readonly list = new TimedList();
   private readonly clock: DrawnClock;
   /** By number; with its outcome once that is known. */
@@ -63,7 +66,7 @@ export class DecisionsView implements View {
       },
       view: [0, 0], time: 0, seek: (time) => viewer.seek(time), pause: () => undefined,
     };
-    this.body.append(this.card, this.pruned,
+    this.body.append(this.card, this.pruned, this.tree,
       element("details", { open: true }, element("summary", {}, "All decisions"), this.list.made));
   }
 
@@ -80,6 +83,11 @@ export class DecisionsView implements View {
   take(topic: string, time: number, message: unknown, isOfRange: boolean): void {
     if (topic === SCENE) {
       this.outlines = outlinesOf(message as SceneMessage);
+      return;
+    }
+    if (topic === TREE) {
+      this.tree.hidden = false;
+      this.nodes.replaceChildren(...rowsOf(message as TreeMessage));
       return;
     }
     if (topic === MAP) {
@@ -118,6 +126,7 @@ export class DecisionsView implements View {
 
   head(): ReactElement {
     const count = this.decisions.size;
+    if (!count && !this.tree.hidden) return createElement("div");
     if (!count) return createElement("p", { className: "note" }, "No decisions here: open the log of a planned run.");
     return createElement("div", { className: "panel-head" }, createElement("b", null, `${count} decision${count === 1 ? "" : "s"}`));
   }
@@ -181,6 +190,16 @@ export class DecisionsView implements View {
     });
     return found;
   }
+}
+
+/** Returns the rows of a tree's nodes, each behind the one above it by its depth. */
+function rowsOf({ nodes }: TreeMessage): HTMLElement[] {
+  const depths: number[] = [];
+  return nodes.map(({ name, type, parent, status }, place) => {
+    const depth = typeof parent === "number" && parent < place ? depths[parent]! + 1 : 0;
+    depths.push(depth);
+    return nodeRow({ name: printable(name), type: printable(type), depth }, status ?? 0);
+  });
 }
 
 function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): DrawnMap | null {

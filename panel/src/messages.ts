@@ -136,6 +136,15 @@ export interface DecisionMessage {
   } | null;
 }
 
+export interface TreeMessage {
+  readonly nodes: readonly {
+    readonly name: string;
+    readonly type: string;
+    readonly parent?: number | null;
+    readonly status?: number;
+  }[];
+}
+
 export interface GridMessage {
   readonly pose?: { readonly position?: { readonly x: number; readonly y: number } | null } | null;
   readonly column_count: number;

@@ -134,4 +134,5 @@ declare module "report-drawing" {
   export function describe(automaton: DrawnAutomaton, states: number[]): Node[];
   export function makeDecision(clock: DrawnClock, decision: DrawnDecision): HTMLElement;
   export function inShort(decision: DrawnDecision): string;
+  export function nodeRow(node: { name: string; type: string; depth: number }, status: number): HTMLElement;
 }

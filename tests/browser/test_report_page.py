@@ -13,6 +13,7 @@ from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Error, Locator, Page, expect
 
 import spatial_replay as sr
+from browser.ticked import write_ticked_log
 from perception.filmed import write_approach
 from planning.plans import record_plan_of
 from planning.test_map_layers import OBJECTS, SPEC, TIDYING, messages
@@ -23,8 +24,6 @@ from report.report_pages import (
     report_of_trace,
     two_discs,
 )
-from spatial_replay.logs.messages import BEHAVIOUR_TREE
-from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.perception import load_tags, open_frames
 from spatial_replay.planning import read_decisions
 from spatial_replay.planning.decision_log import map_fields
@@ -44,21 +43,6 @@ HOSTILE = (
 MINUS = "\N{MINUS SIGN}"
 
 
-def report_of_ticks(page: Path) -> None:
-    """The page of a run of three seconds whose behaviour tree fails after one of them."""
-    log = page.with_suffix(".mcap")
-    with sr.Recorder(log) as recorder:
-        channel = recorder.channel(BEHAVIOUR_TREE, schema=BehaviourTree)
-        for second, (carry, motion) in enumerate(((1, 1), (3, 3), (2, 2), (0, 0))):
-            recorder.write(sr.Sample(second * 10**9, {"cup": sr.Footprint.disc(second, 0, 1)}))
-            tick = BehaviourTree(time_ns=second * 10**9)
-            tick.nodes.add(name="motion", type="Sequence", status=motion)
-            tick.nodes.add(name="carry", type="Action", parent=0, status=carry)
-            if second < 3:
-                channel.write(second * 10**9, tick)
-    write_report(open_source(log), [sr.parse_specification("G cup dist cup <= 1")], page)
-
-
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     """The pages of some runs, by what is special about them."""
@@ -69,7 +53,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     record_plan_of(folder / "layers.mcap", SPEC, OBJECTS, TIDYING)
     write_report(open_source(folder / "layers.mcap"), [], folder / "layers.html")
     report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
-    report_of_ticks(folder / "ticks.html")
+    write_ticked_log(folder / "ticks.mcap")
+    write_report(open_source(folder / "ticks.mcap"), [], folder / "ticks.html")
     broken = folder / "broken.mcap"
     broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:900_000])
     source = open_source(broken)

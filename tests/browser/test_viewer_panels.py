@@ -16,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 import spatial_replay as sr
+from browser.ticked import write_ticked_log
 from browser.viewer_page import differences, write_viewer_page
 from spatial_replay.cli import run
 from spatial_replay.monitor.result import SpecResult
@@ -295,6 +296,18 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
     live.evaluate("viewer.play({sec: -1, nsec: 0}, {sec: 1, nsec: 0})")
     expect(live.locator("canvas")).to_have_count(maps)
     expect(live.get_by_text("Done at")).to_have_count(0)
+
+
+def test_the_behaviour_tree_has_the_statuses_of_the_cursor(open_panel: Open, tmp_path: Path) -> None:
+    write_ticked_log(tmp_path / "ticks.mcap")
+    write_viewer_page(tmp_path / "ticks.mcap", tmp_path / "ticks.html")
+    page = open_panel("ticks", "decisions", logs={"ticks": tmp_path / "ticks.mcap"})
+    for second, status in ((2, "success"), (1, "failure"), (0, "running")):
+        seek(page, second * 10**9)
+        expect(page.locator(".nodes li")).to_contain_text(
+            [f"motion Sequence, {status}", f"carry Action, {status}"]
+        )
+    expect(page.locator(".note")).to_have_count(0)
 
 
 def test_texts_of_a_log_are_shown_as_text(open_panel: Open, logs: Mapping[str, Path], tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def extension_files() -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-TOPICS = ("specification", "robustness", "automaton", "events", "decision", "gradient_map")
+TOPICS = ("specification", "robustness", "automaton", "events", "decision", "gradient_map", "behaviour_tree")
 
 
 def write_viewer_page(log: Path, page: Path, *, topics: Sequence[str] = TOPICS) -> None:

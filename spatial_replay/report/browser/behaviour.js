@@ -7,9 +7,7 @@ const NODE_STATUSES = [
   {mark: "violated", words: "failure"},
 ];
 
-function nodeStatus(stretch, tick, node) {
-  return NODE_STATUSES[Number(stretch.statuses[tick][node])] ?? NODE_STATUSES[0];
-}
+const FAILURE = "3";
 
 function makeBehaviourTree(clock) {
   const place = body("ticks");
@@ -30,7 +28,7 @@ function makeBehaviourTree(clock) {
     const stretch = stretches[indexAt(starts, clock.time)];
     const tick = indexAt(stretch.times, clock.time);
     const shown = isBefore ? "" : `${starts.indexOf(stretch.times[0])} ${tick}`;
-    if (shown !== now) nodes.replaceChildren(...isBefore ? [] : stretch.nodes.map((_, node) => nodeRow(stretch, tick, node)));
+    if (shown !== now) nodes.replaceChildren(...isBefore ? [] : stretch.nodes.map((node, place) => nodeRow(node, Number(stretch.statuses[tick][place]))));
     now = shown;
     rows[newest]?.removeAttribute("aria-current");
     newest = markedEvent(failures.map(({time}) => time), clock.time, () => true);
@@ -38,11 +36,10 @@ function makeBehaviourTree(clock) {
   });
 }
 
-function nodeRow(stretch, tick, node) {
-  const {name, type, depth} = stretch.nodes[node];
-  const status = nodeStatus(stretch, tick, node);
-  const made = element("li", {"data-status": status.words}, mark(status.mark), element("b", {}, name),
-    element("span", {class: "quiet"}, ` ${[type, status.words].filter(Boolean).join(", ")}`));
+function nodeRow({name, type, depth}, status) {
+  const {mark: sign, words} = NODE_STATUSES[status] ?? NODE_STATUSES[0];
+  const made = element("li", {"data-status": words}, mark(sign), element("b", {}, name),
+    element("span", {class: "quiet"}, ` ${[type, words].filter(Boolean).join(", ")}`));
   made.style.paddingLeft = `${depth}rem`;
   return made;
 }
@@ -50,8 +47,7 @@ function nodeRow(stretch, tick, node) {
 // The ticks in which a node begins to fail, as events.
 function failuresOf(stretch) {
   return stretch.times.flatMap((time, tick) => stretch.nodes.flatMap(({name}, node) => {
-    const fails = nodeStatus(stretch, tick, node).words === "failure";
-    const failed = tick > 0 && nodeStatus(stretch, tick - 1, node).words === "failure";
-    return fails && !failed ? [{time, status: "violated", parts: ["", name, " fails"]}] : [];
+    const begins = stretch.statuses[tick][node] === FAILURE && stretch.statuses[tick - 1]?.[node] !== FAILURE;
+    return begins ? [{time, status: "violated", parts: ["", name, " fails"]}] : [];
   }));
 }
