@@ -561,7 +561,7 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     for name, data in container.metadata:
         if name != VERDICTS:
             yield f"metadata {name}"
-            pairs = [(key, _shortened(value)) for key, value in list(data.items())[:_MOST_ENTRIES]]
+            pairs = [(key, _shorten(value)) for key, value in list(data.items())[:_MOST_ENTRIES]]
             yield from align_rows(pairs)
             if len(data) > _MOST_ENTRIES:
                 yield f"  … and {len(data) - _MOST_ENTRIES:,} more; --json prints all"
@@ -578,7 +578,7 @@ _MOST_ENTRIES: Final = 20
 _LONGEST_ENTRY: Final = 120
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     """Return the beginning of a metadata value, and how long it is if that is not all."""
     if len(text) <= _LONGEST_ENTRY:
         return text

@@ -103,20 +103,20 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
 
     episodes, frames = (table[name].to_numpy() for name in ("episode_index", "frame_index"))
     times_s = table["timestamp"].to_pylist()
-    places = {name: place for place, name in enumerate(names)}
+    place_of_stage = {name: place for place, name in enumerate(names)}
     indices = np.full(len(table), -1, np.int64)
     progress = np.full(len(table), np.nan, np.float32)
     rows: list[list[dict[str, Any]]] = [[] for _ in times_s]
     for number in np.unique(episodes).tolist():
-        run, own = runs.get(number), np.flatnonzero(episodes == number)
-        if run is None or len(run.numbers) != len(own):
+        run, places = runs.get(number), np.flatnonzero(episodes == number)
+        if run is None or len(run.numbers) != len(places):
             continue
-        own = own[np.argsort(frames[own], kind="stable")]
-        indices[own] = np.array([places[stage.name] for stage in run.stages])[run.numbers]
-        progress[own] = run.progress
+        places = places[np.argsort(frames[places], kind="stable")]
+        indices[places] = np.array([place_of_stage[stage.name] for stage in run.stages])[run.numbers]
+        progress[places] = run.progress
         changes = [0, *(np.flatnonzero(np.diff(run.numbers)) + 1).tolist()]
-        persistent = [_subtask(run[change].name, times_s[own[change]]) for change in changes]
-        for place in own.tolist():
+        persistent = [_subtask(run[change].name, times_s[places[change]]) for change in changes]
+        for place in places.tolist():
             rows[place] = persistent
     columns = {
         SUBTASK: pa.array(indices),

@@ -106,7 +106,7 @@ class _Collector:
         self._wanted = wanted
         self._open: list[Element] = []
         self._depth = self._inside = 0
-        self._done: list[Element] = []
+        self._finished: list[Element] = []
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
         self.parser.StartDoctypeDeclHandler = self._doctype
@@ -120,8 +120,8 @@ class _Collector:
 
     def take(self) -> list[Element]:
         """Return the elements that were finished since the last call."""
-        done, self._done = self._done, []
-        return done
+        elements, self._finished = self._finished, []
+        return elements
 
     def _doctype(self, *declared: object) -> None:
         raise LogError(
@@ -135,7 +135,7 @@ class _Collector:
             place = f"{self.name}:{self.line}"
             raise LogError(f"{place}: elements are nested deeper than {DEEPEST}; flatten them")
         if self._depth == 1:
-            self._done.append(Element(name, attributes, self.line))
+            self._finished.append(Element(name, attributes, self.line))
         elif self._open or (self._depth == 2 and name in self._wanted):
             self._begin(Element(name, attributes, self.line))
 
@@ -156,7 +156,7 @@ class _Collector:
             element = self._open.pop()
             element.text = element.text.strip()
             if not self._open:
-                self._done.append(element)
+                self._finished.append(element)
 
     def _text(self, text: str) -> None:
         if self._open and len(self._open[-1].text) < LONGEST_TEXT:
@@ -192,7 +192,7 @@ class OutlinePart:
     radius: float = 0.0
     hitch_x: float | None = None
 
-    def turned(self, hitch_angle: float) -> Points:
+    def turn(self, hitch_angle: float) -> Points:
         """Return the vertices in the obstacle's frame, at an angle of the hitch in radians."""
         if self.hitch_x is None:
             return self.vertices
@@ -232,7 +232,7 @@ class ObstacleState:
         parts = self.region if self.region is not None else outline
         along_x, along_y = cos(self.angle), sin(self.angle)
         vertices: list[float] = []
-        for x, y in (vertex for part in parts for vertex in part.turned(self.hitch_angle)):
+        for x, y in (vertex for part in parts for vertex in part.turn(self.hitch_angle)):
             vertices += (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
         counts, radii = [len(part.vertices) for part in parts], [part.radius for part in parts]
         yaw = self.angle if self.oriented else nan
@@ -281,7 +281,7 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     elements = iter_elements(path, faults, _OBSTACLES)
     step_s = _step_size(path, next(elements))
     obstacles = list(_iter_obstacles(path, faults, elements))
-    steps = sorted({step for each in obstacles for step in each.moving}) or ([0] if obstacles else [])
+    steps = sorted({step for obstacle in obstacles for step in obstacle.moving}) or ([0] if obstacles else [])
     if not obstacles and not len(faults):
         raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
     samples = _iter_samples(path, faults, obstacles, steps, step_s)
@@ -296,8 +296,12 @@ def _iter_samples(
         if time_ns > LATEST_NS:
             faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
             continue
-        states = ((each, each.fixed or each.moving.get(step)) for each in obstacles)
-        reports = [state.report(each.name, each.class_name, each.parts) for each, state in states if state]
+        states = ((obstacle, obstacle.fixed or obstacle.moving.get(step)) for obstacle in obstacles)
+        reports = [
+            state.report(obstacle.name, obstacle.class_name, obstacle.parts)
+            for obstacle, state in states
+            if state is not None
+        ]
         yield ReportedSample(time_ns, f"{path.name}: time step {step}", reports, {})
 
 
@@ -343,12 +347,12 @@ def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
     if element.name == "phantomObstacle":
         # it may be there or not: an object of every open group, about which nothing is known
         return _Obstacle(name, class_name, [], dict.fromkeys(_moving_states(element, [], report), UNKNOWN))
-    outline = _outline_of(_required(element, "shape"))
+    outline = _outline_of(_required_child(element, "shape"))
     if element.name == "environmentObstacle":
         return _Obstacle(name, class_name, outline, fixed=ObstacleState())
     role = element.child("role")
     if element.name == "staticObstacle" or (role is not None and role.text == "static"):
-        initial = _required(element, "initialState")
+        initial = _required_child(element, "initialState")
         return _Obstacle(name, class_name, outline, fixed=_state_or_unknown(initial, outline, report))
     return _Obstacle(name, class_name, outline, _moving_states(element, outline, report))
 
@@ -363,20 +367,20 @@ def _moving_states(
     """
     states: dict[int, ObstacleState] = {}
     initial, trajectory = obstacle.child("initialState"), obstacle.child("trajectory")
-    listed = [*([initial] if initial else []), *(trajectory.all("state") if trajectory else ())]
-    for each in listed:
+    elements = [*([initial] if initial else []), *(trajectory.all("state") if trajectory else ())]
+    for element in elements:
         try:
-            step = _step(_required(each, "time"))
+            step = _step(_required_child(element, "time"))
         except ScenarioError as error:
-            report(each.line, f"{error}; the state is left out")
+            report(element.line, f"{error}; the state is left out")
             continue
         if step in states:
-            report(each.line, f"time step {step} is there twice; the first state counts")
+            report(element.line, f"time step {step} is there twice; the first state counts")
             continue
-        states[step] = _state_or_unknown(each, outline, report)
+        states[step] = _state_or_unknown(element, outline, report)
     occupied = obstacle.child("occupancySet")
     for occupancy in occupied.all("occupancy") if occupied else ():
-        for step, state in _occupied(occupancy, report):
+        for step, state in _occupied_states(occupancy, report):
             states.setdefault(step, state)
     return states
 
@@ -410,14 +414,14 @@ def _outline_parts(element: Element) -> list[OutlinePart]:
         return [_truck(element)]
     if element.name == "semiTrailerTruckShape":
         _refuse_unknown(element, "truckShape", "trailerDims")
-        truck = _required(element, "truckShape")
-        return [_truck(truck), _trailer(_required(element, "trailerDims"), _hitch_x(truck))]
+        truck = _required_child(element, "truckShape")
+        return [_truck(truck), _trailer(_required_child(element, "trailerDims"), _hitch_x(truck))]
     return [_part(element)]
 
 
 def _truck(element: Element) -> OutlinePart:
     _refuse_unknown(element, "truckDims", "originXShift")
-    dimensions = _required(element, "truckDims")
+    dimensions = _required_child(element, "truckDims")
     _refuse_unknown(dimensions, "length", "width", *_TRUCK_LENGTHS)
     length, width = _size(dimensions, "length"), _size(dimensions, "width")
     return OutlinePart(_corners(length, width, (-_number(element, "originXShift"), 0.0)))
@@ -425,7 +429,7 @@ def _truck(element: Element) -> OutlinePart:
 
 def _hitch_x(truck: Element) -> float:
     """Return how far the hitch of a truck is ahead of the origin, in metres."""
-    dimensions = _required(truck, "truckDims")
+    dimensions = _required_child(truck, "truckDims")
     rear_axle = _size(dimensions, "distFromRearToRearAxle") - _size(dimensions, "length") / 2
     return _number(dimensions, "distFromRearAxleToHitch") + rear_axle - _number(truck, "originXShift")
 
@@ -490,13 +494,13 @@ def _refuse_unknown(element: Element, *names: str) -> None:
     """Refuse a child of another name, because it may place the outline elsewhere."""
     for child in element.children:
         if child.name not in names:
-            wanted = ", ".join(f"<{name}>" for name in names)
-            raise ScenarioError(f"<{element.name}> has an unknown <{child.name}>; give {wanted} only")
+            children = ", ".join(f"<{name}>" for name in names)
+            raise ScenarioError(f"<{element.name}> has an unknown <{child.name}>; give {children} only")
 
 
 def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
     """Return a state from position and orientation, each exact or somewhere in a region or interval."""
-    position = _required(element, "position")
+    position = _required_child(element, "position")
     point = position.child("point")
     away = 0.0
     if point is not None:
@@ -510,7 +514,7 @@ def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
     hitch_low, hitch_high = _angle(element, "hitchAngle", (0.0, 0.0))
     hitch_angle = (hitch_low + hitch_high) / 2
     trailers = [part for part in outline if part.hitch_x is not None]
-    turned = _turned_away([part.turned(hitch_angle) for part in outline], high - low)
+    turned = _turned_away([part.turn(hitch_angle) for part in outline], high - low)
     turned += _turned_away([trailer.vertices for trailer in trailers], hitch_high - hitch_low)
     if not all(map(isfinite, (x, y, low, high, away, hitch_angle))):
         return UNKNOWN
@@ -538,11 +542,11 @@ def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[flo
     return low, high
 
 
-def _occupied(occupancy: Element, report: ReportFault) -> Iterator[tuple[int, ObstacleState]]:
+def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[int, ObstacleState]]:
     """Yield the time steps at which the obstacle is somewhere in a region, each with that state."""
     try:
-        steps = _steps(_required(occupancy, "time"))
-        parts = _parts_of(_required(occupancy, "shape"))
+        steps = _steps(_required_child(occupancy, "time"))
+        parts = _parts_of(_required_child(occupancy, "shape"))
         # the true outline is inside the region, so no point of the region is farther from it than the width
         region = _hull(parts)
         _, _, reach = _around([region])
@@ -580,17 +584,17 @@ def _steps(time: Element) -> range:
     if time.child("intervalStart") is None:
         step = _step(time)
         return range(step, step + 1)
-    first, last = (_whole(_required(time, name)) for name in ("intervalStart", "intervalEnd"))
+    first, last = (_whole(_required_child(time, name)) for name in ("intervalStart", "intervalEnd"))
     if not 0 <= last - first <= _LONGEST_INTERVAL:
-        wanted = f"an interval of 0 to {_LONGEST_INTERVAL}"
-        raise ScenarioError(f"time is from step {first} to {last}; give {wanted}")
+        remedy = f"give an interval of 0 to {_LONGEST_INTERVAL}"
+        raise ScenarioError(f"time is from step {first} to {last}; {remedy}")
     return range(first, last + 1)
 
 
 def _step(time: Element) -> int:
     if time.child("intervalStart") is not None:
         raise ScenarioError("time is an interval; give <exact> for a state")
-    return _whole(_required(time, "exact"))
+    return _whole(_required_child(time, "exact"))
 
 
 def _whole(element: Element) -> int:
@@ -612,7 +616,7 @@ def _size(element: Element, name: str) -> float:
 
 
 def _number(element: Element, name: str) -> float:
-    text = _required(element, name).text
+    text = _required_child(element, name).text
     try:
         return float(text)
     except ValueError:
@@ -623,7 +627,7 @@ def _number_or_zero(element: Element, name: str) -> float:
     return _number(element, name) if element.child(name) is not None else 0.0
 
 
-def _required(element: Element, name: str) -> Element:
+def _required_child(element: Element, name: str) -> Element:
     child = element.child(name)
     if child is None:
         raise ScenarioError(f"<{element.name}> has no <{name}>; give it one")

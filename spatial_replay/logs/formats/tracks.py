@@ -109,7 +109,7 @@ class ReportedSample(NamedTuple):
     signals: dict[str, float]
 
 
-def _reported(samples: Sequence[ReportedSample]) -> Observations:
+def _observations_from_samples(samples: Sequence[ReportedSample]) -> Observations:
     reports = [report for sample in samples for report in sample.reports]
     names = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
     classes = class_order(r.class_name for r in reports)
@@ -179,7 +179,7 @@ def iter_traces(
 
 
 def _trace_of(samples: Sequence[ReportedSample], faults: FaultList, concave: Concave) -> Trace:
-    trace, left_out = trace_from_observations(_reported(samples), concave=concave)
+    trace, left_out = trace_from_observations(_observations_from_samples(samples), concave=concave)
     for index, what in sorted(left_out.items()):
         faults.add(f"{samples[index].place}: {what}")
     return trace
@@ -242,8 +242,8 @@ def _report(entry: Any) -> ObjectReport:
     else:
         for part in _list(entry["parts"], f"{what}: parts"):
             if not isinstance(part, dict):
-                wanted = '{"vertices": […], "radius": r}'
-                raise _NoSampleError(f"{what}: a part is {_kind(part)}; give {wanted}")
+                example = '{"vertices": […], "radius": r}'
+                raise _NoSampleError(f"{what}: a part is {_kind(part)}; give {example}")
             _check_keys(part, _PART_KEYS, f"a part of {what}")
             radius = _number(part.get("radius", 0.0), f"{what}: radius")
             _add_part(report, part.get("vertices"), radius, f"{what}: vertices")
@@ -261,15 +261,15 @@ def _report(entry: Any) -> ObjectReport:
 
 
 def _add_part(report: ObjectReport, vertices: Any, radius: float, what: str) -> None:
-    listed = _list(vertices, what)
+    points = _list(vertices, what)
     flat = report.vertices
-    for point in listed:
+    for point in points:
         if type(point) is not list or len(point) != 2:
             raise _NoSampleError(f"{what} holds {_short(point)}; give [x, y] pairs")
         x, y = point
         flat.append(x if type(x) is float else _number(x, what))
         flat.append(y if type(y) is float else _number(y, what))
-    report.vertex_counts.append(len(listed))
+    report.vertex_counts.append(len(points))
     report.radii.append(radius)
 
 
@@ -294,8 +294,8 @@ def _number(value: Any, what: str) -> float:
     try:
         return float(value)
     except OverflowError:
-        wanted = "a number that fits a double"
-        raise _NoSampleError(f"{what} holds an integer beyond 1.8e308; give {wanted}") from None
+        remedy = "give a number that fits a double"
+        raise _NoSampleError(f"{what} holds an integer beyond 1.8e308; {remedy}") from None
 
 
 def _list(value: Any, what: str) -> list[Any]:
@@ -306,8 +306,8 @@ def _list(value: Any, what: str) -> list[Any]:
 
 def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
     if not entry.keys() <= known:
-        unknown, listed = ", ".join(map(repr, sorted(entry.keys() - known))), ", ".join(sorted(known))
-        raise _NoSampleError(f"{what} has the unknown key {cut(unknown, 60)}; known are {listed}")
+        unknown, allowed = ", ".join(map(repr, sorted(entry.keys() - known))), ", ".join(sorted(known))
+        raise _NoSampleError(f"{what} has the unknown key {cut(unknown, 60)}; known are {allowed}")
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
@@ -348,7 +348,7 @@ def _csv_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
     order = _column_order(path, next(lines, (1, ""))[1])
     time_ns, place, reports, broken = -1, "", dict[str, ObjectReport](), False
     for number, line in lines:
-        here = f"{path.name}:{number}"
+        line_place = f"{path.name}:{number}"
         try:
             row = _row(line, order)
             at = _time(row["time_ns"])
@@ -357,19 +357,19 @@ def _csv_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
                 what = Sentence("its time is ", this, ", before ", last, "; give times that do not go back")
                 raise _NoSampleError(what)
         except _NoSampleError as error:
-            faults.add(Sentence(f"{here}: ", *error.args))
+            faults.add(Sentence(f"{line_place}: ", *error.args))
             continue
         if at > time_ns:
             if reports and not broken:
                 yield ReportedSample(time_ns, place, list(reports.values()), {})
-            time_ns, place, reports, broken = at, here, {}, False
+            time_ns, place, reports, broken = at, line_place, {}, False
         try:
             report = _row_report(row)
             if report.name in reports:
                 raise _NoSampleError(f"object {report.name!r} is there twice; name each object once a sample")
             reports[report.name] = report
         except _NoSampleError as error:
-            faults.add(Sentence(f"{here}: {error}; the sample at ", Instant(at, 0), " is left out"))
+            faults.add(Sentence(f"{line_place}: {error}; the sample at ", Instant(at, 0), " is left out"))
             broken = True
     if reports and not broken:
         yield ReportedSample(time_ns, place, list(reports.values()), {})
@@ -426,8 +426,8 @@ def _cell(row: dict[str, str], column: str) -> float:
     try:
         return float(text) if text else nan
     except ValueError:
-        wanted = "a number, or nothing where it is not known"
-        raise _NoSampleError(f"{column} is {text[:60]!r}; give {wanted}") from None
+        remedy = "give a number, or nothing where it is not known"
+        raise _NoSampleError(f"{column} is {text[:60]!r}; {remedy}") from None
 
 
 FRAMES_A_SECOND = 30.0
