@@ -268,6 +268,6 @@ def _exit_code(judgement: Judgement, at_least: float | None) -> ExitCode:
     is_enough = judgement.reaches(at_least)
     if is_enough is None:
         pending = judgement.agreement.undecided + judgement.agreement.unstored
-        warn(f"--at-least {at_least:g}: {counted(pending, 'episode')} undecided or unstored leave it open")
+        warn(f"--at-least {at_least:g} depends on {counted(pending, 'undecided or unstored episode')}")
         return ExitCode.UNKNOWN
     return ExitCode.SATISFIED if is_enough else ExitCode.VIOLATED

@@ -159,7 +159,7 @@ class Judgement:
 
     @cached_property
     def failures(self) -> dict[str | None, tuple[JudgedEpisode, ...]]:
-        """The failed episodes by their first failure, the most frequent first; None is none of the file."""
+        """The failed episodes by their first failure, the most frequent first; None is another failure."""
         failed = [row for row in self.rows if row.is_success is False]
         counts = Counter(row.failure for row in failed)
         names = sorted(counts, key=lambda name: (name is None, -counts[name]))
@@ -220,7 +220,7 @@ class Judgement:
         """Messages about the data sets and the labels."""
         rate = self.label_rate
         if 1 < rate.episodes == rate.successes:
-            remark = f"all {rate.episodes:,} labels are successes: the data set may hold successes only"
+            remark = f"all {rate.episodes:,} labels are successes: the data set may leave failures out"
             return (*self.data_set_remarks, remark)
         return self.data_set_remarks
 

@@ -142,7 +142,7 @@ def _labels_of(file: Path, logs: Sequence[FoundLog]) -> dict[str, bool | None]:
 def _repetition(entry: Mapping[str, Any], place: str) -> str:
     frame = next((key for key in _FRAME_KEYS if key in entry), None)
     if frame is not None:
-        return f"a label for each frame ({frame!r}); give one entry an episode, with its whole success"
+        return f"a label for each frame ({frame!r}); give one entry per episode"
     return f"{place} labels this episode already; keep one of them"
 
 
@@ -157,7 +157,7 @@ def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
     except (OSError, ValueError) as error:
         raise MissingFileError.of(file, error) from None
     if len(data) > _LARGEST:
-        raise UsageError(f"{file} is larger than {_LARGEST // 2**20} MB; labels have one entry an episode")
+        raise UsageError(f"{file} is larger than {_LARGEST // 2**20} MB; labels have one entry per episode")
     if file.suffix.lower() == ".csv":
         rows = csv.DictReader(text.splitlines())
         yield from ((f"line {rows.line_num}", row) for row in rows)
@@ -203,7 +203,7 @@ def _entry_path(
         return paths[0]
     if "\0" not in name and (file.parent / name).exists():
         return None
-    hint = nearest_hint(name, paths_by_name) or "remove this entry, or judge that episode, too"
+    hint = nearest_hint(name, paths_by_name) or "remove this entry, or judge that episode"
     raise UsageError(f"no judged episode is named {name!r:.100}; {hint}")
 
 

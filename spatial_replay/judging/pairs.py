@@ -24,7 +24,7 @@ from spatial_replay.judging.statistics import (
     more_pairs,
     wilcoxon,
 )
-from spatial_replay.text import json_value
+from spatial_replay.text import counted, json_value
 
 SAME_START: Final = 0.001
 """Distance of first places that counts as none, in units of length."""
@@ -199,17 +199,15 @@ def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Yield how many pairs there are, which side is better, and how sure that is."""
     pairs, won, lost = len(comparison.pairs), comparison.won, comparison.lost
-    rest = {
-        "start elsewhere": comparison.elsewhere,
-        "undecided": comparison.undecided,
-        "episodes without a partner": comparison.alone,
-    }
-    others = "".join(f", {count:,} {name}" for name, count in rest.items() if count)
-    yield f"against {comparison.old.name}: {pairs:,} pairs with the same start{others}"
+    parts = [f"{counted(pairs, 'pair')} with the same start"]
+    parts += [f"{comparison.elsewhere:,} with another start"] if comparison.elsewhere else []
+    parts += [f"{comparison.undecided:,} undecided"] if comparison.undecided else []
+    parts += [f"{counted(comparison.alone, 'episode')} without a partner"] if comparison.alone else []
+    yield f"against {comparison.old.name}: {', '.join(parts)}"
     if not pairs:
         return
     if not won and not lost:
-        yield "undecided: no pair has a success on one side alone"
+        yield "undecided: both episodes of each pair succeed, or both fail"
         return
     more = comparison.more_pairs
     if comparison.decision == "undecided":
@@ -220,4 +218,4 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         yield f"{comparison.new} is {comparison.decision}: {counts}, p = {comparison.p:.2g}"
     yield f"evidence {comparison.evidence:.2g} of the {EVIDENCE:.0f} needed"
     if comparison.margins is not None:
-        yield f"margins differ by Wilcoxon's signed ranks: p = {comparison.margins.p:.2g}"
+        yield f"margins: p = {comparison.margins.p:.2g} by Wilcoxon's signed ranks"

@@ -57,7 +57,7 @@ def _rates(name: str, judgement: Judgement) -> Iterator[tuple[str, Rate, str]]:
     """Yield the names and rates of a judgement, and what is after them in their lines."""
     yield name, judgement.rate, ""
     if unstored := judgement.agreement.unstored:
-        yield "", judgement.rate_with_unstored, f"   if the unstored {unstored:,} count"
+        yield "", judgement.rate_with_unstored, f"   if the {unstored:,} unstored count"
 
 
 def _percents(rate: Rate) -> str:
@@ -88,7 +88,7 @@ def failure_lines(judgement: Judgement) -> Iterator[str]:
     """Yield how many episodes failed by which failure, and the first of them."""
     failed = sum(map(len, judgement.failures.values()))
     yield f"first failures of the {counted(failed, 'episode')} that fail `{judgement.result}`"
-    names = {name: name or "none of the file" for name in judgement.failures}
+    names = {name: name or "another failure" for name in judgement.failures}
     width = max(map(len, names.values()), default=0)
     for name, rows in judgement.failures.items():
         episodes = listed([row.episode for row in rows], _MOST_IN_LINE)

@@ -140,7 +140,7 @@ def test_failed_episodes_have_the_failure_that_happened_first(episodes: Path) ->
         "first failures of the 4 episodes that fail `task`",
         "  dropped in transport  2  2, 4",
         "  wrong object moved    1  3",
-        "  none of the file      1  5",
+        "  another failure       1  5",
     ]
     # the page has the task alone: a failure that does not happen is no failing result
     assert "never_lifted" not in Path("pages/index.html").read_text()

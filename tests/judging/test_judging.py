@@ -144,7 +144,7 @@ def test_a_least_rate_is_compared_with_the_lower_end_of_the_interval(fleet: Path
     judge("--at-least", "0.16", code=1)
     # Wilson's lower end is 9 % for one of four, 15 % for two, 30 % for three
     Path("logs/run-0.jsonl").write_text("{")
-    assert "1 episode undecided or unstored leave" in judge("--at-least", "0.12", code=4)
+    assert "--at-least 0.12 depends on 1 undecided or unstored episode" in judge("--at-least", "0.12", code=4)
     judge("--at-least", "0.2", code=1)
     judge("--at-least", "0.04")
 
@@ -274,11 +274,11 @@ def test_labels_of_a_data_set_are_its_own(name: str) -> None:
 def test_successes_after_the_last_frame_are_unstored_and_no_disagreements() -> None:
     text = judge_set("push_v3_stopped")
     assert "ours      0 of 4" in text
-    assert "2 of 4  50 %   15 to 85   if the unstored 2 count" in text
+    assert "2 of 4  50 %   15 to 85   if the 2 unstored count" in text
     assert re.search(r"agreement 2 of 2 .*neither 2, unstored 2\n", text)
     assert "which is not in the data; 3.8 mm were missing" in text
     text = judge_set("push_v3_stopped", "--against", "push_v3_stopped")
-    line = "2 of 4  50 %   15 to 85   if the unstored 2 count"
+    line = "2 of 4  50 %   15 to 85   if the 2 unstored count"
     assert re.search(rf"against   0 of 4 .*\n +{line}\n", text)
     judge_set("push_v3_stopped", "--at-least", "0.1", code=4)
     judge_set("push_v3_stopped", "--at-least", "0.2", code=1)

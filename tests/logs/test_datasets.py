@@ -36,7 +36,7 @@ def test_rows_are_found_by_their_episode_whatever_the_files_are_called(tmp_path:
     assert [episode.number for episode in data_set.episodes] == [7, 9]
     assert data_set.remarks == (
         "meta names files that are not in data/: episode_000007.parquet, episode_000009.parquet;"
-        " episode_index counts",
+        " rows are found by episode_index",
     )
     assert data_set.columns(9).features["state"].tolist() == [[3.0]]
     assert data_set.features[0].places == ("x",)

@@ -86,7 +86,9 @@ class _LeRobot(DataSet):
         is_third_party = version.startswith("v3") and (path / "meta" / "episodes.jsonl").exists()
         lost = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
         if lost and not is_third_party:
-            remarks.append(f"meta names files that are not in data/: {listed(lost, 3)}; episode_index counts")
+            remarks.append(
+                f"meta names files that are not in data/: {listed(lost, 3)}; rows are found by episode_index"
+            )
         total = info.get("total_episodes")
         if isinstance(total, int) and total != len(self.episodes):
             remarks.append(
