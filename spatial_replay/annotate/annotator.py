@@ -47,6 +47,7 @@ from spatial_replay.logs.messages import (
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvent, RecentEvents, Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
+from spatial_replay.logs.wire import Payloads
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import Instance, SeriesBlock
 from spatial_replay.monitor.verdict import Semantics
@@ -95,7 +96,7 @@ class _Result:
         """Follow which requirements are violated for certain."""
         self._since_ns = violated_since(self.requirements, block, self._since_ns)
 
-    def robustness(self, block: SeriesBlock, *, final: bool = False) -> list[bytes]:
+    def robustness(self, block: SeriesBlock, *, final: bool = False) -> Payloads:
         """Return one message per sample."""
         tree = self.tree
         return encode_robustness(
@@ -280,11 +281,8 @@ class Annotator:
             return []
         trace, blocks = self._latest
         ended = [_ended(block, final) for block, final in zip(blocks, finals, strict=True)]
-        robustness = [
-            payload
-            for result, block in zip(self._results, ended, strict=True)
-            for payload in result.robustness(block, final=True)
-        ]
+        pairs = zip(self._results, ended, strict=True)
+        robustness = Payloads.concatenate([result.robustness(block, final=True) for result, block in pairs])
         last_ns = int(trace.times_ns[-1])
         numbers = self._messages(_ROBUSTNESS, np.full(len(robustness), time_ns), robustness)
         ending = self.standing.end(last_ns, finals, self._over)
@@ -357,8 +355,7 @@ class Annotator:
         """Order the messages of results by time; among equal times the order of results stays."""
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
         order = np.argsort(times_ns, kind="stable")
-        payloads = [payload for each in encoded for payload in each]
-        return self._messages(channel, times_ns[order], [payloads[place] for place in order.tolist()])
+        return self._messages(channel, times_ns[order], Payloads.concatenate(encoded).select(order))
 
     def _messages(self, channel: Channel, times_ns: Integers, payloads: Sequence[bytes]) -> Messages:
         first = self._written[channel.topic]

@@ -23,7 +23,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
     Robustness,
 )
-from spatial_replay.logs.wire import WireTemplate, words_of
+from spatial_replay.logs.wire import Payloads, WireTemplate, words_of
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.spec.walks import looks_ahead
@@ -60,7 +60,7 @@ def encode_robustness(
     series: Floats,
     *,
     final: bool = False,
-) -> list[bytes]:
+) -> Payloads:
     """Return one message for each sample.
 
     Args:

@@ -19,7 +19,7 @@ from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, StandingUpdate
-from spatial_replay.logs.wire import WireTemplate, placed, rounded, words_of
+from spatial_replay.logs.wire import WireTemplate, ordered, rounded, words_of
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.spec.walks import looks_ahead
@@ -265,7 +265,7 @@ class StandingEncoder:
                 own += [column[members] for column in of_violated[each]]
             own_marks = np.concatenate([each[members] for each in marks], axis=1)
             encoded.append((members, self._template(layout).encode(words_of(own), own_marks)))
-        return placed(len(times_ns), encoded)
+        return ordered(encoded)
 
     def _made_template(self, layout: _Layout) -> WireTemplate:
         """Return a template with a value in every field that differs between samples."""

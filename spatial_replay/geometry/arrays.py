@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
+from functools import cache
 from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar, cast
 
@@ -148,13 +149,13 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
     """
     if isinstance(rows, slice):
         return _mapped(table, lambda name: getattr(table, name)[rows])
-    listed = rows.tolist()
+    listed = cache(rows.tolist)
 
     def chosen(name: str) -> Any:
         column = getattr(table, name)
         if isinstance(column, np.ndarray):
             return column[rows]
-        return [column[row] for row in listed] if isinstance(column, Sequence) else column.select(rows)
+        return column.select(rows) if hasattr(column, "select") else [column[row] for row in listed()]
 
     return _mapped(table, chosen)
 
@@ -168,8 +169,8 @@ def concatenated(tables: Sequence[_Table]) -> _Table:
         columns = [getattr(table, name) for table in tables]
         if isinstance(columns[0], np.ndarray):
             return np.concatenate(columns)
-        is_listed = isinstance(columns[0], Sequence)
-        return list(chain.from_iterable(columns)) if is_listed else type(columns[0]).concatenate(columns)
+        kinds = [type(column) for column in columns if hasattr(column, "concatenate")]
+        return kinds[0].concatenate(columns) if kinds else list(chain.from_iterable(columns))
 
     return _mapped(tables[-1], joined)
 

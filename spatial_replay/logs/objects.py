@@ -26,7 +26,7 @@ from spatial_replay.geometry.arrays import (
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import OBJECTS, Messages, messages_of, protobuf_channel
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.wire import Bytes, LayoutError, WireTemplate, Words, payloads_of, rows_of
+from spatial_replay.logs.wire import Bytes, LayoutError, Payloads, WireTemplate, Words, ordered, rows_of
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import ABSENT, Trace, class_order, require_few
@@ -418,30 +418,29 @@ def sample_messages(trace: Trace, first: int) -> Messages:
     return messages_of(OBJECTS_CHANNEL, trace.times_ns, encode_objects(trace), first)
 
 
-def encode_objects(trace: Trace) -> list[bytes]:
+def encode_objects(trace: Trace) -> Payloads:
     """Encode each sample of a trace as one ObjectStates message.
 
     Two encodings side by side are the encoding of both messages' fields. So a sample is joined from pieces:
     its time, each of its objects and each of its signals, and all pieces of one layout are encoded at once.
     """
+    count = len(trace)
     times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
-    objects = _object_pieces(trace)
-    begins = starts_from_counts(np.count_nonzero(trace.rows != ABSENT, axis=1)).tolist()
-    columns = [_signal_pieces(trace, name) for name in trace.signals]
-    signals = list(zip(*columns, strict=True))
-    return [
-        b"".join((time, *objects[begins[index] : begins[index + 1]], *(signals[index] if signals else ())))
-        for index, time in enumerate(times)
-    ]
+    signals = [_signal_pieces(trace, name) for name in trace.signals]
+    each = np.arange(count)
+    of_objects = np.nonzero(trace.rows != ABSENT)[0]
+    samples = np.concatenate([each, of_objects, *[each] * len(signals)])
+    pieces = Payloads.concatenate([times, _object_pieces(trace), *signals])
+    return pieces.select(np.argsort(samples, kind="stable")).grouped(np.bincount(samples, minlength=count))
 
 
-def _object_pieces(trace: Trace) -> list[bytes]:
+def _object_pieces(trace: Trace) -> Payloads:
     """Encode every object of every sample, by sample and name."""
     present = trace.rows != ABSENT
     marked = trace.rows[present]
     rows = np.where(marked < 0, -2 - marked, marked)
     name = np.nonzero(present)[1]
-    pieces = [b""] * len(rows)
+    pieces = list[tuple[Integers, Payloads]]()
     reported_ns = np.zeros(0, np.int64) if trace.reported_ns is None else trace.reported_ns[present]
     is_earlier = np.zeros(len(rows), np.bool_)
     if trace.reported_ns is not None:
@@ -454,32 +453,28 @@ def _object_pieces(trace: Trace) -> list[bytes]:
         if is_earlier[first]:
             message.objects[0].reported_ns = 0
             numbers = np.column_stack([numbers, reported_ns[places].view(np.float64)])
-        encoded = _pieces(message, numbers)
-        for place, piece in zip(places.tolist(), encoded, strict=True):
-            pieces[place] = piece
-    return pieces
+        pieces.append((places, _pieces(message, numbers)))
+    return ordered(pieces)
 
 
-def _signal_pieces(trace: Trace, name: str) -> list[bytes]:
+def _signal_pieces(trace: Trace, name: str) -> Payloads:
     """Encode a signal in every sample: nothing where its value is not known."""
     message, values = ObjectStates(), trace.signals[name]
     signal = message.signals.add(name=name, value=0.0)
     pieces = _pieces(message, values[:, None])
     reported_ns = trace.signals_reported_ns.get(name, trace.times_ns)
-    earlier = np.flatnonzero(reported_ns != trace.times_ns)
-    if len(earlier):
+    is_earlier = reported_ns != trace.times_ns
+    if is_earlier.any():
         signal.reported_ns = 0
-        numbers = np.column_stack([values[earlier], reported_ns[earlier].view(np.float64)])
-        for place, piece in zip(earlier.tolist(), _pieces(message, numbers), strict=True):
-            pieces[place] = piece
-    for place in np.flatnonzero(np.isnan(values)).tolist():
-        pieces[place] = b""
-    return pieces
+        numbers = np.column_stack([values[is_earlier], reported_ns[is_earlier].view(np.float64)])
+        current, earlier = np.flatnonzero(~is_earlier), np.flatnonzero(is_earlier)
+        pieces = ordered([(current, pieces.select(current)), (earlier, _pieces(message, numbers))])
+    return pieces.without(np.isnan(values))
 
 
-def _pieces(message: Message, numbers: Floats) -> list[bytes]:
+def _pieces(message: Message, numbers: Floats) -> Payloads:
     """Encode a message with other numbers (n, W)."""
-    return payloads_of(WireTemplate.of(message).fill(np.ascontiguousarray(numbers).view(np.uint64)))
+    return WireTemplate.of(message).encode(np.ascontiguousarray(numbers).view(np.uint64))
 
 
 def _row_layout(trace: Trace) -> Integers:

@@ -11,14 +11,14 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias, overload
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, combined, equal_places
 
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.uint64]
@@ -90,18 +90,22 @@ class WireTemplate:
     def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""
         rows = np.empty((len(words), len(self)), np.uint8)
-        rows[:] = self.payload
-        if words.size:
-            # any 8 bytes of a row, as a word
-            anywhere = np.ndarray((len(words), len(self) - 7), "<u8", rows, 0, (len(self), 1))
-            anywhere[:, self.word_offsets] = words
-        if marks is not None:
-            rows[:, self.mark_offsets] = marks
+        # in the processor's cache the same rows are written twice in half the time
+        step = max(1, _CACHED_BYTES // max(len(self), 1))
+        for begin in range(0, len(rows), step):
+            part, own_words = rows[begin : begin + step], words[begin : begin + step]
+            part[:] = self.payload
+            if words.size:
+                # any 8 bytes of a row, as a word
+                anywhere = np.ndarray((len(part), len(self) - 7), "<u8", part, 0, (len(self), 1))
+                anywhere[:, self.word_offsets] = own_words
+            if marks is not None:
+                part[:, self.mark_offsets] = marks[begin : begin + step]
         return rows
 
-    def encode(self, words: Words, marks: Bytes | None = None) -> list[bytes]:
-        """Encode n messages as `fill` does, each by itself."""
-        return payloads_of(self.fill(words, marks))
+    def encode(self, words: Words, marks: Bytes | None = None) -> Payloads:
+        """Encode n messages as `fill` does."""
+        return Payloads.from_rows(self.fill(words, marks))
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
         """Return (n,) which of n encoded messages (n, L) have this layout."""
@@ -115,18 +119,130 @@ class WireTemplate:
         return np.asarray(anywhere[:, self.word_offsets], np.uint64)
 
 
+class Payloads(Sequence[bytes]):
+    """M encoded messages as stretches of a few buffers. One becomes bytes only when it is asked for.
+
+    Attributes:
+        buffers: (B,) uint8 each.
+        buffer: (M,) int64, the buffer that each message is in.
+        start, size: (M,) int64, its place there and its length, in bytes.
+    """
+
+    __slots__ = ("buffer", "buffers", "size", "start")
+
+    def __init__(self, buffers: Sequence[Bytes], buffer: Integers, start: Integers, size: Integers) -> None:
+        self.buffers, self.buffer, self.start, self.size = tuple(buffers), buffer, start, size
+
+    @classmethod
+    def from_rows(cls, rows: Bytes) -> Payloads:
+        """Return (n, L) uint8 as n messages."""
+        count, length = rows.shape
+        start = np.arange(count, dtype=np.int64) * length
+        return cls((rows.reshape(-1),), np.zeros(count, np.int64), start, np.full(count, length))
+
+    @classmethod
+    def of(cls, payloads: Sequence[bytes]) -> Payloads:
+        """Return messages as they are, or small ones joined and large ones each as a buffer."""
+        if isinstance(payloads, Payloads):
+            return payloads
+        count = len(payloads)
+        size = np.fromiter(map(len, payloads), np.int64, count)
+        total = int(size.sum())
+        if total > _LARGE_BYTES * count:
+            buffers = [np.frombuffer(payload, np.uint8) for payload in payloads]
+            return cls(buffers, np.arange(count), np.zeros(count, np.int64), size)
+        joined = np.frombuffer(b"".join(payloads), np.uint8)
+        return cls((joined,), np.zeros(count, np.int64), np.cumsum(size) - size, size)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Sequence[bytes]]) -> Payloads:
+        """Join messages, one part after the other. Small buffers become one, so that few remain."""
+        groups = [cls.of(part) for part in parts if len(part)]
+        small = [buffer for group in groups for buffer in group.buffers if len(buffer) < _JOINED_BYTES]
+        buffers = [np.concatenate(small)] if small else []
+        starts = iter(np.cumsum([0, *map(len, small)]).tolist())
+        numbers, starts_of = list[int](), list[int]()
+        for buffer in (buffer for group in groups for buffer in group.buffers):
+            is_small = len(buffer) < _JOINED_BYTES
+            numbers.append(0 if is_small else len(buffers))
+            starts_of.append(next(starts) if is_small else 0)
+            if not is_small:
+                buffers.append(buffer)
+        firsts = np.cumsum([0, *(len(group.buffers) for group in groups)]).tolist()
+        old = [group.buffer + first for group, first in zip(groups, firsts, strict=False)]
+        places = np.concatenate([np.empty(0, np.int64), *old])
+        start = np.concatenate([np.empty(0, np.int64), *(group.start for group in groups)])
+        size = np.concatenate([np.empty(0, np.int64), *(group.size for group in groups)])
+        if not len(places):
+            return cls((), places, start, size)
+        return cls(buffers, np.array(numbers)[places], start + np.array(starts_of)[places], size)
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    @overload
+    def __getitem__(self, place: int) -> bytes: ...
+    @overload
+    def __getitem__(self, place: slice) -> Payloads: ...
+    def __getitem__(self, place: int | slice) -> bytes | Payloads:
+        """Return one message, or a stretch of them."""
+        if isinstance(place, slice):
+            return self.select(place)
+        start = int(self.start[place])
+        return bytes(self.buffers[self.buffer[place]][start : start + int(self.size[place])])
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the messages in bytes."""
+        return int(self.size.sum())
+
+    def select(self, places: Integers | slice) -> Payloads:
+        """Return some messages, in the order given."""
+        return Payloads(self.buffers, self.buffer[places], self.start[places], self.size[places])
+
+    def without(self, is_empty: Booleans) -> Payloads:
+        """Return the messages with nothing in some of them, (M,)."""
+        return Payloads(self.buffers, self.buffer, self.start, np.where(is_empty, 0, self.size))
+
+    def grouped(self, counts: Integers) -> Payloads:
+        """Return (n,) messages, each joined from the next `counts` (n,) of these."""
+        ends = np.append(0, np.cumsum(self.size))
+        target = np.empty(ends[-1], np.uint8)
+        self.copy_into(target, ends[:-1])
+        edges = ends[np.append(0, np.cumsum(counts))]
+        return Payloads((target,), np.zeros(len(counts), np.int64), edges[:-1], np.diff(edges))
+
+    def copy_into(self, target: Bytes, starts: Integers) -> None:
+        """Copy the messages into a buffer, each to its start there."""
+        for places in equal_places(combined([self.buffer, self.size], len(self))):
+            source, size = self.buffers[self.buffer[places[0]]], int(self.size[places[0]])
+            if len(places) < _FEW:
+                for begin, end in zip(self.start[places].tolist(), starts[places].tolist(), strict=True):
+                    target[end : end + size] = source[begin : begin + size]
+            elif size:
+                step = max(1, _CACHED_BYTES // size)
+                for begin in range(0, len(places), step):
+                    some = places[begin : begin + step]
+                    stretches(target, size)[starts[some]] = stretches(source, size)[self.start[some]]
+
+
+def stretches(buffer: Bytes, size: int) -> NDArray[np.void]:
+    """Return all stretches of some bytes in a buffer as a view: the element at a place begins there."""
+    return np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer, 0, (1,))
+
+
+_CACHED_BYTES: Final = 2**17
+"""Rows that are written to more than once at a time: half a processor core's cache."""
+_LARGE_BYTES: Final = 2**12
+"""Mean size of messages from which joining them costs more than a buffer each."""
+_JOINED_BYTES: Final = 2**20
+_FEW: Final = 4
+"""Messages of one size that are copied one by one."""
+
+
 def rows_of(payloads: Sequence[bytes]) -> Bytes:
     """Return n payloads of one length L as (n, L) uint8."""
     return np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
-
-
-def payloads_of(rows: Bytes) -> list[bytes]:
-    """Return (n, L) uint8 as n payloads."""
-    count, length = rows.shape
-    if not length:
-        return [b""] * count
-    joined = rows.tobytes()
-    return [joined[begin : begin + length] for begin in range(0, count * length, length)]
 
 
 def words_of(columns: Sequence[NDArray[Any]]) -> Words:
@@ -134,13 +250,10 @@ def words_of(columns: Sequence[NDArray[Any]]) -> Words:
     return np.concatenate([np.ascontiguousarray(each).view(np.uint64) for each in columns], axis=1)
 
 
-def placed(count: int, groups: Sequence[tuple[Integers, Sequence[bytes]]]) -> list[bytes]:
-    """Return messages by their places among `count`, each group with its own places."""
-    payloads = [b""] * count
-    for places, own in groups:
-        for place, payload in zip(places.tolist(), own, strict=True):
-            payloads[place] = payload
-    return payloads
+def ordered(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
+    """Return messages in the order of their places, which are given for each group."""
+    places = np.concatenate([np.empty(0, np.int64), *(places for places, _ in groups)])
+    return Payloads.concatenate([payloads for _, payloads in groups]).select(np.argsort(places))
 
 
 _POWERS = np.array([float(f"1e{digits}") for digits in range(20)])

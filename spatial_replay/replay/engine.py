@@ -85,8 +85,11 @@ _MOST_DIGITS = 18
 """Greatest valid count in the metadata of a log."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 """Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
-_RESULTS_AT_ONCE = 2**16
-"""Samples, times results, whose messages are made and written together: about 200 MB."""
+_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE = 2**12, 2**16
+"""Samples, and samples times results, whose messages are made and written together: some 30 MB.
+
+The memory of earlier messages serves these. Fresh memory from the system costs as much as filling it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,7 +427,7 @@ class Replay:
         self, write: Callable[[Messages], None], trace: Trace, stretches: Sequence[SeriesBlock], own: Messages
     ) -> None:
         """Write the messages of a block, of some samples at a time: those of many results are large."""
-        most = max(1, _RESULTS_AT_ONCE // max(len(stretches), 1))
+        most = max(1, min(_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE // max(len(stretches), 1)))
         begins = range(0, max(len(trace), 1), most)
         starts_ns = [-FOREVER, *(int(trace.times_ns[begin]) for begin in begins[1:]), FOREVER]
         for begin, (start_ns, end_ns) in zip(begins, pairwise(starts_ns), strict=True):

@@ -133,7 +133,7 @@ def test_cutting_a_run_into_blocks_changes_no_byte(trace, data):
         payloads += part.payloads
         state = part.state
     assert times == whole.times_ns.tolist()
-    assert payloads == whole.payloads
+    assert payloads == list(whole.payloads)
 
 
 @examples(60)

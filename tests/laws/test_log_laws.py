@@ -189,7 +189,7 @@ def test_chunks_that_are_named_several_times_are_read_as_often(trace, named):
         with McapSource(path).open_walk() as walk:
             places = [walk.places[number] for number in named]
             found = [messages.payloads for _, messages in walk.iter_messages(places)]
-    payloads = encode_objects(Trace.from_samples(samples))
+    payloads = list(encode_objects(Trace.from_samples(samples)))
     assert [each for several in found for each in several] == [payloads[number] for number in named]
 
 

@@ -400,7 +400,7 @@ def test_all_messages_but_derived_ones_are_copied_as_they_are(log):
     assert list(block.messages.payloads[1::2]) == [b"[]", b"{}", b"1"]
     assert block.messages.log_time_ns.tolist() == sorted(times * 2)
     assert ROBUSTNESS not in {channel.topic for channel in block.messages.channels.values()}
-    assert list(block.messages.payloads[::2]) == encode_objects(trace)
+    assert list(block.messages.payloads[::2]) == list(encode_objects(trace))
 
 
 def test_messages_of_others_on_our_topics_are_copied_to_other_topics(log):
@@ -442,7 +442,7 @@ def test_a_log_by_the_mcap_library_is_read(log, use_chunking):
 
 def test_times_that_repeat_or_disagree_are_faults(log):
     trace = moving_cup(3)
-    payloads = encode_objects(trace)
+    payloads = list(encode_objects(trace))
     first, second, third = trace.times_ns.tolist()
     wrong = messages(
         SAMPLES, [first, first, second, third], [payloads[0], payloads[0], payloads[2], payloads[2]]
@@ -458,7 +458,7 @@ def test_times_that_repeat_or_disagree_are_faults(log):
 
 def test_a_copy_of_a_damaged_log_is_sound(log, tmp_path, capsys):
     trace = moving_cup(6)
-    payloads, times = encode_objects(trace), trace.times_ns.tolist()
+    payloads, times = list(encode_objects(trace)), trace.times_ns.tolist()
     wrong = [payloads[0], payloads[0], payloads[1], payloads[1], b"\xff\xff", *payloads[3:]]
     beside = messages(JOINTS, [times[1]] * 2, [b"{}"] * 2)
     stream = io.BytesIO()
@@ -495,7 +495,7 @@ def test_a_copy_of_a_damaged_log_is_sound(log, tmp_path, capsys):
 )
 def test_a_message_that_is_not_a_sample_is_a_fault(log, change, reported):
     trace = moving_cup(3)
-    payloads = encode_objects(trace)
+    payloads = list(encode_objects(trace))
     message = ObjectStates.FromString(payloads[1])
     change(message)
     payloads[1] = message.SerializeToString()

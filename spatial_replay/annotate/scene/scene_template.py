@@ -32,7 +32,7 @@ from spatial_replay.geometry.arrays import (
     starts_from_counts,
 )
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch
-from spatial_replay.logs.wire import WireTemplate, Words
+from spatial_replay.logs.wire import Payloads, WireTemplate, Words
 from spatial_replay.palette import LABEL, NEGATIVE, NEUTRAL
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
@@ -482,7 +482,7 @@ class SceneTemplate:
     template: WireTemplate
     order: Integers
 
-    def encode(self, numbers: Words) -> list[bytes]:
+    def encode(self, numbers: Words) -> Payloads:
         """Encode messages by their numbers (K, N)."""
         return self.template.encode(numbers.take(self.order, axis=1))
 

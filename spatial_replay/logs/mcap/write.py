@@ -7,12 +7,11 @@ divided among calls.
 from __future__ import annotations
 
 import struct
-from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, chain
+from itertools import chain
 from pathlib import Path
 from threading import local
 from types import TracebackType
@@ -26,10 +25,11 @@ from mcap.opcode import Opcode
 
 from spatial_replay.compiled import cores
 from spatial_replay.errors import OutputError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.mcap.index import RECORD_HEAD, encoded
 from spatial_replay.logs.messages import LIBRARY, MAGIC, OWN_PREFIX, Channel, Messages, Schema, messages_of
 from spatial_replay.logs.output_file import output_error
+from spatial_replay.logs.wire import Bytes, Payloads, stretches
 from spatial_replay.trace.trace import FOREVER
 
 CHUNK_BYTES = 512 * 2**10
@@ -43,6 +43,8 @@ REPEAT_NS = 5 * 10**9
 declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
 WAITING_BYTES = 64 * 2**20
 """Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
+_PART_BYTES: Final = 4 * 2**20
+"""Messages that are laid out as records at once."""
 COMPRESSION_LEVEL: Final = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
 _OWN_LEVEL, _OWN_HASH_LOG = -1, 12
@@ -66,41 +68,37 @@ _ZSTD: Final = "zstd"
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
 
 
+class _Records(NamedTuple):
+    """Records of some messages.
+
+    Attributes:
+        content: their heads and payloads, one after the other.
+        channels, times_ns, sizes: of each message: number of its channel, log time, bytes of its record.
+    """
+
+    content: Bytes
+    channels: Integers
+    times_ns: Integers
+    sizes: Integers
+
+
 @dataclass(slots=True)
 class _Lane:
     """The open chunk of some topics.
 
     Attributes:
         is_own: whether the messages are ours, and so each much like the one before.
-        records: heads and payloads of its messages in turn.
-        channels, times_ns, sizes: of each message: number of its channel, log time, bytes of its record.
+        records: of its messages.
+        first_ns: the time of the first message.
         size: of all records, in bytes.
         began_s: when it began by the clock.
     """
 
     is_own: bool
-    records: list[bytes] = field(default_factory=list)
-    channels: list[int] = field(default_factory=list)
-    times_ns: list[int] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
+    records: list[_Records] = field(default_factory=list)
+    first_ns: int = 0
     size: int = 0
     began_s: float = 0.0
-
-
-class _Columns(NamedTuple):
-    """Messages of one call.
-
-    Attributes:
-        parts: head and payload of each in turn.
-        channels, times_ns, sizes: of each message, as in a lane.
-        total: bytes of the records before each message, and of all.
-    """
-
-    parts: list[bytes]
-    channels: list[int]
-    times_ns: list[int]
-    sizes: list[int]
-    total: list[int]
 
 
 def _run_ends(times_ns: Integers, lanes: Integers) -> list[int]:
@@ -124,16 +122,17 @@ class _PackedChunk(NamedTuple):
     counts: dict[int, int]
 
 
-def _packed(lane: _Lane, declaring: bytes) -> _PackedChunk:
+def _pack(lane: _Lane, declaring: bytes) -> _PackedChunk:
     """Compress the chunk of a lane, which begins with some declarations, and make its index."""
-    content = b"".join([declaring, *lane.records])
+    contents, *columns = zip(*lane.records, strict=True)
+    channels, times_ns, sizes = map(np.concatenate, columns)
+    content = b"".join([declaring, *contents])
     compressed = _compressor(lane.is_own).compress(content)
-    start_ns, end_ns = min(lane.times_ns), max(lane.times_ns)
+    start_ns, end_ns = int(times_ns.min()), int(times_ns.max())
     length = _CHUNK.size - RECORD_HEAD.size + len(compressed)
     about = start_ns, end_ns, len(content), crc32(content), len(_ZSTD), _ZSTD.encode(), len(compressed)
     parts = [_CHUNK.pack(Opcode.CHUNK, length, *about), compressed]
-    channels, sizes = np.array(lane.channels), np.array(lane.sizes)
-    entries = np.stack([lane.times_ns, len(declaring) + np.cumsum(sizes) - sizes], axis=1).astype("<u8")
+    entries = np.stack([times_ns, len(declaring) + np.cumsum(sizes) - sizes], axis=1).astype("<u8")
     record_bytes = at = RECORD_HEAD.size + length
     offsets, counts = dict[int, int](), dict[int, int]()
     for channel in np.unique(channels).tolist():
@@ -302,7 +301,21 @@ class LogWriter:
         for number, lane in enumerate(self._lanes):
             if lane.records and self._clock and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS:
                 self._end(number)
-        sizes = np.fromiter(map(len, messages.payloads), np.int64, len(messages)) + _HEAD_BYTES
+        payloads = Payloads.of(messages.payloads)
+        ends = np.cumsum(payloads.size)
+        begin = 0
+        while begin < len(messages):
+            # the memory of one part serves the next
+            filled = int(ends[begin]) - int(payloads.size[begin]) + _PART_BYTES
+            end = max(begin + 1, int(np.searchsorted(ends, filled)))
+            part = select(replace(messages, payloads=payloads), slice(begin, end))
+            self._write_part(part, numbers[begin:end], lanes[begin:end])
+            begin = end
+
+    def _write_part(self, messages: Messages, numbers: Integers, lanes: Integers) -> None:
+        """Add messages that are not too many, given their channels' numbers and their lanes."""
+        payloads = Payloads.of(messages.payloads)
+        sizes = payloads.size + _HEAD_BYTES
         heads = np.zeros(len(messages), _HEAD)
         heads["opcode"] = Opcode.MESSAGE
         heads["length"] = sizes - RECORD_HEAD.size
@@ -310,35 +323,43 @@ class LogWriter:
         heads["sequence"] = messages.sequence
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
-        parts = [b""] * (2 * len(messages))
-        parts[::2] = heads.view(f"V{_HEAD_BYTES}").tolist()
-        parts[1::2] = messages.payloads
-        times_ns, lengths = messages.log_time_ns.tolist(), sizes.tolist()
-        columns = _Columns(parts, numbers.tolist(), times_ns, lengths, [0, *accumulate(lengths)])
+        # the records of one lane are side by side
+        order = np.argsort(lanes, kind="stable")
+        starts = np.empty(len(messages), np.int64)
+        starts[order] = np.cumsum(sizes[order]) - sizes[order]
+        content = np.empty(int(sizes.sum()), np.uint8)
+        stretches(content, _HEAD_BYTES)[starts] = heads.view(f"V{_HEAD_BYTES}")
+        payloads.copy_into(content, starts + _HEAD_BYTES)
+        records_of_part = _Records(content, numbers, messages.log_time_ns, sizes)
         begin = 0
         for end in _run_ends(messages.log_time_ns, lanes):
-            self._fill(int(lanes[begin]), columns, begin, end)
+            self._fill(int(lanes[begin]), records_of_part, starts, begin, end)
             begin = end
 
-    def _fill(self, number: int, columns: _Columns, begin: int, end: int) -> None:
+    def _fill(self, number: int, part: _Records, starts: Integers, begin: int, end: int) -> None:
         """Add messages of one lane whose times do not fall, as many at once as the open chunks take."""
-        times_ns, total = columns.times_ns, columns.total
+        times_ns = part.times_ns
         while begin < end:
+            time_ns = int(times_ns[begin])
             for place, lane in enumerate(self._lanes):
-                if lane.records and times_ns[begin] - lane.times_ns[0] >= self._chunk_ns:
+                if lane.records and time_ns - lane.first_ns >= self._chunk_ns:
                     self._end(place)
             lane = self._lanes[number]
             if not lane.records:
                 lane.began_s = self._clock() if self._clock else 0.0
-            first_ns = min([times_ns[begin], *(lane.times_ns[0] for lane in self._lanes if lane.records)])
-            stop = bisect_left(times_ns, first_ns + self._chunk_ns, begin, end)
-            if total[stop] - total[begin] + lane.size >= CHUNK_BYTES:
-                stop = bisect_left(total, total[begin] + CHUNK_BYTES - lane.size, begin + 1, stop)
-            lane.records += columns.parts[2 * begin : 2 * stop]
-            lane.channels += columns.channels[begin:stop]
-            lane.times_ns += times_ns[begin:stop]
-            lane.sizes += columns.sizes[begin:stop]
-            lane.size += total[stop] - total[begin]
+                lane.first_ns = time_ns
+            first_ns = min([time_ns, *(lane.first_ns for lane in self._lanes if lane.records)])
+            stop = begin + int(np.searchsorted(times_ns[begin:end], first_ns + self._chunk_ns))
+            start, last = int(starts[begin]), stop - 1
+            size = int(starts[last] + part.sizes[last]) - start
+            if size + lane.size >= CHUNK_BYTES:
+                full = start + CHUNK_BYTES - lane.size
+                stop = begin + 1 + int(np.searchsorted(starts[begin + 1 : stop], full))
+                last = stop - 1
+                size = int(starts[last] + part.sizes[last]) - start
+            columns = (column[begin:stop] for column in part[1:])
+            lane.records.append(_Records(part.content[start : start + size], *columns))
+            lane.size += size
             if lane.size >= CHUNK_BYTES:
                 self._end(number)
             begin = stop
@@ -422,14 +443,15 @@ class LogWriter:
         """Have the open chunk of a lane packed on another thread, and write those that are ready."""
         lane = self._lanes[number]
         self._lanes[number] = _Lane(lane.is_own)
-        self._packing.append((lane.size, self._threads.submit(_packed, lane, self._declaring(lane))))
+        self._packing.append((lane.size, self._threads.submit(_pack, lane, self._declaring(lane))))
         self._packing_bytes += lane.size
         self._write_packed(WAITING_BYTES)
 
     def _declaring(self, lane: _Lane) -> bytes:
         """Return the declarations that a chunk begins with; each schema is in it once."""
-        start_ns = lane.times_ns[0]
-        own = [self._declarations[number] for number in sorted(set(lane.channels))]
+        start_ns = lane.first_ns
+        counts = sum(np.bincount(part.channels, minlength=len(self._channels) + 1) for part in lane.records)
+        own = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
         due = [each for each in own if start_ns >= each.due_ns]
         for each in due:
             each.count += 1
