@@ -106,7 +106,7 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     """Return a light for each of the first results, in the colour of how it stands at the cursor.
 
     Args:
-        outcomes: of the finished log; titles say by how much and when results are violated.
+        outcomes: of the finished log; titles say the worst number of violated results, and when it was.
     """
     titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
@@ -225,12 +225,12 @@ def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
 
 
 def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
-    """Return the name of a result, by how much it is violated and when, then words: viewers cut the end."""
+    """Return the name of a result, its worst number if it is violated, then words: viewers cut the end."""
     title, words = tree.title, f": {tree.sentence}" if tree.sentence else ""
     if outcome is None or outcome.standing != VIOLATED or not math.isfinite(outcome.by):
         return f"{title}{words}"
     unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
-    return f"{title}, by {number_text(outcome.by)}{unit} at {_with_clock(outcome.at)}{words}"
+    return f"{title}, worst {number_text(-outcome.by)}{unit} at {_with_clock(outcome.at)}{words}"
 
 
 def _with_clock(at: Instant) -> str:

@@ -195,9 +195,9 @@ def test_the_title_of_a_light_has_the_verdicts_number_and_when_it_was_least(tmp_
     assert (result.violated_at_ns, result.least_at_ns) == (10**8, 4 * 10**8)
     lights = layout_of(output)["configById"]
     titles = [lights[f"Indicator!result{place}"]["foxglovePanelTitle"] for place in (0, 1)]
-    number = f"{-result.robustness:.4g}"
-    assert titles[0] == f"REQ-2 apart, by {number} at 0.400 s: they keep their distance"
-    assert titles[1].startswith("near, by ")
+    number = f"{result.robustness:.4g}"
+    assert titles[0] == f"REQ-2 apart, worst {number} at 0.400 s: they keep their distance"
+    assert titles[1].startswith("near, worst -")
 
 
 def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_path):
@@ -209,7 +209,7 @@ def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_p
     lights = [panel for name, panel in panels.items() if name.startswith("Indicator!")]
     for key in ("lichtblickPanelTitle", "foxglovePanelTitle"):
         first, second = (light[key] for light in lights)
-        assert first == "near, by 2.099 at 0.400 s"
+        assert first == "near, worst -2.099 at 0.400 s"
         assert second == "apart"
     assert panels["Table!violated"]["topicPath"] == "/spatial/standing.violated"
     strips = panels["StateTransitions!verdicts"]["paths"]
