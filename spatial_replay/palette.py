@@ -14,7 +14,9 @@ POSITIVE: Final = (0.0, 0.447, 0.698)
 NEGATIVE: Final = (0.835, 0.369, 0.0)
 NEUTRAL: Final = (0.55, 0.55, 0.55)
 HOLDING: Final = (0.337, 0.706, 0.914)
-"""Colour of results that hold so far: light blue. Pending ones are grey."""
+"""Colour of results that hold so far: light blue."""
+PENDING: Final = (0.941, 0.894, 0.259)
+"""Colour of pending results: yellow. Unknown ones are grey."""
 LABEL: Final = (0.95, 0.95, 0.95)
 """Red, green and blue from 0 to 1."""
 

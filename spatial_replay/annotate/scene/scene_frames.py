@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spatial_replay import palette
 from spatial_replay.annotate.deciding_leaf import SettledViolation
 from spatial_replay.annotate.robustness import standing_codes
 from spatial_replay.annotate.scene.scene_template import (
@@ -77,7 +78,7 @@ _BANNER_WIDTH: Final = 30
 STANDING_WORDS: Final = MappingProxyType(
     {
         VIOLATED: ("violated", NEGATIVE),
-        PENDING: ("pending", NEUTRAL),
+        PENDING: ("pending", palette.PENDING),
         UNKNOWN: ("unknown", NEUTRAL),
         HOLDS_SO_FAR: ("holds so far", HOLDING),
         SATISFIED: ("satisfied", POSITIVE),
