@@ -105,8 +105,7 @@ class _Result:
 
     def evaluated(self, block: SeriesBlock, *, is_final: bool) -> EvaluatedResult:
         """Return the result as the scene shows it."""
-        settled, violated_ns = self.reporter.settled, self.reporter.violated_ns
-        of = self._since_ns, settled, violated_ns, self.tree.title, is_final, self._shades.shades
+        of = self._since_ns, self.reporter.settled, is_final, self._shades.shades
         return EvaluatedResult(self.requirements, block, self._pairs, *of)
 
 

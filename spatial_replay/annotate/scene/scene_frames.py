@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from textwrap import wrap
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -14,11 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from spatial_replay import palette
 from spatial_replay.annotate.deciding_leaf import SettledViolation
-from spatial_replay.annotate.robustness import standing_codes
 from spatial_replay.annotate.scene.scene_template import (
     OBJECT,
     REGION,
-    Banner,
     CauseText,
     Dashes,
     Region,
@@ -73,8 +70,6 @@ _CROWD: Final = 40
 _MOST_LABELS: Final = 20
 """From so many objects on, not all have labels; the most that then have."""
 
-_MOST_TITLES: Final = 6
-_BANNER_WIDTH: Final = 30
 STANDING_WORDS: Final = MappingProxyType(
     {
         VIOLATED: ("violated", NEGATIVE),
@@ -85,54 +80,6 @@ STANDING_WORDS: Final = MappingProxyType(
     }
 )
 """How results stand, the worst first, each in words and as a colour."""
-
-
-def banners_of(
-    results: Sequence[EvaluatedResult], times_ns: Integers, place: tuple[float, float], first: int
-) -> tuple[Integers, tuple[Banner | None, ...]]:
-    """Return which of some banners (S,) each message has: all results that it evaluates, the worst first.
-
-    Args:
-        first: the first message that has any.
-    """
-    titled = [each for each in results if each.title]
-    if not titled:
-        return np.zeros(len(times_ns), np.int64), (None,)
-    codes = np.zeros((len(times_ns), len(titled)), np.uint8)
-    for column, result in enumerate(titled):
-        own_ns = result.block.times_ns
-        if not len(own_ns):
-            continue
-        at = np.minimum(np.searchsorted(own_ns, times_ns), len(own_ns) - 1)
-        now = standing_codes(result.block.series[:1], final=result.is_final)[0, at]
-        codes[:, column] = np.where((own_ns[at] == times_ns) | result.is_final, now, 0)
-    codes[:first] = 0
-    banners, which = list[Banner | None](), np.zeros(len(times_ns), np.int64)
-    for places in equal_places(combined(codes.T, len(codes))):
-        which[places] = len(banners)
-        banners.append(_banner(titled, codes[places[0]], place))
-    return which, tuple(banners)
-
-
-def _banner(
-    results: Sequence[EvaluatedResult], codes: NDArray[np.uint8], place: tuple[float, float]
-) -> Banner | None:
-    worst, others, colour = "", list[str](), None
-    for code, (words, hue) in STANDING_WORDS.items():
-        of_code = [result for result, each in zip(results, codes.tolist(), strict=True) if each == code]
-        if code == VIOLATED:  # the one that was so first comes first
-            of_code.sort(key=lambda each: each.violated_ns)
-        own = [each.title for each in of_code]
-        if not own:
-            continue
-        if colour is not None:
-            others.append(f"{len(own)} {words}")
-            continue
-        few = own[:_MOST_TITLES] + [f"{len(own) - _MOST_TITLES} more"] * (len(own) > _MOST_TITLES)
-        worst = f"{own[0]} {words}" if len(results) == 1 else f"{len(own)} {words}: {', '.join(few)}"
-        colour = hue
-    lines = [line for text in (worst, ", ".join(others)) for line in wrap(text, _BANNER_WIDTH)]
-    return None if colour is None else Banner("\n".join(lines), colour, place)
 
 
 class ArrowTexts(NamedTuple):
@@ -172,12 +119,15 @@ def arrow_texts(
     for places in equal_places(combined([*columns, lengths], len(shown))):
         cause[shown[places]] = len(causes)
         result, leaf, holds, moment_ns, atom = (int(each[places[0]]) for each in columns)
-        known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
-        text = found.atoms[atom] if atom >= 0 else "" if known is None else known.texts[leaf]
+        pairs = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
+        text, pair = ("", None) if pairs is None else (pairs.texts[leaf], pairs.pairs[leaf])
+        if atom >= 0:
+            text, pair = found.atoms[atom]
         at = " now" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
         said = f"{cut(text, _LONGEST_CAUSE)}{at}: {'must not hold, holds by ' if holds else ''}"
         dashes = () if moment_ns < 0 else _outlines_then(results[result].settled)
-        causes.append(CauseText(said, int(lengths[places[0]]), dashes))
+        names = () if pair is None else pair.names
+        causes.append(CauseText(said, int(lengths[places[0]]), dashes, names))
     numbers = [b""] * len(found.result)
     for index, number in zip(shown.tolist(), texts, strict=True):
         numbers[index] = number
@@ -333,7 +283,15 @@ class Arrows(NamedTuple):
         label = self.texts.label(index)
         moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
         node, leaf, atom = (int(each[index]) for each in (found.node, found.leaf, found.atom))
-        of = (self.result, node, robustness, leaf, moment_ns, holds, found.atoms[atom] if atom >= 0 else "")
+        of = (
+            self.result,
+            node,
+            robustness,
+            leaf,
+            moment_ns,
+            holds,
+            found.atoms[atom].text if atom >= 0 else "",
+        )
         dashes = self.texts.causes[self.texts.cause[index]].dashes
         return DrawnViolation(found.points[index], label, *of, dashes)
 
@@ -431,7 +389,7 @@ class SceneContent(NamedTuple):
         arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
         causes: what decides violations, in words.
         numbers: of each violation that is shown, its number with its unit.
-        banner: (S,), which of `banners`.
+        spots: (S, 2, 2), the middles of the names beside an arrow.
     """
 
     names: tuple[str, ...]
@@ -449,8 +407,7 @@ class SceneContent(NamedTuple):
     arrow: Integers
     causes: tuple[CauseText, ...]
     numbers: Sequence[bytes]
-    banner: Integers
-    banners: tuple[Banner | None, ...]
+    spots: Floats
 
 
 def _bytes(colour: Floats) -> tuple[int, int, int]:

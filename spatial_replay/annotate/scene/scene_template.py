@@ -34,7 +34,7 @@ from spatial_replay.geometry.arrays import (
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.logs.wire import Payloads, WireTemplate, Words
 from spatial_replay.palette import LABEL, NEGATIVE, NEUTRAL
-from spatial_replay.spec.formula import Outline
+from spatial_replay.spec.formula import Outline, RegionName, TrackedName
 from spatial_replay.trace.trace import Trace
 
 ROUND: Final = 32
@@ -302,8 +302,8 @@ def _add_dashes(entity: SceneEntity, ends: Floats, z: float) -> None:
     line.color.r, line.color.g, line.color.b, line.color.a = *NEUTRAL, 1.0
 
 
-def point_at(entity: SceneEntity, label: str, lift: float) -> None:
-    """Add an arrow and its label to an entity; their positions and the arrow's length are to be filled in.
+def point_at(entity: SceneEntity, label: str, lift: float, names: Sequence[str] = ()) -> None:
+    """Add an arrow, names and its label to an entity; positions and the arrow's length are to be filled in.
 
     Args:
         lift: height of flat objects above the plane, and a fifth of an arrow's width.
@@ -314,7 +314,13 @@ def point_at(entity: SceneEntity, label: str, lift: float) -> None:
     arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = SLOT
     arrow.pose.orientation.z = arrow.pose.orientation.w = SLOT
     arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = *NEGATIVE, 1.0
-    _add_label(entity, label, (SLOT, SLOT), SLOT)
+    for text in (*names, label):
+        _add_label(entity, text, (SLOT, SLOT), SLOT)
+
+
+def missing_words(name: str) -> str:
+    """Return the words at the last outline of a missing object."""
+    return f"{name}, last seen"
 
 
 def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
@@ -359,32 +365,15 @@ OBJECT_OPACITY: Final = 0.55
 REGION_OPACITY: Final = 0.3
 """Opacity of faces: objects are more opaque than the regions that they lie in."""
 
-_BANNER_PIXELS: Final = 20.0
-
 OBJECT: Final = "object/"
 REGION: Final = "region/"
 WITNESS: Final = "witness"
-BANNER: Final = "verdict"
 
 LEVELS: Final = 8
 """How many heights there are between large flat objects and small ones."""
 
 _LABEL_LIFT: Final = 0.01
 """The height of a region's name above it, by the region's size."""
-
-
-class Banner(NamedTuple):
-    """The results in a few words, above the scene.
-
-    Attributes:
-        text: "3 violated: near, apart, met; 2 satisfied".
-        colour: of the worst one.
-        place: where its middle is.
-    """
-
-    text: str
-    colour: tuple[float, float, float]
-    place: tuple[float, float]
 
 
 class CauseText(NamedTuple):
@@ -394,11 +383,13 @@ class CauseText(NamedTuple):
         text: all before the number.
         length: how many bytes the number has with its unit.
         dashes: of an arrow about an earlier sample, the outlines then: x and y of the ends of dashes.
+        names: the objects and regions of the atom that decides it.
     """
 
     text: str
     length: int
     dashes: tuple[float, ...] = ()
+    names: tuple[TrackedName | RegionName, ...] = ()
 
     def ends(self, numbers: Sequence[bytes]) -> list[bytes]:
         """Return the last bytes of labels, in which the number is: 8 or more, as those are filled in."""
@@ -436,14 +427,14 @@ class SceneLayout(NamedTuple):
             last outlines (see `Dashes`).
         witness: what decides the worst violation, which an arrow points at; "deleted" deletes the arrow of
             the message before, and without one it is None.
-        banner: None without any result.
+        names: those beside the arrow, in words; the message then has no others.
     """
 
     deleted: tuple[str, ...]
     objects: tuple[DrawnObject, ...]
     missing: tuple[tuple[str, int], ...] = ()
     witness: CauseText | Literal["deleted"] | None = None
-    banner: Banner | None = None
+    names: tuple[str, ...] = ()
 
     @property
     def has_heights(self) -> bool:
@@ -501,15 +492,15 @@ class EncodedRegions(NamedTuple):
     order: list[int]
 
 
-def encode_regions(regions: Sequence[Region]) -> EncodedRegions:
-    """Encode regions; larger ones lie lower, so that they hide no smaller one."""
+def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedRegions:
+    """Encode regions, with or without names; larger ones lie lower, so that they hide no smaller one."""
     sizes = [region.size for region in regions]
     message, order = SceneUpdate(), list[int]()
     for number, (region, size) in enumerate(zip(regions, sizes, strict=True)):
         smaller = sum(other < size for other in sizes)
         depth = _LABEL_LIFT * smaller / len(regions) * min(sizes)
         entity = _add_entity(message, REGION + region.name)
-        _add_region(entity, region, depth)
+        _add_region(entity, region, depth, named=named)
         at = len(_STAMP_WORDS) + 3 * number
         order += [at, at + 1, at + 2] * (len(entity.lines) + len(entity.triangles))
     return EncodedRegions(len(regions), _encoded(message), order)
@@ -521,7 +512,7 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
     A message has these numbers, each once: its timestamp (2), the colours of the regions (3 each), the points
     of all objects (2 each), their colours (3 each) and the places of names (2 each). If any object has a
     height, tops, bottoms, heights and those of names follow (4 each), then the last outlines of missing
-    objects (see `Dashes`). The arrow's numbers come last.
+    objects (see `Dashes`). The arrow's numbers come last, with those of the names beside it.
 
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
@@ -531,8 +522,6 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
         gone.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     if layout.witness == "deleted":
         gone.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
-    if layout.banner is not None:
-        _add_banner(_add_entity(last, BANNER), layout.banner, lift)
     places, end = _places(layout, regions.number)
     label, order = list[int](), [*regions.order]
     for drawn, own in zip(layout.objects, places, strict=True):
@@ -540,17 +529,24 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
     for name, length in layout.missing:
         entity = _add_entity(last, OBJECT + name)
         _add_dashes(entity, np.full((length - 1, 2), SLOT), lift)
-        _add_label(entity, f"{name}, last seen", (SLOT, SLOT), 2.5 * lift)
-        order += range(end, end + 2 * length)
+        order += range(end, end + 2 * (length - 1))
+        if not isinstance(layout.witness, CauseText):
+            _add_label(entity, missing_words(name), (SLOT, SLOT), 2.5 * lift)
+            order += range(end + 2 * (length - 1), end + 2 * length)
         end += 2 * length
     if isinstance(layout.witness, CauseText):
         number = "#" * layout.witness.length
         entity = _add_entity(last, WITNESS)
         if layout.witness.dashes:
             _add_dashes(entity, np.reshape(layout.witness.dashes, (-1, 2)), lift)
-        point_at(entity, layout.witness.text + number, lift)
+        point_at(entity, layout.witness.text + number, lift, layout.names)
         label = layout.witness.words
-        order += range(end, end + _ARROW_NUMBERS + len(label))
+        begin = end + _ARROW_NUMBERS
+        middle = begin + 2 * len(layout.names)
+        order += range(end, begin)
+        for x in range(begin, middle, 2):
+            order += [x, x + 1, middle + 2]
+        order += range(middle, middle + 3 + len(label))
     objects = [_encoded_object(drawn, lift) for drawn in layout.objects]
     # messages are joined by joining their bytes
     encoded = b"".join([_encoded(gone), regions.entities, *objects, _encoded(last)])
@@ -627,18 +623,25 @@ def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
     ]
 
 
-_ARROW_NUMBERS: Final = 10
-"""Number of columns of `numbers_of_witness`, without its text."""
+_ARROW_NUMBERS: Final = 7
+"""Number of columns of `numbers_of_witness` before those of names and of the label."""
 
 
 def numbers_of_witness(
-    points: Floats, z: Floats, label_y: Floats, scale: float, labels: Sequence[bytes], words: Sequence[int]
+    points: Floats,
+    z: Floats,
+    names: Floats,
+    label_y: Floats,
+    scale: float,
+    labels: Sequence[bytes],
+    words: Sequence[int],
 ) -> list[Floats]:
     """Return what to fill in for the arrow at the worst violation.
 
     Args:
         points: (S, 2, 2), its begin and its end.
         z: (S,), its height.
+        names: (S, names, 2), the middles of the names beside it.
         label_y: (S,), where the label is on the plane, off the arrow.
         scale: the size of objects in the scene.
         labels: the ends of S labels, of one length.
@@ -652,14 +655,14 @@ def numbers_of_witness(
     middle = [(begin[:, 0] + end[:, 0]) / 2.0, label_y, z + ARROW_HEAD * scale]
     text = b"".join([label[at : at + 8] for label in labels for at in words])
     label = np.frombuffer(text, "<f8")
-    return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
+    return [column.reshape(len(points), -1) for column in (*arrow, names, *middle, label)]
 
 
 def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
     return message.entities.add(id=identifier, frame_id=FRAME, timestamp=_A_STAMP)
 
 
-def _add_region(entity: SceneEntity, region: Region, depth: float = 0.0) -> None:
+def _add_region(entity: SceneEntity, region: Region, depth: float, *, named: bool) -> None:
     """Add a region: its border, its convex parts as faces, and its name at the upper edge.
 
     There, objects inside do not cover the name. The face of a prism is its floor: a roof would hide them.
@@ -674,7 +677,7 @@ def _add_region(entity: SceneEntity, region: Region, depth: float = 0.0) -> None
     label = top + _LABEL_LIFT * max(right - left, high - low)
     draw(
         entity,
-        region.name,
+        region.name if named else "",
         border_of(region),
         list(region.rings),
         ((left + right) / 2.0, high),
@@ -694,14 +697,6 @@ def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
     entity = _add_entity(message, OBJECT + drawn.name)
     draw(entity, drawn.label, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
     return _encoded(message)
-
-
-def _add_banner(entity: SceneEntity, banner: Banner, lift: float) -> None:
-    text = entity.texts.add(
-        billboard=True, font_size=_BANNER_PIXELS, scale_invariant=True, text=banner.text, pose=lying_at(lift)
-    )
-    text.pose.position.x, text.pose.position.y = banner.place
-    text.color.r, text.color.g, text.color.b, text.color.a = *banner.colour, 1.0
 
 
 # ------------------------------------------------------------------------------------------- timestamps

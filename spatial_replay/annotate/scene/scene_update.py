@@ -16,6 +16,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spatial_replay.annotate.scene.placing import place_names
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
@@ -25,7 +26,6 @@ from spatial_replay.annotate.scene.scene_frames import (
     SceneContent,
     SceneFrames,
     arrow_texts,
-    banners_of,
     colours,
     failed_objects,
     labelled_objects,
@@ -33,7 +33,6 @@ from spatial_replay.annotate.scene.scene_frames import (
 )
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
-    Banner,
     CauseText,
     Dashes,
     DrawnObject,
@@ -46,6 +45,7 @@ from spatial_replay.annotate.scene.scene_template import (
     encoded_stamps,
     extents,
     make_template,
+    missing_words,
     numbers_of_witness,
     outlines_of,
     rings_of,
@@ -61,7 +61,7 @@ from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_pla
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.wire import Words, ordered, words_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
-from spatial_replay.spec.formula import Outline
+from spatial_replay.spec.formula import Outline, RegionName
 from spatial_replay.trace.trace import Trace
 
 LIFT: Final = 0.01
@@ -111,7 +111,8 @@ class SceneNumbers:
             found, witness = content.violations, layout.witness
             labels = witness.ends([content.numbers[index] for index in samples.tolist()])
             z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
-            at = found.points[samples], z, content.label[samples]
+            spots = content.spots[samples, : len(layout.names)]
+            at = found.points[samples], z, spots, content.label[samples]
             columns += numbers_of_witness(*at, self._scale, labels, witness.words)
         return words_of(columns)
 
@@ -133,7 +134,6 @@ _UNSCALED: Final = 1.0
 _MOST_TEMPLATES: Final = 256
 _MOST_SHADES: Final = 4_096
 """Shades of one message, of each result and each object or region, at most."""
-_NOWHERE: Final = (0.0, 0.0)
 _LINE: Final = 0.05
 """How high a line of text is, about, by the longer side of the scene; a letter is half as wide."""
 
@@ -150,7 +150,7 @@ class SceneState:
         is_pointing: whether it has an arrow at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
-        place: where the banner is: above the objects of that message and the regions.
+        top: the upper edge of the objects of that message and the regions.
         line: how high a line of text is there, about.
         templates: those of the layouts so far; a cache that changes no message.
     """
@@ -161,13 +161,13 @@ class SceneState:
     last: Mapping[str, tuple[FootprintBatch, int]] = field(default_factory=lambda: MappingProxyType({}))
     is_pointing: bool = False
     scale: float | None = None
-    place: tuple[float, float] | None = None
+    top: float | None = None
     line: float = 0.0
     templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> SceneState:
-    """Return the scale and the banner's place of a run's scene (see `SceneState`), before its first message.
+    """Return the scale and the upper edge of a run's scene (see `SceneState`), before its first message.
 
     Args:
         trace: from the first sample on.
@@ -208,7 +208,7 @@ class SceneEncoder:
             Region(name, outline, tuple(outlines_of(footprint_from_outline(outline))))
             for name, outline in sorted(regions.items(), key=itemgetter(0))
         )
-        self._encoded = encode_regions(self._drawn)
+        self._encoded, self._unnamed = (encode_regions(self._drawn, named=named) for named in (True, False))
 
     def encode(
         self, trace: Trace, results: Sequence[EvaluatedResult] = (), state: SceneState | None = None
@@ -239,9 +239,9 @@ class SceneEncoder:
         objects[missing[0] >= 0] = np.nan
         has_label = labelled_objects(self.named, names, rows >= 0, objects)
         labels = has_label, failed_objects(results, names, times_ns)
-        banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
         arrows = arrow_texts(results, violations, state.zero_ns or 0, self.unit)
-        content = _content(trace, names, rows, state, violations, arrows, labels, missing, banners)
+        regions_by_name = {region.name: np.concatenate(region.rings) for region in self._drawn}
+        content = _content(trace, names, rows, state, violations, arrows, labels, missing, regions_by_name)
         shades = colours(objects, scales), colours(regions, scales)
         shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
         columns = SceneNumbers(times_ns, shades[1], shown, content, scale)
@@ -249,7 +249,8 @@ class SceneEncoder:
         encoded = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
-                templates[layout] = make_template(layout, self._encoded, LIFT * scale)
+                of_regions = self._unnamed if isinstance(layout.witness, CauseText) else self._encoded
+                templates[layout] = make_template(layout, of_regions, LIFT * scale)
             encoded.append((samples, templates[layout].encode(columns.of_messages(layout, samples))))
         is_shown = (content.forms[-1] >= FIRST_FORM) | (content.missing[-1] >= 0)
         after = replace(
@@ -301,9 +302,9 @@ class SceneEncoder:
         return (found, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
-        """Return the state with its scale and place, once an object is shown, the scale (S, 1) of each
-        message, and the first message that has a place."""
-        if state.scale is not None and state.place is not None:
+        """Return the state with its scale and upper edge, once an object is shown, the scale (S, 1) of each
+        message, and the first message that shows one."""
+        if state.scale is not None and state.top is not None:
             return state, np.full((len(rows), 1), state.scale), 0
         scales = np.full((len(rows), 1), state.scale or _UNSCALED)
         is_shown = (rows >= 0).any(axis=1)
@@ -314,18 +315,17 @@ class SceneEncoder:
         # the median size of the objects
         scale = state.scale or float(np.median(extents(shown))) or _UNSCALED
         scales[first:] = scale
-        place, line = self._place(shown)
-        return replace(state, scale=scale, place=place, line=line), scales, first
+        top, line = self._edge(shown)
+        return replace(state, scale=scale, top=top, line=line), scales, first
 
-    def _place(self, shown: FootprintBatch) -> tuple[tuple[float, float], float]:
-        """Return the place above the objects of one sample and the regions, and a line's height."""
+    def _edge(self, shown: FootprintBatch) -> tuple[float, float]:
+        """Return the upper edge of the objects of one sample and the regions, and a line's height."""
         points = np.concatenate([shown.vertices, *(ring for region in self._drawn for ring in region.rings)])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
-            return _NOWHERE, 0.0
+            return 0.0, 0.0
         (left, low), (right, high) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-        line = _LINE * max(right - left, high - low)
-        return ((left + right) / 2.0, high + 2.0 * line), line
+        return high, _LINE * max(right - left, high - low)
 
 
 def _arrows_of(
@@ -402,7 +402,7 @@ def _content(
     arrows: ArrowTexts,
     labels: tuple[NDArray[np.bool_], NDArray[np.bool_]],
     missing: tuple[Integers, Dashes],
-    banners: tuple[Integers, tuple[Banner | None, ...]],
+    regions: Mapping[str, Floats],
 ) -> SceneContent:
     is_present = rows >= 0
     is_drawn = is_present | (missing[0] >= 0)
@@ -421,6 +421,9 @@ def _content(
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
+    deciding = _deciding_boxes(names, found, arrows, observations, (low, high), missing, regions)
+    spots = np.zeros((len(rows), 2, 2))
+    spots[found.is_shown] = place_names(*deciding, before.line)
     return SceneContent(
         names,
         rows,
@@ -432,12 +435,71 @@ def _content(
         rings,
         _name_places(low, high, letters, before.line),
         found,
-        _label_places(found, observations, (low, high), before),
+        _label_places(found, observations, (low, high), spots, before),
         witness,
         arrows.causes,
         arrows.numbers,
-        *banners,
+        spots,
     )
+
+
+class _DecidingBoxes(NamedTuple):
+    """Boxes that the names beside the arrow of K messages are placed by, see `place_names`."""
+
+    low: Floats
+    high: Floats
+    letters: Floats
+    blocked: Floats
+
+
+def _deciding_boxes(
+    names: Sequence[str],
+    found: Violations,
+    arrows: ArrowTexts,
+    observations: Integers,
+    boxes_of_objects: tuple[Floats, Floats],
+    missing: tuple[Integers, Dashes],
+    regions: Mapping[str, Floats],
+) -> _DecidingBoxes:
+    """Return the boxes of what decides violations, and the boxes that the names must not cover."""
+    shown = np.flatnonzero(found.is_shown)
+    boxes_of = np.full((len(shown), 2, 2, 2), np.nan)
+    blocked = np.full((len(shown), 4, 2, 2), np.nan)
+    letters = np.zeros((len(shown), 2))
+    lasts = [_box(np.concatenate(rings)) for rings in missing[1].rings]
+    for cause in np.unique(arrows.cause[shown]).tolist():
+        places = np.flatnonzero(arrows.cause[shown] == cause)
+        text = arrows.causes[cause]
+        if text.dashes:
+            blocked[places, 3] = _box(np.reshape(text.dashes, (-1, 2)))
+        for side, name in enumerate(text.names):
+            letters[places, side] = len(name.name) + 2
+            if isinstance(name, RegionName):
+                if name.name in regions:
+                    boxes_of[places, side] = _box(regions[name.name])
+                continue
+            if name.name not in names:
+                continue
+            column = names.index(name.name)
+            rows, last = (each[shown[places], column] for each in (observations, missing[0]))
+            seen, gone = np.flatnonzero(rows >= 0), np.flatnonzero(last >= 0)
+            own = np.stack([corner[rows[seen]] for corner in boxes_of_objects], axis=1)
+            boxes_of[places[seen], side] = own
+            for place in gone.tolist():
+                boxes_of[places[place], side] = lasts[last[place]]
+                letters[places[place], side] = len(missing_words(name.name))
+            blocked[places, side] = boxes_of[places, side]
+    ends = found.points[shown]
+    blocked[:, 2] = np.stack([ends.min(axis=1), ends.max(axis=1)], axis=1)
+    # an object that is gone has its name at the arrow
+    at_end = np.stack([ends, ends], axis=2)
+    boxes_of = np.where(np.isnan(boxes_of), at_end, boxes_of)
+    return _DecidingBoxes(boxes_of[:, :, 0], boxes_of[:, :, 1], letters, blocked)
+
+
+def _box(points: Floats) -> Floats:
+    """Return the low and the high corner (2, 2) of points (n, 2)."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> Floats:
@@ -451,13 +513,23 @@ def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> F
 
 
 def _label_places(
-    found: Violations, observations: Integers, boxes: tuple[Floats, Floats], state: SceneState
+    found: Violations,
+    observations: Integers,
+    boxes: tuple[Floats, Floats],
+    spots: Floats,
+    state: SceneState,
 ) -> Floats:
-    """Return (S,) how high on the plane each arrow's label is: above the objects that it joins, or below."""
+    """Return (S,) how high on the plane each arrow's label is: above the objects that it joins, or below.
+
+    Args:
+        spots: (S, 2, 2), the middles of the names beside it.
+    """
     label = np.full(len(observations), np.nan)
     shown = np.flatnonzero(found.is_shown)
     ends = found.points[shown]
-    low, high = ends[:, :, 1].min(axis=1), ends[:, :, 1].max(axis=1)
+    of_names = spots[shown, :, 1]
+    low = np.minimum(ends[:, :, 1].min(axis=1), of_names.min(axis=1) - 0.5 * state.line)
+    high = np.maximum(ends[:, :, 1].max(axis=1), of_names.max(axis=1) + 0.5 * state.line)
     for own in observations[shown].T:
         # an absent object has the last box, and counts for nothing
         lower, upper = (box[own][:, None, :] for box in boxes) if len(boxes[0]) else (ends, ends)
@@ -466,7 +538,7 @@ def _label_places(
         touches = is_near.any(axis=1) & (own >= 0)
         low = np.where(touches, np.minimum(low, lower[:, 0, 1]), low)
         high = np.where(touches, np.maximum(high, upper[:, 0, 1]), high)
-    has_room = high + 2.5 * state.line < (state.place or _NOWHERE)[1]
+    has_room = high + 0.5 * state.line < (state.top or 0.0)
     label[shown] = np.where(has_room, high + 1.25 * state.line, low - 1.75 * state.line)
     return label
 
@@ -488,17 +560,23 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
     lengths = np.array([*map(len, content.last.rows), -1])[content.missing]
-    keys = [*content.forms.T, *content.styles.T, *lengths.T, content.arrow, content.banner]
+    keys = [*content.forms.T, *content.styles.T, *lengths.T, content.arrow]
     for samples in equal_places(combined(keys, len(content.arrow))):
         yield _layout(content, int(samples[0])), samples
 
 
 def _layout(content: SceneContent, message: int) -> SceneLayout:
-    arrow, banner = int(content.arrow[message]), int(content.banner[message])
+    arrow = int(content.arrow[message])
+    is_pointing = arrow >= FIRST_FORM
     of_objects = content.forms[message].tolist(), content.styles[message].tolist()
     listed: list[tuple[str, int, int]] = list(zip(content.names, *of_objects, strict=True))
     shown = tuple(
-        DrawnObject(name, content.rings.forms[form - FIRST_FORM], style >> 2, _label(name, style))
+        DrawnObject(
+            name,
+            content.rings.forms[form - FIRST_FORM],
+            style >> 2,
+            "" if is_pointing else _label(name, style),
+        )
         for name, form, style in listed
         if form >= FIRST_FORM
     )
@@ -508,7 +586,13 @@ def _layout(content: SceneContent, message: int) -> SceneLayout:
     cause: CauseText | Literal["deleted"] | None = None
     if arrow != ABSENT:
         cause = "deleted" if arrow == DELETED else content.causes[arrow - FIRST_FORM]
-    return SceneLayout(deleted, shown, missing, cause, content.banners[banner])
+    words = {name: _label(name, style | 1) for name, _, style in listed if style >= 0}
+    words |= {name: missing_words(name) for name, _ in missing}
+    beside = cause.names if isinstance(cause, CauseText) else ()
+    names = [
+        base.name if isinstance(base, RegionName) else words.get(base.name, base.name) for base in beside
+    ]
+    return SceneLayout(deleted, shown, missing, cause, tuple(names))
 
 
 def _label(name: str, style: int) -> str:
