@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import permutations
+from itertools import islice, permutations
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -492,6 +492,7 @@ def _iter_deciding(
     if not shades:
         return
     if not shades[0].bodies:
+        yield from _iter_worst(pairs.leaves[leaf], shades[0].requirement.sign, scene, samples)
         return
     # of the finished log there is the last sample alone
     at = np.searchsorted(result.block.times_ns, scene.trace.times_ns[samples]) - (
@@ -500,6 +501,29 @@ def _iter_deciding(
     worst = shades[0].worst[at]
     for which in np.unique(worst[worst >= 0]).tolist():
         yield shades[0].bodies[which], np.flatnonzero(worst == which)
+
+
+def _iter_worst(
+    leaf: Formula, sign: float, scene: TraceScene, samples: Integers
+) -> Iterator[tuple[Formula, Integers]]:
+    """Yield what a quantifier with many bindings asks of those with the least number, as `_iter_deciding`."""
+    if not isinstance(leaf, Quantified):
+        return
+    chosen = TraceScene(scene.trace.take(samples), scene.regions)
+    tuples = permutations(chosen.candidates(leaf.group), len(leaf.variables))
+    least, bodies = np.full(len(samples), np.inf), dict[int, Formula]()
+    worst = np.full(len(samples), -1, np.int64)
+    begin = 0
+    while some := list(islice(tuples, _MOST_BINDINGS)):
+        of_some, numbers = _numbers_of_bindings(leaf, sign, chosen, some)
+        numbers = np.where(np.isnan(numbers), np.inf, numbers)
+        is_less = numbers.min(axis=0) < least
+        worst[is_less] = begin + numbers.argmin(axis=0)[is_less]
+        least = np.minimum(least, numbers.min(axis=0))
+        bodies |= {begin + place: of_some[place] for place in set((worst[is_less] - begin).tolist())}
+        begin += len(some)
+    for which in np.unique(worst[worst >= 0]).tolist():
+        yield bodies[which], np.flatnonzero(worst == which)
 
 
 def _point_at(scene: TraceScene, pair: Pair, samples: Integers, there: Integers, found: Violations) -> None:
