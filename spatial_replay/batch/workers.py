@@ -17,10 +17,10 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from itertools import islice
-from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
+from spatial_replay.batch.forking import forking_context
 from spatial_replay.errors import ClusterError, UsageError, importing
 from spatial_replay.recording.recorder import uninterrupted
 
@@ -134,9 +134,7 @@ def _results(
 @contextmanager
 def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
     """Start processes; they are ended at once when the block ends early, or with suspects."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([_PRELOADED])
-    _start_server()
+    context = forking_context([_PRELOADED])
     others = set(multiprocessing.active_children())
     ours, theirs = multiprocessing.Pipe(duplex=False)
     try:
@@ -156,20 +154,6 @@ def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
     finally:
         theirs.close()
         ours.close()
-
-
-def _start_server() -> None:
-    """Start the process that workers are forked from with Ctrl-C blocked, which all of them inherit.
-
-    Ctrl-C goes to all processes of a terminal; the first one decides.
-    """
-    # it unblocks Ctrl-C itself when it starts
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker(connection: Connection) -> None:

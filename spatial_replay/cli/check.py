@@ -27,7 +27,15 @@ from spatial_replay.cli.options import (
     require_choice,
     strict_names_option,
 )
-from spatial_replay.cli.terminal import PROGRAM, progress, show, show_diagnostics, show_json, warn
+from spatial_replay.cli.terminal import (
+    PROGRAM,
+    progress,
+    show,
+    show_diagnostics,
+    show_json,
+    show_result,
+    warn,
+)
 from spatial_replay.errors import Diagnosis, NoAutomatonError, OutputError, SpecificationError, UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import format_formula
@@ -213,10 +221,10 @@ def check(
     show_findings(form, path, diagnostics)
     if any(diagnostic.severity == "error" for diagnostic in diagnostics):
         raise SpecificationError([diagnostic for diagnostic in diagnostics if diagnostic.severity == "error"])
-    if as_json:
-        show_json(_document(parsed, diagnostics, compared))
-    elif form == "text":
-        show(*_lines(parsed, compared))
+    if form == "text":
+        show_result(
+            lambda: _document(parsed, diagnostics, compared), lambda: _lines(parsed, compared), as_json
+        )
     if dfa is not None:
         _write_automata(parsed, of, dfa, inputs, hz, quiet=as_json)
 

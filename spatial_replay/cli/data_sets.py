@@ -11,7 +11,7 @@ import numpy as np
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.output import align_rows
-from spatial_replay.cli.terminal import progress, show, show_json, warn
+from spatial_replay.cli.terminal import progress, show_result, warn
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.text import counted, json_fields, json_number, listed, printable, without_numbers
 
@@ -38,10 +38,11 @@ def show_data_set(data_set: DataSet, as_json: bool) -> int:
     labels = _read_labels(data_set)
     bodies, remarks = _bodies(data_set)
     warn(*(f"{data_set.name}: {remark}" for remark in (*data_set.remarks, *remarks)))
-    if as_json:
-        show_json(_document(data_set, labels, bodies, remarks))
-    else:
-        show(*_lines(data_set, labels, bodies))
+    show_result(
+        lambda: _document(data_set, labels, bodies, remarks),
+        lambda: _lines(data_set, labels, bodies),
+        as_json,
+    )
     if reason := why_poseless(data_set):
         raise UsageError(reason)
     return ExitCode.SATISFIED
@@ -56,14 +57,14 @@ def show_episode(data_set: DataSet, number: int, as_json: bool) -> int:
     name = f"{data_set.name}#{number}"
     unjudged = [columns.unjudged] if columns.unjudged else []
     warn(*(f"{name}: {text}" for text in (*columns.faults, *columns.remarks, *unjudged)))
-    seconds = int(columns.times_ns[-1] - columns.times_ns[0]) / 1e9 if len(columns.times_ns) else 0.0
-    if as_json:
-        document = {
+
+    def document() -> dict[str, Any]:
+        return {
             "name": name,
             "kind": f"{data_set.kind} episode",
             **json_fields(episode, "number", "key", "task", "seed"),
             "frames": len(columns.times_ns),
-            "seconds": seconds if data_set.fps else None,
+            "seconds": _seconds(columns) if data_set.fps else None,
             "success": columns.label,
             "faults": columns.faults,
             "remarks": columns.remarks,
@@ -72,30 +73,39 @@ def show_episode(data_set: DataSet, number: int, as_json: bool) -> int:
                 {"name": feature.name, "places": list(_ranges(feature, columns))} for feature in features
             ],
         }
-        show_json(document)
-        return ExitCode.DAMAGED if columns.faults else ExitCode.SATISFIED
-    length = f" in {seconds:.3f} s" if data_set.fps else ""
-    show(f"{name}: {data_set.kind} episode, {counted(len(columns.times_ns), 'frame')}{length}")
+
+    show_result(document, lambda: _episode_lines(data_set, number, columns, features), as_json)
+    return ExitCode.DAMAGED if columns.faults else ExitCode.SATISFIED
+
+
+def _episode_lines(
+    data_set: DataSet, number: int, columns: EpisodeColumns, features: Sequence[Feature]
+) -> Iterator[str]:
+    episode = data_set.episode(number)
+    length = f" in {_seconds(columns):.3f} s" if data_set.fps else ""
+    frames = counted(len(columns.times_ns), "frame")
+    yield f"{data_set.name}#{number}: {data_set.kind} episode, {frames}{length}"
     if episode.task:
-        show(f"task     {printable(episode.task)}")
+        yield f"task     {printable(episode.task)}"
     if columns.label is not None:
-        show(f"label    {_label_text(data_set, columns)}")
+        yield f"label    {_label_text(data_set, columns)}"
     for feature in features:
-        show(printable(feature.name))
+        yield printable(feature.name)
         ranges = list(_ranges(feature, columns))
-        show(
-            *align_rows(
-                (
-                    row["place"],
-                    f"first {row['first']:.4g}",
-                    f"from {row['least']:.4g} to {row['greatest']:.4g}",
-                )
-                for row in ranges[:_MOST_PLACES]
+        yield from align_rows(
+            (
+                row["place"],
+                f"first {row['first']:.4g}",
+                f"from {row['least']:.4g} to {row['greatest']:.4g}",
             )
+            for row in ranges[:_MOST_PLACES]
         )
         if len(ranges) > _MOST_PLACES:
-            show(f"  … and {len(ranges) - _MOST_PLACES:,} more; --json prints all")
-    return ExitCode.DAMAGED if columns.faults else ExitCode.SATISFIED
+            yield f"  … and {len(ranges) - _MOST_PLACES:,} more; --json prints all"
+
+
+def _seconds(columns: EpisodeColumns) -> float:
+    return int(columns.times_ns[-1] - columns.times_ns[0]) / 1e9 if len(columns.times_ns) else 0.0
 
 
 def _any_rate(data_set: DataSet) -> EpisodeReading:

@@ -23,7 +23,7 @@ from spatial_replay.cli.options import (
     refuse_values,
     semantics_option,
 )
-from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_json, warn
+from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_json, show_result, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import BAG_METADATA, LogFile, is_address, local_files, log_file, sendable
 
@@ -104,12 +104,9 @@ def diff(
         difference: SpecificationDiff | LogDiff = _of_specifications(request, output, semantics)
     else:
         difference = _of_logs(request, other, align, output, semantics)
-    if as_json:
-        show_json(difference.document)
-    else:
-        show(*difference.lines())
-        if output is not None:
-            show(f"wrote {output}")
+    show_result(lambda: difference.document, difference.lines, as_json)
+    if output is not None and not as_json:
+        show(f"wrote {output}")
     warn(*difference.faults, *difference.doubts)
     show_diagnostics(difference.missing)
     code = ExitCode.SATISFIED if difference.is_empty else ExitCode.VIOLATED

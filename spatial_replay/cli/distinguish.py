@@ -8,7 +8,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import JsonCommand, LogPath, load_spec_options
-from spatial_replay.cli.terminal import show, show_json
+from spatial_replay.cli.terminal import show_result
 
 if TYPE_CHECKING:
     from spatial_replay.logs.remote import LogFile
@@ -40,9 +40,6 @@ def distinguish(first: LogFile, second: LogFile, hz: float | None, as_json: bool
 
     specifications = [load_spec_options([file], {})[0] for file in (first, second)]
     distinction = compare(*specifications, rate_hz=hz)
-    if as_json:
-        show_json(distinction.document)
-    else:
-        show(*distinction.lines())
+    show_result(lambda: distinction.document, distinction.lines, as_json)
     codes = {"same": ExitCode.SATISFIED, "unknown": ExitCode.UNKNOWN}
     return codes.get(distinction.relation, ExitCode.VIOLATED)

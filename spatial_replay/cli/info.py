@@ -22,6 +22,7 @@ from spatial_replay.cli.terminal import (
     show,
     show_file,
     show_json,
+    show_result,
     warn,
 )
 from spatial_replay.errors import UsageError
@@ -227,13 +228,14 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
     remarks = (*(surveyed.remarks if surveyed else ()), *overview.remarks)
     faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, remarks))
     warn(*dict.fromkeys((*faults, *remarks)))
-    if as_json:
-        show_json({**_document(overview, surveyed, faults, about), **episode})
-    else:
-        lines = _lines(overview, surveyed, bool(faults), about)
-        show(
-            next(lines), *(f"{name:<8} {fact}" for name, fact in episode.items() if fact is not None), *lines
-        )
+
+    def lines() -> Iterator[str]:
+        first, *others = _lines(overview, surveyed, bool(faults), about)
+        yield first
+        yield from (f"{name:<8} {fact}" for name, fact in episode.items() if fact is not None)
+        yield from others
+
+    show_result(lambda: {**_document(overview, surveyed, faults, about), **episode}, lines, as_json)
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 

@@ -51,8 +51,8 @@ from spatial_replay.cli.terminal import (
     show,
     show_diagnostics,
     show_file,
-    show_json,
     show_message,
+    show_result,
     warn,
 )
 from spatial_replay.errors import (
@@ -639,16 +639,21 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     verdicts_of_others = [str(verdict_of(result, node, goes_on=goes_on)) for result in others]
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     idle = replayed.vacuous if node is None and object_name is None else ()
-    if as_json:
-        show_json([*(explanation.document for explanation in results), *map(idle_document, idle)])
-    else:
+
+    def documents() -> list[Any]:
+        return [*(explanation.document for explanation in results), *map(idle_document, idle)]
+
+    def lines() -> Iterator[Line]:
         texts = [*([[counts]] if counts else []), *_texts(results)]
         if idle:
             texts.append([part.message for part in idle])
         if others:
             texts.append([others_text(others, verdicts_of_others)])
-        for number, lines in enumerate(texts):
-            show(*([""] if number else []), *map(_colour_verdicts, lines))
+        for number, sentences in enumerate(texts):
+            yield from ([""] if number else [])
+            yield from map(_colour_verdicts, sentences)
+
+    show_result(documents, lines, as_json)
     verdicts = [*(explanation.verdict for explanation in results), *verdicts_of_others]
     verdicts += _doubtful((*replayed.results, *others))
     return exit_code_from_verdicts(verdicts, bool(replayed.faults))

@@ -12,6 +12,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
 from textwrap import wrap
 from threading import Timer
 from types import MappingProxyType
@@ -122,6 +123,41 @@ def show_json(value: Any, indent: int | None = 2) -> None:
     )
 
 
+class Listener(NamedTuple):
+    """Receives the results of commands as values, and the progress of their work.
+
+    Attributes:
+        document: called with each result, as values for JSON.
+        progress: called with a label, the steps so far, and their number or None.
+    """
+
+    document: Callable[[Any], None]
+    progress: Callable[[str, int, int | None], None]
+
+
+_LISTENER: Final[ContextVar[Listener | None]] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Give a listener the results and the progress of commands that run inside the block."""
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def show_result(document: Callable[[], Any], lines: Callable[[], Iterable[Line]], as_json: bool) -> None:
+    """Print a result as JSON or as text; a listener gets it as values in any case."""
+    if (listener := _LISTENER.get()) is not None:
+        listener.document(document())
+    if as_json:
+        show_json(document())
+    else:
+        show(*lines())
+
+
 def show_file(text: str) -> None:
     """Print the text of a file: as it is to a file or a pipe, escaped to a terminal."""
     if sys.stdout.isatty():
@@ -192,6 +228,9 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     Args:
         total: number of steps; None if it is not known.
     """
+    if (listener := _LISTENER.get()) is not None:
+        yield _counting(listener, label, total)
+        return
     if not sys.stderr.isatty() or _NOTEBOOK in os.environ:
         yield lambda steps: None
         return
@@ -204,6 +243,19 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
             yield bar.advance
     finally:
         bar.close()
+
+
+def _counting(listener: Listener, label: str, total: int | None) -> Advance:
+    """Return a function that gives a listener the number of all steps so far."""
+    count = 0
+
+    def advance(steps: int) -> None:
+        nonlocal count
+        count += steps
+        listener.progress(label, count, total)
+
+    listener.progress(label, 0, total)
+    return advance
 
 
 class _Bar:

@@ -20,7 +20,15 @@ from spatial_replay.cli.options import (
     output_option,
     reading_options,
 )
-from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_file, show_json, warn
+from spatial_replay.cli.terminal import (
+    progress,
+    show,
+    show_diagnostics,
+    show_file,
+    show_json,
+    show_result,
+    warn,
+)
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, is_address, local_copy
 from spatial_replay.text import counted
@@ -162,10 +170,8 @@ def tune(
         from spatial_replay.notebook.study_view import write_surface
 
         write_surface(tuning, output)
-    if as_json:
-        show_json(tuning.document)
-    else:
-        show(*_lines(tuning))
+    show_result(lambda: tuning.document, lambda: _lines(tuning), as_json)
+    if not as_json:
         if write and tuning.is_found:
             show(f"{spec}: {', '.join(changed)} written" if changed else f"{spec} has these values already")
         if output is not None:

@@ -62,7 +62,7 @@ IN_BOWL, LEFT = "cup enclosedin bowl", "cup leftof mug"
             f"F {IN_BOWL}",
             "different",
             [f"{LEFT} and not ({IN_BOWL})"],
-            [f"{IN_BOWL} and not ({LEFT})"],
+            [f"not ({LEFT}) and {IN_BOWL}"],
         ),
     ],
 )
