@@ -68,6 +68,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "results": "Show the results of a batch.",
     },
     "Live": {"monitor": "Monitor a running robot."},
+    "Agents": {"mcp": "Serve the commands as tools of agents."},
     "Planning": {"plan": "Plan a run in a simulated world."},
 }
 """Commands by the headings of the help, with their summaries."""

@@ -1,0 +1,331 @@
+"""Bounds of a server for agents: the files that it reads, and the size of its answers."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, NamedTuple
+
+from spatial_replay.errors import UsageError
+from spatial_replay.text import counted, escaped
+
+MOST_BYTES: Final = 20_000
+"""Size of an answer as JSON, bytes."""
+MOST_TEXT: Final = 100_000
+"""Length of a text that a tool takes, characters."""
+
+_LINES: Final = 4_000
+"""Bytes of the lines of an answer, which are sent twice: as text and as values."""
+_WARNINGS: Final = 1_500
+_ROW: Final = 3_000
+"""Bytes of one row."""
+_OTHERS: Final = 3_000
+"""Bytes of all values but the rows."""
+_MOST_ENTRIES: Final = 20_000
+"""Entries of a folder that are checked for links."""
+_ADDRESSES: Final = "://"
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Folders and addresses that a server reads, and the folder that it writes.
+
+    Attributes:
+        folders: without links.
+        addresses: of folders on other machines; each ends in "/".
+        output: None if nothing is written.
+    """
+
+    folders: tuple[Path, ...]
+    addresses: tuple[str, ...] = ()
+    output: Path | None = None
+
+    @classmethod
+    def of(cls, roots: Iterable[str], output: Path | None = None) -> Bounds:
+        """Return the bounds of a command line.
+
+        Raises:
+            UsageError: a root, or the output, is not a folder.
+        """
+        folders, addresses = [], []
+        for root in roots:
+            if _ADDRESSES in root:
+                addresses.append(root.rstrip("/") + "/")
+            elif Path(root).is_dir():
+                folders.append(Path(root).resolve())
+            else:
+                raise UsageError(f"--root {root} is not a folder; give the folder with the logs")
+        if output is not None and not output.is_dir():
+            raise UsageError(f"--output {output} is not a folder; make it with mkdir {output}")
+        return cls(tuple(folders), tuple(addresses), None if output is None else output.resolve())
+
+    @property
+    def names(self) -> str:
+        """The roots as a text."""
+        return ", ".join([*map(str, self.folders), *self.addresses])
+
+    def place(self, text: str, argument: str) -> str:
+        """Return where an input is, with all links resolved.
+
+        Args:
+            text: a path, also relative to a root, or an address; `push_v3#17` is an episode of a data set.
+            argument: the name of the argument, for errors.
+
+        Raises:
+            UsageError: it is missing, outside the roots, or neither a file nor a folder.
+        """
+        if not text:
+            raise UsageError(f"{argument} is empty; give a path below {self.names}")
+        if _ADDRESSES in text:
+            if ".." not in text and text.startswith(self.addresses or ("\0",)):
+                return text
+            raise UsageError(f"{argument}: {_quote(text)} is outside the roots, which are {self.names}")
+        path, episode = self._path(text, argument), ""
+        if path is None and "#" in text:
+            text, _, episode = text.rpartition("#")
+            path, episode = self._path(text, argument), f"#{episode}"
+        if path is None:
+            raise UsageError(
+                f"{argument}: {_quote(text)} is not a file below the roots; list_logs names the logs"
+            )
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            self._check_links(path, argument)
+        elif not stat.S_ISREG(mode):
+            raise UsageError(f"{argument}: {_quote(text)} is neither a file nor a folder; give a log")
+        return f"{path}{episode}"
+
+    def _path(self, text: str, argument: str) -> Path | None:
+        """Return an existing path without links; None if there is none.
+
+        Raises:
+            UsageError: it is outside the roots.
+        """
+        is_outside = False
+        try:
+            # of an absolute one, every root gives the same
+            for root in self.folders:
+                path = (root / text).resolve()
+                if not any(map(path.is_relative_to, self.folders)):
+                    is_outside = True
+                elif path.exists():
+                    return path
+        except (OSError, ValueError, RuntimeError):
+            # names that are too long or have a null character, links in a circle
+            raise UsageError(
+                f"{argument}: {_quote(text)} cannot be a path; give one that list_logs names"
+            ) from None
+        if is_outside:
+            raise UsageError(f"{argument}: {_quote(text)} is outside the roots, which are {self.names}")
+        return None
+
+    def _check_links(self, folder: Path, argument: str) -> None:
+        """Refuse a folder with a link to the outside."""
+        count = 0
+        for parent, folders, names in os.walk(folder):
+            for name in (*folders, *names):
+                count += 1
+                path = Path(parent, name)
+                if count > _MOST_ENTRIES:
+                    raise UsageError(
+                        f"{argument}: {folder.name} has over {_MOST_ENTRIES:,} entries; give a folder in it"
+                    )
+                if path.is_symlink() and not any(map(path.resolve().is_relative_to, self.folders)):
+                    raise UsageError(
+                        f"{argument}: {_quote(path.name)} is a link to outside the roots; remove the link"
+                    )
+
+    def relative(self, path: str) -> str:
+        """Return a path as tools take it: relative to the only root, or else absolute."""
+        root = str(self.folders[0]) if len(self.folders) == 1 and not self.addresses else ""
+        return os.path.relpath(path, root) if root and path.startswith(root) else path
+
+    def output_path(self, name: str, ending: str) -> Path:
+        """Return the file in the output folder that a result is written to.
+
+        Raises:
+            UsageError: no output folder; a name with a folder in it, or of something else than a file.
+        """
+        if self.output is None:
+            raise UsageError("nothing can be written; start the server with --output FOLDER")
+        path = self.output / (name if name.endswith(ending) else f"{name}{ending}")
+        is_name = name.isprintable() and len(path.name) < 200 and path.name == os.path.basename(path)  # noqa: PTH119
+        if not is_name or "/" in name or name.startswith(".") or (path.exists() and not path.is_file()):
+            raise UsageError(f"name: {_quote(name)} is not the name of a file; give one such as run{ending}")
+        if path.is_symlink():
+            raise UsageError(f"name: {_quote(name)} is a link; give another name")
+        return path
+
+
+def _quote(text: str) -> str:
+    text = escaped(text)
+    return repr(text if len(text) <= 80 else f"{text[:79]}…")
+
+
+class Files:
+    """A folder for the texts of one call, as files; removed after it."""
+
+    def __init__(self, parent: str, bounds: Bounds, texts: Mapping[str, str]) -> None:
+        self._bounds, self._texts = bounds, texts
+        self._temporary = TemporaryDirectory(dir=parent, ignore_cleanup_errors=True)
+        self.folder = self._temporary.name
+
+    def __enter__(self) -> Files:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._temporary.cleanup()
+
+    def path(self, name: str) -> str:
+        """Return a file with a text, or the file that the text names.
+
+        Raises:
+            UsageError: the text is empty or too long, or names a file outside the roots.
+        """
+        text = self._texts[name]
+        ending, *_ = endings = (".yaml", ".yml") if name == "mapping" else (".spatial",)
+        if len(text) > MOST_TEXT:
+            raise UsageError(
+                f"{name} has {len(text):,} characters, at most {MOST_TEXT:,} are read; give a shorter one"
+            )
+        if not text.strip():
+            raise UsageError(f"{name} is empty; give a text, or the path of a file that ends in {ending}")
+        if "\n" not in text and text.endswith(endings):
+            return self._bounds.place(text, name)
+        Path(self.folder, f"{name}{ending}").write_text(text, "utf-8", "surrogateescape")
+        return f"{name}{ending}"
+
+    def option(self, option: str, name: str) -> list[str]:
+        """Return an option with that file; nothing for an empty text."""
+        return [option, self.path(name)] if self._texts.get(name) else []
+
+    def json(self, command: Sequence[str]) -> Any:
+        """Return the values that a command wrote to a file; None without any."""
+        for option, file in pairwise(command):
+            path = Path(self.folder, file)
+            if option == "--json" and path.is_file():
+                return json.loads(path.read_text("utf-8"))
+        return None
+
+
+class Page(NamedTuple):
+    """A part of an answer that fits.
+
+    Attributes:
+        lines: of the text.
+        warnings: of the first part.
+        document: with a part of its rows.
+        left_off: what was cut, as sentences.
+        next: the argument that gives the next part; "" for the last one.
+    """
+
+    lines: list[str]
+    warnings: list[str]
+    document: dict[str, Any]
+    left_off: list[str]
+    next: str
+
+
+def page_of(
+    lines: Sequence[str], warnings: Sequence[str], document: Mapping[str, Any], rows_key: str, start: str
+) -> Page:
+    """Return the part of an answer that begins at a place.
+
+    Args:
+        rows_key: the key of the list in the document that may be long.
+        start: the `next` of the part before; "" for the first.
+
+    Raises:
+        UsageError: a place that no part names.
+    """
+    first_line, first_row = _place(start)
+    left_off: list[str] = []
+    texts = [_cut(line, "line", 1_000, 0, []) for line in lines]
+    lines_here = list(_prefix(texts[first_line:], _LINES))
+    warnings_here: list[str] = []
+    if not start:
+        texts_of_warnings = [_cut(warning, "warning", 400, 0, []) for warning in warnings]
+        warnings_here = list(_prefix(texts_of_warnings, _WARNINGS))
+        if len(warnings_here) < len(texts_of_warnings):
+            left_off.append(f"{counted(len(texts_of_warnings) - len(warnings_here), 'line')} of the warnings")
+    rows = list(document.get(rows_key) or ())
+    others = {key: value for key, value in document.items() if key != rows_key}
+    part = _fit(others, _OTHERS, left_off)
+    spent = 2 * (_size(lines_here) + _size(warnings_here)) + _size(part) + 1_000
+    fitting = [_fit(row, _ROW, left_off) for row in rows[first_row : first_row + 200]]
+    rows_here = list(_prefix(fitting, MOST_BYTES - spent))
+    if rows_key in document:
+        part[rows_key] = rows_here
+    last_line, last_row = first_line + len(lines_here), first_row + len(rows_here)
+    is_last = last_line >= len(lines) and last_row >= len(rows)
+    following = "" if is_last else f"{last_line}.{last_row}"
+    return Page(lines_here, warnings_here, part, list(dict.fromkeys(left_off))[:10], following)
+
+
+def _place(start: str) -> tuple[int, int]:
+    line, _, row = (start or "0.0").partition(".")
+    if not (line.isascii() and line.isdecimal() and row.isascii() and row.isdecimal() and len(start) < 20):
+        raise UsageError(
+            f"next: {_quote(start)} is not a place in an answer; give the `next` of the part before"
+        )
+    return int(line), int(row)
+
+
+def _prefix(values: Iterable[Any], most: int) -> Iterator[Any]:
+    """Yield values that are at most so many bytes together; at least one."""
+    total = 0
+    for number, value in enumerate(values):
+        total += _size(value) + 1
+        if total > most and number:
+            return
+        yield value
+
+
+def _size(value: Any) -> int:
+    return len(json.dumps(value, ensure_ascii=False).encode("utf-8", "replace"))
+
+
+_LIMITS: Final = ((1_000, 100), (300, 30), (200, 10), (120, 4), (80, 2), (40, 1))
+"""Characters of a text and entries of a list, less and less."""
+
+
+def _fit(value: Any, most: int, left_off: list[str]) -> Any:
+    """Return a value cut to at most so many bytes."""
+    part, notes = value, list[str]()
+    for characters, entries in _LIMITS:
+        notes = []
+        part = _cut(value, "", characters, entries, notes)
+        if _size(part) <= most:
+            break
+    # without the largest values, if that is not enough
+    sizes = sorted(part, key=lambda key: _size(part[key])) if isinstance(part, dict) else []
+    while sizes and _size(part) > most:
+        key = sizes.pop()
+        notes.append(key)
+        part = {name: entry for name, entry in part.items() if name != key}
+    left_off += notes
+    return part
+
+
+def _cut(value: Any, name: str, characters: int, entries: int, notes: list[str]) -> Any:
+    """Return a value with shorter texts and lists, and without signs that do not print."""
+    match value:
+        case str():
+            text = escaped(value)
+            return text if len(text) <= characters else f"{text[: characters - 1]}…"
+        case list() | tuple():
+            if len(value) > entries:
+                notes.append(f"{name or 'rows'}: {len(value) - entries:,} of {len(value):,}")
+            return [_cut(entry, name, characters, entries, notes) for entry in value[:entries]]
+        case dict():
+            return {
+                _cut(str(key), "", characters, 0, []): _cut(entry, str(key)[:40], characters, entries, notes)
+                for key, entry in value.items()
+            }
+    return value

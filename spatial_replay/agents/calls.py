@@ -1,0 +1,114 @@
+"""Calls of tools: each runs commands in a process of its own, which ends with it."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
+from typing import Any, NamedTuple, TypeAlias
+
+import anyio
+from anyio import to_thread
+
+from spatial_replay.batch.forking import forking_context
+
+
+class Call(NamedTuple):
+    """The commands of one call.
+
+    Attributes:
+        commands: arguments of the program, without its name.
+        folder: the current folder.
+        readable: further folders that may be read and written.
+        is_online: whether addresses may be read.
+    """
+
+    commands: Sequence[Sequence[str]]
+    folder: str
+    readable: Sequence[str]
+    is_online: bool
+
+
+class Outcome(NamedTuple):
+    """The outcome of one command.
+
+    Attributes:
+        code: exit code.
+        out, err: the text on standard output and standard error.
+        document: the result as values for JSON; None without any.
+    """
+
+    code: int
+    out: str
+    err: str
+    document: Any
+
+
+class Outcomes(NamedTuple):
+    """The outcomes of the commands of a call, and why there are no more.
+
+    Attributes:
+        outcomes: of the commands that ended.
+        reason: "" if all ended.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    reason: str
+
+
+Work: TypeAlias = Callable[[Connection, Call], None]
+Report: TypeAlias = Callable[[str, int, int | None], Awaitable[None]]
+
+_PRELOADED = ("spatial_replay.api", "spatial_replay.batch.run", "spatial_replay.sanity.differences")
+"""Imported once, by the process that the processes of all calls are copies of."""
+
+
+class Processes:
+    """Starts a process for each call; as many run at once as there are cores."""
+
+    def __init__(self, work: Work, limit_s: float, most: int) -> None:
+        self._work, self._limit_s = work, limit_s
+        self._limiter = anyio.CapacityLimiter(most)
+
+    def start(self) -> None:
+        """Start the process that all others are copies of."""
+        self._context()
+
+    def _context(self) -> ForkServerContext:
+        return forking_context([self._work.__module__, *_PRELOADED])
+
+    async def run(self, call: Call, report: Report) -> Outcomes:
+        """Run a call to its end, or until the time limit; if it is cancelled, its process is killed."""
+        async with self._limiter:
+            ours, theirs = multiprocessing.Pipe(duplex=False)
+            process = self._context().Process(target=self._work, args=(theirs, call), daemon=True)
+            outcomes: list[Outcome] = []
+            progress = ""
+            try:
+                # the first one waits for the process that is copied
+                await to_thread.run_sync(process.start)
+                theirs.close()
+                with anyio.move_on_after(self._limit_s):
+                    while len(outcomes) < len(call.commands):
+                        await anyio.wait_readable(ours)
+                        message = ours.recv()
+                        if message[0] == "result":
+                            outcomes.append(Outcome(*message[1:]))
+                        else:
+                            _, label, steps, total = message
+                            progress = f" after {steps:,} {label}"
+                            await report(label, steps, total)
+                    return Outcomes(tuple(outcomes), "")
+                reason = f"the call took longer than {self._limit_s:g} s and was ended{progress}"
+                return Outcomes(
+                    tuple(outcomes), f"{reason}; give less, or start the server with a greater --limit"
+                )
+            except (EOFError, ConnectionError):
+                reason = "the process of this call ended unexpectedly; is there memory enough?"
+                return Outcomes(tuple(outcomes), f"{reason} Other calls are served as before")
+            finally:
+                ours.close()
+                with suppress(AttributeError, ValueError):
+                    process.kill()

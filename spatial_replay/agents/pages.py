@@ -1,0 +1,86 @@
+"""Pages for agents, made of sections of the documentation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from spatial_replay.errors import UsageError
+
+PAGES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "language": "The specification language: statements, objects, relations, operators, quantifiers.",
+        "cookbook": "Specifications for common sentences: order, keep out, hold, respond, visit twice.",
+        "relations": "Each relation in a line, with a picture at spatial://relations/NAME.",
+        "mapping": "Mapping files: which topics of a bag or an external log are objects.",
+        "errors": "Mistakes in specifications, as they look, and how to write what was meant.",
+    }
+)
+"""Descriptions by the names of pages."""
+
+_SECTIONS: Final[Mapping[str, Sequence[tuple[str, Sequence[str]]]]] = MappingProxyType(
+    {
+        "language": (
+            (
+                "language",
+                (
+                    "A first file",
+                    "Statements",
+                    "Objects",
+                    "Relations",
+                    "Operators",
+                    "Quantifiers and templates",
+                ),
+            ),
+        ),
+        "cookbook": (("cookbook", ()),),
+        "relations": (("relations", ()),),
+        "mapping": (("mapping", ("The whole file", "A topic", "A suggested mapping")),),
+        "errors": (("agents", ("Mistakes, as they look",)), ("language", ("Errors and limits",))),
+    }
+)
+"""Sections of pages of the documentation; without any, all of the page."""
+
+_HEADING: Final = re.compile(r"^(#{2,}) (.+)$")
+
+
+def page_text(name: str) -> str:
+    """Return a page as Markdown."""
+    parts = [_sections(_document(f"{source}.md"), headings) for source, headings in _SECTIONS[name]]
+    return "\n".join(parts)
+
+
+def relation_picture(name: str) -> str:
+    """Return the picture of a relation, as SVG."""
+    if not re.fullmatch(r"[a-z]+", name):
+        raise UsageError(f"no relation {name!r:.40}; spatial://relations names them")
+    return _document(f"relations/{name}.svg")
+
+
+def _document(path: str) -> str:
+    """Return a file of the documentation, which wheels have inside the package."""
+    shipped = resources.files(__package__).joinpath("docs", path)
+    source = Path(__file__).parents[2] / "docs" / path
+    try:
+        return shipped.read_text("utf-8") if shipped.is_file() else source.read_text("utf-8")
+    except FileNotFoundError:
+        raise UsageError(f"no page {path!r:.80}; spatial://relations names the relations") from None
+
+
+def _sections(text: str, headings: Sequence[str]) -> str:
+    """Return sections of a page, each without those below it; all of it without headings."""
+    if not headings:
+        return text
+    lines: list[str] = []
+    is_inside = is_code = False
+    for line in text.splitlines():
+        is_code ^= line.startswith("```")
+        if not is_code and (match := _HEADING.match(line)):
+            is_inside = match[2] in headings
+        if is_inside:
+            lines.append(line)
+    return "\n".join(lines) + "\n"
