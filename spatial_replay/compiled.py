@@ -30,7 +30,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache, cached_property
 from itertools import pairwise
 from operator import methodcaller
@@ -276,9 +276,11 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
         task: the one of `spatial-replay warmup` that compiles all kernels of the trial.
         wait: compile in this process instead, before this returns.
     """
+    # once: garbage of a program that starts many monitors is still collected
+    collections = _no_collection() if _process.interprets else nullcontext()
     compile_ahead()
     if _process.only is not None or wait or _is_compiled(task):
-        with _process.loading():
+        with collections, _process.loading():
             trial()
         return
     if _process.folder is None:
@@ -286,7 +288,8 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
     _process.trials.append((task, trial))
     try:
         # interpreted: it imports and keeps all that the first sample would wait for
-        trial()
+        with collections:
+            trial()
     except BaseException:
         _process.trials.remove((task, trial))
         raise
@@ -454,19 +457,19 @@ class _Kernel(Generic[_Arguments, _Result]):
         self._is_elementwise = is_elementwise
         self._compiled: Callable[_Arguments, _Result] | None = None
         self._interpreted: Callable[_Arguments, _Result] | None = None
-        self._is_called = False
+        self._ready: Callable[_Arguments, _Result] | None = None
         self._spent_s = 0.0
         self._element_s: float | None = None
 
     def __call__(self, *arguments: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
-        if self._is_called and self._compiled is not None and _process.only != "interpreted":
-            return self._compiled(*arguments, **named)
+        if (ready := self._ready) is not None and _process.only != "interpreted":
+            return ready(*arguments, **named)
         elements = _CALL + _elements(arguments)
         if not self._may_interpret(elements):
             compiled = self.compiled()
             with _process.compiling(self.__wrapped__):
                 result = compiled(*arguments, **named)
-            self._is_called = True
+            self._ready = compiled
             return result
         run = cast(Callable[..., _Result], self.interpreted())
         begin = time.thread_time()
