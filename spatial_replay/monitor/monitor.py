@@ -780,9 +780,9 @@ class ViolationLog:
             after = numbers[index]
             if after is None:
                 continue
-            if after.item(0, 3) < 0.0 and conjuncts:
+            if conjuncts and after.item(0, 3) < 0.0:
                 self._settle(spec, conjuncts, after)
-            elif after.item(0, 2) >= 0.0 and index in self._unsatisfied:
+            elif index in self._unsatisfied and after.item(0, 2) >= 0.0:
                 del self._unsatisfied[index]
                 whole = Conjunct(0, spec.name, spec.formula)
                 found = self._settled(spec, whole, Verdict.SATISFIED, float(after[0, 2]))

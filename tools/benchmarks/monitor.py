@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import os
 import random
 import subprocess
@@ -88,6 +89,31 @@ def bench_monitor(bench: Any) -> None:
         unit="sample",
         runs=51,
     )
+
+
+def bench_update(bench: Any) -> None:
+    """`Monitor.update` with one atom over a signal, and with the 27 nodes of block pushing."""
+    signal = [sr.Sample(k * 1_000_000, signals={"p": math.sin(0.7 * k)}) for k in range(10_000)]
+    cases = {"one atom": (sr.parse_specification("H[0,10] p >= 0"), signal)}
+    if (blocks := _blocks()) is not None:
+        specification, recorded = blocks
+        cases["27 nodes"] = (
+            specification,
+            [sr.Sample(k * 33_333_333, recorded[k % len(recorded)].objects) for k in range(10_000)],
+        )
+    turn = 250
+    for name, (specification, samples) in cases.items():
+        monitor = sr.Monitor(specification, wait=True)
+        turns = iter([samples[begin : begin + turn] for begin in range(0, len(samples), turn)])
+        bench.measure(
+            name,
+            lambda some, monitor=monitor: [monitor.update(sample) for sample in some],
+            prepare=lambda turns=turns: next(turns),
+            per=turn,
+            unit="sample",
+            runs=len(samples) // turn - 4,
+            warmups=4,
+        )
 
 
 _CROWD = """\

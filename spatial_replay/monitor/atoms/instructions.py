@@ -163,9 +163,9 @@ TILE = 128
 
 
 @inlined
-def _copy_to(source: Floats, row: int, begin: int, count: int, columns: Floats, target: int) -> None:
+def _copy_to(source: Floats, begin: int, count: int, columns: Floats, target: int) -> None:
     for k in range(count):
-        columns[target, k] = source[row, begin + k]
+        columns[target, k] = source[begin + k]
 
 
 @inlined
@@ -191,13 +191,20 @@ def run_instructions(
     begin: int,
     end: int,
 ) -> None:
-    """Run the instructions over some samples; leaf j is what instruction outputs[j] gives."""
-    channels = leaves.shape[0]
-    columns = np.empty((code.shape[0] * channels, min(TILE, end - begin)))
+    """Run the instructions over some samples; leaf j is what instruction outputs[j] gives.
+
+    Args:
+        code: four numbers for each instruction.
+        values, spreads, signals, closest, members: row after row of T numbers; four rows a closest pair.
+        leaves: (C, A, T), receives them.
+    """
+    channels, total, instructions = leaves.shape[0], leaves.shape[2], len(code) // 4
+    columns = np.empty((instructions * channels, min(TILE, end - begin)))
     for t in range(begin, end, TILE):
         count = min(TILE, end - t)
-        for i in range(code.shape[0]):
-            op, a, b, c = code[i, 0], code[i, 1], code[i, 2], code[i, 3]
+        for i in range(instructions):
+            op, a, b, c = code[4 * i], code[4 * i + 1], code[4 * i + 2], code[4 * i + 3]
+            row, member = a * total + t, c * total + t
             for channel in range(channels):
                 mirror = channel ^ 1 if channels > 1 else channel
                 # rows by their numbers: a slice of an array takes as long as ten samples
@@ -209,17 +216,17 @@ def run_instructions(
                         columns[target, k] = constants[a]
                 elif op == MEASURED:
                     sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
-                    _copy_to(values, a, t, count, columns, target)
+                    _copy_to(values, row, count, columns, target)
                     if sign:
                         for k in range(count):
-                            columns[target, k] += sign * spreads[a, t + k]
+                            columns[target, k] += sign * spreads[row + k]
                 elif op == SIGNAL:
                     for k in range(count):
-                        value = signals[a, t + k]
+                        value = signals[row + k]
                         columns[target, k] = np.nan if -np.inf < value <= TEXTS else value
                 elif op == CLOSEST:
                     for k in range(count):
-                        columns[target, k] = closest[a, channel, t + k]
+                        columns[target, k] = closest[(4 * a + channel) * total + t + k]
                 elif op == ADD:
                     for k in range(count):
                         columns[target, k] = columns[first, k] + columns[second, k]
@@ -247,7 +254,7 @@ def run_instructions(
                         columns[target, k] = min(columns[first, k], columns[second, k])
                 elif op == EQUAL:
                     for k in range(count):
-                        value = signals[a, t + k]
+                        value = signals[row + k]
                         equal = np.inf if value == constants[b] else -np.inf
                         is_alike = value == value and (value <= TEXTS) == (constants[b] <= TEXTS)
                         columns[target, k] = equal if is_alike else np.nan
@@ -272,9 +279,9 @@ def run_instructions(
                     for k in range(count):
                         value = columns[second, k]
                         # unknown membership: the body may or may not count, so its interval is all reals
-                        if members[c, t + k] < 0:
+                        if members[member + k] < 0:
                             value = np.inf if channel % 2 else -np.inf
-                        if members[c, t + k] == 0:
+                        if members[member + k] == 0:
                             columns[target, k] = columns[first, k]
                         elif op == AND_MEMBER:
                             columns[target, k] = min(columns[first, k], value)

@@ -170,229 +170,324 @@ class PackedPlan(NamedTuple):
         return cls(np.concatenate(whole), np.concatenate(real), room)
 
 
+class PlanPlaces(NamedTuple):
+    """Where the arrays of a plan begin in `PackedPlan.whole` and `PackedPlan.real`, and counts of them.
+
+    Kernels count references to arrays, also to those in tuples; numbers cost nothing.
+
+    Attributes:
+        samples, regions, places, signals, coded: the extent.
+        parts, corners: of all regions.
+    """
+
+    samples: int
+    regions: int
+    places: int
+    signals: int
+    coded: int
+    parts: int
+    corners: int
+    operands: int
+    geometric_count: int
+    yaw_count: int
+    pairs: int
+    groups: int
+    region_parts: int
+    region_sizes: int
+    region_radius: int
+    region_vertices: int
+    region_heights: int
+    listed_start: int
+    listed_rows: int
+    listed_classes: int
+    enlargement: int
+    geometric: int
+    quantity: int
+    first: int
+    second: int
+    yaws: int
+    closest_enlargement: int
+    is_group: int
+    code: int
+    code_end: int
+    constants: int
+    constants_end: int
+    outputs: int
+    outputs_end: int
+
+
 @inlined
-def plan_at(whole: Integers, real: Floats) -> PlanArrays:
-    """Return the arrays of a plan."""
-    return PlanArrays(
-        extent=whole[whole[0] : whole[1]],
-        region_parts=whole[whole[2] : whole[3]],
-        region_sizes=whole[whole[4] : whole[5]],
-        region_radius=real[whole[6] : whole[7]],
-        region_vertices=real[whole[8] : whole[9]],
-        region_heights=real[whole[10] : whole[11]].reshape((-1, 2)),
-        listed_start=whole[whole[12] : whole[13]],
-        listed_rows=whole[whole[14] : whole[15]],
-        listed_classes=whole[whole[16] : whole[17]],
-        enlargement=real[whole[18] : whole[19]],
-        geometric=whole[whole[20] : whole[21]],
-        quantity=whole[whole[22] : whole[23]],
-        first=whole[whole[24] : whole[25]],
-        second=whole[whole[26] : whole[27]],
-        yaws=whole[whole[28] : whole[29]].reshape((-1, 3)),
-        closest_enlargement=real[whole[30] : whole[31]],
-        is_group=whole[whole[32] : whole[33]],
-        code=whole[whole[34] : whole[35]].reshape((-1, 4)),
-        constants=real[whole[36] : whole[37]],
-        outputs=whole[whole[38] : whole[39]],
+def _plan_at(whole: Integers) -> PlanPlaces:
+    extent = whole[0]
+    return PlanPlaces(
+        samples=whole[extent],
+        regions=whole[extent + 1],
+        places=whole[extent + 2],
+        signals=whole[extent + 3],
+        coded=whole[extent + 4],
+        parts=whole[7] - whole[6],
+        corners=(whole[9] - whole[8]) // 2,
+        operands=whole[19] - whole[18],
+        geometric_count=whole[21] - whole[20],
+        yaw_count=(whole[29] - whole[28]) // 3,
+        pairs=whole[31] - whole[30],
+        groups=whole[33] - whole[32],
+        region_parts=whole[2],
+        region_sizes=whole[4],
+        region_radius=whole[6],
+        region_vertices=whole[8],
+        region_heights=whole[10],
+        listed_start=whole[12],
+        listed_rows=whole[14],
+        listed_classes=whole[16],
+        enlargement=whole[18],
+        geometric=whole[20],
+        quantity=whole[22],
+        first=whole[24],
+        second=whole[26],
+        yaws=whole[28],
+        closest_enlargement=whole[30],
+        is_group=whole[32],
+        code=whole[34],
+        code_end=whole[35],
+        constants=whole[36],
+        constants_end=whole[37],
+        outputs=whole[38],
+        outputs_end=whole[39],
     )
 
 
-class SampleRows(NamedTuple):
-    """The rows of a plan in one sample, as `measure_rows` takes them, with the class code of each.
+class RowPlaces(NamedTuple):
+    """Where the rows of a plan begin in one sample's numbers, as `measure_rows` takes them.
 
     Attributes:
+        rows, parts, corners: how many there are.
+        classes: the class code of each row.
         yaw, uncertainty: of each row; NaN and 0 for samples and regions.
         edges: (V, 4), room for `measure_rows`.
     """
 
-    classes: Integers
-    part_start: Integers
-    vertex_start: Integers
-    vertices: Floats
-    radius: Floats
-    bottom: Floats
-    top: Floats
-    yaw: Floats
-    uncertainty: Floats
-    edges: Floats
+    rows: int
+    parts: int
+    corners: int
+    classes: int
+    part_start: int
+    vertex_start: int
+    vertices: int
+    radius: int
+    bottom: int
+    top: int
+    yaw: int
+    uncertainty: int
+    edges: int
 
 
 @inlined
-def _places_at(plan: PlanArrays) -> int:
-    """Return where the numbers of the objects begin in those of a sample."""
-    return int(plan.extent[0] + plan.extent[3] + plan.extent[4])
-
-
-@inlined
-def _rows_of_sample(plan: PlanArrays, sample: Floats, room: Floats) -> SampleRows:
-    """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
-    samples, regions, places = plan.extent[0], plan.extent[1], plan.extent[2]
-    here, rows = samples + regions, samples + regions + places
-    parts, corners, at = len(plan.region_radius), len(plan.region_vertices) // 2, _places_at(plan)
-    for _ in range(places):
-        own = max(int(sample[at + PARTS]), 0)
+def _rows_at(plan: PlanPlaces, sample: Floats, begin: int) -> RowPlaces:
+    """Return the places of the rows of a sample in the room that begins there."""
+    rows = plan.samples + plan.regions + plan.places
+    parts, corners, at = plan.parts, plan.corners, plan.samples + plan.signals + plan.coded
+    for _ in range(plan.places):
+        number = max(int(sample[at + PARTS]), 0)
         at += _OF_OBJECT
-        parts += own
-        for _ in range(own):
-            count = int(sample[at])
-            at += _OF_PART + 2 * count
-            corners += count
-    starts, heights = rows, 4 * rows + parts
-    real, whole = room[: heights + 6 * corners], room[heights + 6 * corners :].view(np.int64)
-    made = SampleRows(
-        classes=whole[:rows],
-        part_start=whole[starts : starts + rows + 1],
-        vertex_start=whole[starts + rows + 1 : starts + rows + parts + 2],
-        vertices=real[heights : heights + 2 * corners].reshape((corners, 2)),
-        radius=real[4 * rows : heights],
-        bottom=real[:rows],
-        top=real[rows : 2 * rows],
-        yaw=real[2 * rows : 3 * rows],
-        uncertainty=real[3 * rows : 4 * rows],
-        edges=real[heights + 2 * corners :].reshape((corners, 4)),
+        parts += number
+        for _ in range(number):
+            of_part = int(sample[at])
+            at += _OF_PART + 2 * of_part
+            corners += of_part
+    vertices = begin + 4 * rows + parts
+    classes = vertices + 6 * corners
+    return RowPlaces(
+        rows=rows,
+        parts=parts,
+        corners=corners,
+        classes=classes,
+        part_start=classes + rows,
+        vertex_start=classes + 2 * rows + 1,
+        vertices=vertices,
+        radius=begin + 4 * rows,
+        bottom=begin,
+        top=begin + rows,
+        yaw=begin + 2 * rows,
+        uncertainty=begin + 3 * rows,
+        edges=vertices + 2 * corners,
     )
-    made.part_start[0] = made.vertex_start[0] = 0
-    for k in range(here):
-        made.classes[k] = int(sample[k]) if k < samples else 0
-        made.part_start[k + 1] = made.part_start[k]
-        made.bottom[k] = made.top[k] = made.yaw[k] = np.nan
-        made.uncertainty[k] = 0.0
-    for k in range(regions):
-        made.part_start[samples + k + 1] = made.part_start[samples + k] + plan.region_parts[k]
-        made.bottom[samples + k], made.top[samples + k] = plan.region_heights[k, 0], plan.region_heights[k, 1]
-    part = len(plan.region_radius)
-    for p in range(part):
-        made.vertex_start[p + 1] = made.vertex_start[p] + plan.region_sizes[p]
-        made.radius[p] = plan.region_radius[p]
-    for v in range(len(plan.region_vertices) // 2):
-        made.vertices[v, 0], made.vertices[v, 1] = (
-            plan.region_vertices[2 * v],
-            plan.region_vertices[2 * v + 1],
-        )
-    at, codes_at = _places_at(plan), samples + plan.extent[3]
-    for row in range(here, rows):
-        own = max(int(sample[at + PARTS]), 0)
-        made.classes[row] = int(sample[codes_at + row - here]) if plan.extent[4] > 0 else 0
+
+
+@inlined
+def _fill_rows(
+    plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers
+) -> None:
+    """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
+    samples, before = plan.samples, plan.samples + plan.regions
+    lists[rows.part_start] = lists[rows.vertex_start] = 0
+    for k in range(before):
+        lists[rows.classes + k] = int(sample[k]) if k < samples else 0
+        parts = 0 if k < samples else whole[plan.region_parts + k - samples]
+        lists[rows.part_start + k + 1] = lists[rows.part_start + k] + parts
+        height = plan.region_heights + 2 * (k - samples)
+        sample[rows.bottom + k] = np.nan if k < samples else real[height]
+        sample[rows.top + k] = np.nan if k < samples else real[height + 1]
+        sample[rows.yaw + k], sample[rows.uncertainty + k] = np.nan, 0.0
+    for p in range(plan.parts):
+        lists[rows.vertex_start + p + 1] = lists[rows.vertex_start + p] + whole[plan.region_sizes + p]
+        sample[rows.radius + p] = real[plan.region_radius + p]
+    for k in range(2 * plan.corners):
+        sample[rows.vertices + k] = real[plan.region_vertices + k]
+    part, codes_at = plan.parts, samples + plan.signals
+    at = codes_at + plan.coded
+    for row in range(before, rows.rows):
+        number = max(int(sample[at + PARTS]), 0)
+        lists[rows.classes + row] = int(sample[codes_at + row - before]) if plan.coded > 0 else 0
         if sample[at + PARTS] == 0.0:
-            made.classes[row] = ABSENT
-        made.part_start[row + 1] = part + own
-        made.bottom[row], made.top[row] = sample[at + BOTTOM], sample[at + TOP]
-        made.yaw[row], made.uncertainty[row] = sample[at + YAW], sample[at + UNCERTAINTY]
+            lists[rows.classes + row] = ABSENT
+        lists[rows.part_start + row + 1] = part + number
+        sample[rows.bottom + row], sample[rows.top + row] = sample[at + BOTTOM], sample[at + TOP]
+        sample[rows.yaw + row], sample[rows.uncertainty + row] = sample[at + YAW], sample[at + UNCERTAINTY]
         at += _OF_OBJECT
-        for p in range(part, part + own):
-            start, count = made.vertex_start[p], int(sample[at])
-            made.radius[p] = sample[at + 1]
+        for p in range(part, part + number):
+            start, count = lists[rows.vertex_start + p], int(sample[at])
+            sample[rows.radius + p] = sample[at + 1]
             at += _OF_PART
-            for v in range(start, start + count):
-                made.vertices[v, 0], made.vertices[v, 1] = sample[at], sample[at + 1]
-                at += 2
-            made.vertex_start[p + 1] = start + count
-        part += own
-    return made
+            for k in range(2 * count):
+                sample[rows.vertices + 2 * start + k] = sample[at + k]
+            at += 2 * count
+            lists[rows.vertex_start + p + 1] = start + count
+        part += number
 
 
 @inlined
-def _is_there(classes: Integers, row: int, wanted: int) -> bool:
-    return classes[row] != ABSENT and wanted in (ANY, classes[row])
+def _is_there(lists: Integers, classes: int, row: int, wanted: int) -> bool:
+    return lists[classes + row] != ABSENT and wanted in (ANY, lists[classes + row])
 
 
 @inlined
-def _is_hidden(plan: PlanArrays, rows: SampleRows, row: int) -> bool:
+def _is_hidden(plan: PlanPlaces, rows: RowPlaces, lists: Integers, row: int) -> bool:
     """Return whether an object that is there is not known where."""
-    is_place = row >= plan.extent[0] + plan.extent[1]
-    return bool(is_place and rows.part_start[row] == rows.part_start[row + 1])
+    start = rows.part_start + row
+    return bool(row >= plan.samples + plan.regions and lists[start] == lists[start + 1])
 
 
 @inlined
-def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats, room: Floats) -> None:
-    """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
-    if len(values) == 0:
-        return
-    operands, required = len(plan.enlargement), len(plan.listed_start) - 1 - len(values)
-    of_operands, begin = room[: operands + 1], operands + 1 + len(plan.geometric)
-    measured, lists = room[operands + 1 : begin].reshape((-1, 1)), room[begin:].view(np.int64)
-    widths, hidden, members = lists[:operands], lists[operands : 2 * operands + 1], lists[2 * operands + 1 :]
-    of_operands[operands], hidden[operands] = 0.0, 0  # for no operand, -1
+def _measure(
+    plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
+    values: int, begin: int,
+) -> None:  # fmt: skip
+    """Fill K `values` and the spreads after them, as `measurements.measured` gives them.
+
+    Args:
+        begin: of the room for operands.
+    """
+    operands, count = plan.operands, plan.geometric_count + plan.yaw_count
+    spreads, listed = values + count, plan.listed_start
+    of_operands, measured = begin, begin + operands + 1
+    widths = measured + plan.geometric_count
+    hidden, members = widths + operands, widths + 2 * operands + 1
+    sample[of_operands + operands], lists[hidden + operands] = 0.0, 0  # for no operand, -1
     for operand in range(operands):
-        begin, end = plan.listed_start[operand], plan.listed_start[operand + 1]
-        widths[operand], hidden[operand], spread = end - begin, 0, 0.0
-        for k in range(begin, end):
-            row, members[k] = plan.listed_rows[k], ABSENT
-            if not _is_there(rows.classes, row, plan.listed_classes[k]):
+        first, last = whole[listed + operand], whole[listed + operand + 1]
+        lists[widths + operand], lists[hidden + operand], spread = last - first, 0, 0.0
+        for k in range(first, last):
+            row, lists[members + k] = whole[plan.listed_rows + k], ABSENT
+            if not _is_there(lists, rows.classes, row, whole[plan.listed_classes + k]):
                 continue
-            if _is_hidden(plan, rows, row):
-                hidden[operand] = 1
+            if _is_hidden(plan, rows, lists, row):
+                lists[hidden + operand] = 1
             else:
-                members[k] = row
-                spread = max(spread, rows.uncertainty[row])
-        of_operands[operand] = spread
+                lists[members + k] = row
+                spread = max(spread, sample[rows.uncertainty + row])
+        sample[of_operands + operand] = spread
     # a literal 0 has a type of its own, for which all of it would be compiled once more
-    for sample in range(1):
-        measure_rows(
-            rows.part_start, rows.vertex_start, rows.vertices, rows.radius, rows.bottom, rows.top,
-            members, plan.listed_start, widths, plan.enlargement, plan.quantity, plan.first, plan.second,
-            rows.edges, measured, sample, sample + 1,
-        )  # fmt: skip
-    for g in range(len(plan.geometric)):
-        k = plan.geometric[g]
-        values[k, 0] = np.nan if hidden[plan.first[g]] or hidden[plan.second[g]] else measured[g, 0]
-        spreads[k, 0] = of_operands[plan.first[g]] + of_operands[plan.second[g]]
-    for y in range(len(plan.yaws)):
-        k, a, b = plan.yaws[y, 0], plan.yaws[y, 1], plan.yaws[y, 2]
-        values[k, 0], spreads[k, 0] = misalignment_of(rows.yaw[a], rows.yaw[b]), 0.0
-    for k in range(len(values)):
-        for at in range(plan.listed_start[required + k], plan.listed_start[required + k + 1]):
-            if rows.classes[plan.listed_rows[at]] == ABSENT:
-                values[k, 0] = np.nan
+    zero = min(operands, 0)
+    measure_rows(
+        lists[rows.part_start : rows.part_start + rows.rows + 1],
+        lists[rows.vertex_start : rows.vertex_start + rows.parts + 1],
+        sample[rows.vertices : rows.edges].reshape((-1, 2)),
+        sample[rows.radius : rows.vertices],
+        sample[rows.bottom : rows.top],
+        sample[rows.top : rows.yaw],
+        lists[members : members + whole[listed + operands]],
+        whole[listed : listed + operands + 1],
+        lists[widths:hidden],
+        real[plan.enlargement : plan.enlargement + operands],
+        whole[plan.quantity : plan.quantity + plan.geometric_count],
+        whole[plan.first : plan.first + plan.geometric_count],
+        whole[plan.second : plan.second + plan.geometric_count],
+        sample[rows.edges : rows.classes].reshape((-1, 4)),
+        sample[measured:widths].reshape((-1, 1)),
+        zero,
+        zero + 1,
+    )
+    for g in range(plan.geometric_count):
+        k, a, b = whole[plan.geometric + g], whole[plan.first + g], whole[plan.second + g]
+        a, b = (a, b if b >= 0 else operands)
+        is_hidden = lists[hidden + a] != 0 or lists[hidden + b] != 0
+        sample[values + k] = np.nan if is_hidden else sample[measured + g]
+        sample[spreads + k] = sample[of_operands + a] + sample[of_operands + b]
+    for y in range(plan.yaw_count):
+        at = plan.yaws + 3 * y
+        k, a, b = whole[at], whole[at + 1], whole[at + 2]
+        sample[values + k] = misalignment_of(sample[rows.yaw + a], sample[rows.yaw + b])
+        sample[spreads + k] = 0.0
+    required = listed + operands + plan.pairs + plan.groups
+    for k in range(count):
+        for at in range(whole[required + k], whole[required + k + 1]):
+            if lists[rows.classes + whole[plan.listed_rows + at]] == ABSENT:
+                sample[values + k] = np.nan
 
 
 @inlined
-def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
-    """Fill `closest` (K, 4, 1), as `measurements.leaf_values` computes it."""
-    if len(closest) == 0:
-        return
-    found, operands = np.empty((1, 3)), len(plan.enlargement)
-    for k in range(len(closest)):
-        begin, end = plan.listed_start[operands + k], plan.listed_start[operands + k + 1]
+def _closest(
+    plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
+    closest: int,
+) -> None:  # fmt: skip
+    """Fill `closest` (K, 4), as `measurements.leaf_values` computes it."""
+    nearest = np.empty((1, 3))
+    for k in range(plan.pairs):
+        start = plan.listed_start + plan.operands + k
+        begin, end = whole[start], whole[start + 1]
         members = np.empty((1, end - begin), np.int64)
-        there = hidden = 0
+        present = hidden = 0
         for m in range(begin, end):
-            row, members[0, m - begin] = plan.listed_rows[m], ABSENT
-            if not _is_there(rows.classes, row, plan.listed_classes[m]):
+            row, members[0, m - begin] = whole[plan.listed_rows + m], ABSENT
+            if not _is_there(lists, rows.classes, row, whole[plan.listed_classes + m]):
                 continue
-            there += 1
-            if _is_hidden(plan, rows, row):
+            present += 1
+            if _is_hidden(plan, rows, lists, row):
                 hidden += 1
             else:
                 members[0, m - begin] = row
         closest_rows(
-            rows.part_start,
-            rows.vertex_start,
-            rows.vertices,
-            rows.radius,
-            rows.bottom,
-            rows.top,
+            lists[rows.part_start : rows.part_start + rows.rows + 1],
+            lists[rows.vertex_start : rows.vertex_start + rows.parts + 1],
+            sample[rows.vertices : rows.edges].reshape((-1, 2)),
+            sample[rows.radius : rows.vertices],
+            sample[rows.bottom : rows.top],
+            sample[rows.top : rows.yaw],
             members,
-            rows.uncertainty,
-            plan.closest_enlargement[k],
-            rows.edges,
-            found,
+            sample[rows.uncertainty : rows.radius],
+            real[plan.closest_enlargement + k],
+            sample[rows.edges : rows.classes].reshape((-1, 4)),
+            nearest,
         )
-        closest[k, 0, 0] = closest[k, 1, 0] = found[0, 0]
-        closest[k, 2, 0], closest[k, 3, 0] = found[0, 1], found[0, 2]
-        if hidden > 0 and there > 1:  # it may be anywhere, and so may be the closest
-            closest[k, 0, 0] = closest[k, 2, 0] = -np.inf
+        at = closest + 4 * k
+        sample[at] = sample[at + 1] = nearest[0, 0]
+        sample[at + 2], sample[at + 3] = nearest[0, 1], nearest[0, 2]
+        if hidden > 0 and present > 1:  # it may be anywhere, and so may be the closest
+            sample[at] = sample[at + 2] = -np.inf
 
 
 @inlined
-def _members(plan: PlanArrays, classes: Integers, members: Integers) -> None:
-    """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
-    first = len(plan.enlargement) + len(plan.closest_enlargement)
-    for m in range(len(members)):
-        members[m, 0] = 0 if plan.is_group[m] else 1
-        for k in range(plan.listed_start[first + m], plan.listed_start[first + m + 1]):
-            if not _is_there(classes, plan.listed_rows[k], plan.listed_classes[k]):
-                members[m, 0] = -1 if plan.is_group[m] else 0
+def _members(plan: PlanPlaces, classes: int, whole: Integers, lists: Integers, members: int) -> None:
+    """Fill M `members`: whether each binding is one (1, 0), or that is not known (-1)."""
+    first = plan.listed_start + plan.operands + plan.pairs
+    for m in range(plan.groups):
+        is_group = whole[plan.is_group + m] != 0
+        lists[members + m] = 0 if is_group else 1
+        for k in range(whole[first + m], whole[first + m + 1]):
+            row, wanted = whole[plan.listed_rows + k], whole[plan.listed_classes + k]
+            if not _is_there(lists, classes, row, wanted):
+                lists[members + m] = -1 if is_group else 0
 
 
 @inlined
@@ -403,23 +498,23 @@ def _channels_of(
     channels = 1
     for k in range(len(constants)):
         if -np.inf < constants[k] <= TEXTS:
-            channels = 2
-    for k in range(len(closest)):
-        if closest[k, 2, 0] != closest[k, 0, 0] or closest[k, 3, 0] != closest[k, 1, 0]:
-            return 4
-        if closest[k, 0, 0] != closest[k, 1, 0]:
-            channels = 2
+            channels = max(channels, 2)
+    for k in range(0, len(closest), 4):
+        if closest[k + 2] != closest[k] or closest[k + 3] != closest[k + 1]:
+            channels = 4
+        elif closest[k] != closest[k + 1]:
+            channels = max(channels, 2)
     for k in range(len(values)):
-        if spreads[k, 0] != 0.0:
-            return 4
-        if not np.isfinite(values[k, 0]):
-            channels = 2
+        if spreads[k] != 0.0:
+            channels = 4
+        elif not np.isfinite(values[k]):
+            channels = max(channels, 2)
     for k in range(len(signals)):
-        if not np.isfinite(signals[k, 0]) or signals[k, 0] <= TEXTS:
-            channels = 2
+        if not np.isfinite(signals[k]) or signals[k] <= TEXTS:
+            channels = max(channels, 2)
     for k in range(len(members)):
-        if members[k, 0] < 0:
-            channels = 2
+        if members[k] < 0:
+            channels = max(channels, 2)
     return channels
 
 
@@ -437,30 +532,33 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
     Returns:
         C, in how many channels they are.
     """
-    plan = plan_at(whole, real)
-    count, groups, pairs = (
-        len(plan.geometric) + len(plan.yaws),
-        len(plan.is_group),
-        len(plan.closest_enlargement),
+    plan, lists = _plan_at(whole), sample.view(np.int64)
+    count = plan.geometric_count + plan.yaw_count
+    # room for the results, then for operands, then for rows: new arrays would take as long as distances
+    closest, members = end + 2 * count, end + 2 * count + 4 * plan.pairs
+    begin = members + plan.groups
+    if count + plan.groups + plan.pairs > 0:  # not signals alone
+        operands = 3 * plan.operands + 2 + plan.geometric_count + whole[plan.listed_start + plan.operands]
+        rows = _rows_at(plan, sample, begin + operands)
+        _fill_rows(plan, rows, whole, real, sample, lists)
+        _members(plan, rows.classes, whole, lists, members)
+        if plan.pairs > 0:
+            _closest(plan, rows, whole, real, sample, lists, closest)
+        if count > 0:
+            _measure(plan, rows, whole, real, sample, lists, end, begin)
+    values, spreads = sample[end : end + count], sample[end + count : closest]
+    signals = sample[plan.samples : plan.samples + plan.signals]
+    of_pairs, of_members, constants = (
+        sample[closest:members],
+        lists[members:begin],
+        real[plan.constants : plan.constants_end],
     )
-    room = sample[end:]  # a new array would take as long as a distance
-    values, spreads = room[:count].reshape((-1, 1)), room[count : 2 * count].reshape((-1, 1))
-    closest = room[2 * count : 2 * count + 4 * pairs].reshape((-1, 4, 1))
-    members = room[2 * count + 4 * pairs : 2 * count + 4 * pairs + groups].view(np.int64).reshape((-1, 1))
-    if count + groups + pairs > 0:  # not signals alone
-        begin, operands = 2 * count + 4 * pairs + groups, len(plan.enlargement)
-        after = begin + 3 * operands + 2 + len(plan.geometric) + plan.listed_start[operands]
-        rows = _rows_of_sample(plan, sample, room[after:])
-        _members(plan, rows.classes, members)
-        _closest(plan, rows, closest)
-        _measure(plan, rows, values, spreads, room[begin:after])
-    signals = sample[plan.extent[0] : plan.extent[0] + plan.extent[3]].reshape((-1, 1))
-    channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
-    for t in range(1):  # as in `_measure`
-        run_instructions(
-            plan.code, plan.constants, values, spreads, signals, closest, members, plan.outputs,
-            leaves[:channels], t, t + 1,
-        )  # fmt: skip
+    channels = _channels_of(values, spreads, signals, of_pairs, of_members, constants)
+    zero = min(count, 0)  # as in `_measure`
+    run_instructions(
+        whole[plan.code : plan.code_end], constants, values, spreads, signals, of_pairs, of_members,
+        whole[plan.outputs : plan.outputs_end], leaves[:channels], zero, zero + 1,
+    )  # fmt: skip
     return channels
 
 
@@ -468,35 +566,42 @@ class SampleRoom:
     """The newest sample of a stream, as kernels take it; the next one takes its place.
 
     Attributes:
-        whole, real: of the plan that it fits into.
-        numbers, end: what `measure_sample` takes as `sample`.
+        arguments: those of `measure_sample`.
         leaves: (MOST_CHANNELS, A, 1), once they are measured.
         channels: in how many of them the leaves differ; 0 until they are measured.
     """
 
-    __slots__ = ("_bytes", "channels", "end", "leaves", "numbers", "real", "whole")
+    __slots__ = ("_bytes", "_length", "_numbers", "_plan", "arguments", "channels", "leaves")
 
     def __init__(self, leaves: int) -> None:
-        self.whole, self.real = np.zeros(0, np.int64), np.zeros(0)
         self.leaves, self.channels = np.empty((MOST_CHANNELS, leaves, 1)), 0
-        self._bytes, self.end = bytearray(), 0
+        self.arguments: tuple[Integers, Floats, Floats, int, Floats]
+        self._plan: PackedPlan | None = None
+        self._length = -1
+        self._bytes, self._numbers = bytearray(), np.empty(0)
 
     def fill(self, plan: PackedPlan, layout: Struct, numbers: Sequence[float], objects: list[bytes]) -> None:
         """Take the next sample: a plan for it, its numbers, and the packed objects of its places."""
-        self.whole, self.real, self.channels = plan.whole, plan.real, 0
         packed = b"".join(objects)
-        begin, end = layout.size, layout.size + len(packed)
-        size = end + 8 * plan.room + 3 * len(packed)
+        if plan is not self._plan or len(packed) != self._length:
+            self._fit(plan, layout.size, len(packed))
+        layout.pack_into(self._bytes, 0, *numbers)
+        if packed:
+            self._bytes[layout.size : layout.size + len(packed)] = packed
+        self.channels = 0
+
+    def _fit(self, plan: PackedPlan, begin: int, length: int) -> None:
+        """Have room for objects of some length, in bytes."""
+        self._plan, self._length = plan, length
+        size = begin + 4 * length + 8 * plan.room
         if size > len(self._bytes):
             self._bytes = bytearray(2 * size)
-            self.numbers = np.frombuffer(self._bytes)
-        layout.pack_into(self._bytes, 0, *numbers)
-        self._bytes[begin:end] = packed
-        self.end = end >> 3
+            self._numbers = np.frombuffer(self._bytes)
+        self.arguments = plan.whole, plan.real, self._numbers, (begin + length) // 8, self.leaves
 
     def measure(self) -> Floats:
         """Return the leaves of the sample, (C, A, 1)."""
-        self.channels = measure_sample(self.whole, self.real, self.numbers, self.end, self.leaves)
+        self.channels = measure_sample(*self.arguments)
         return self.leaves[: self.channels]
 
 
@@ -678,6 +783,9 @@ class LeafPlan:
             else:
                 numbers.append(_signal(signal, newest, reports))
         packed: list[bytes] = []
+        if not self._places:
+            room.fill(self.packed, self._layout, numbers, packed)
+            return
         lookups = [newest.objects.get]
         if len(samples) > 1:
             lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
@@ -866,7 +974,7 @@ class SampleLeaves:
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        samples = self.look_at(sample)
+        samples = self.look_at(sample) if self._looks_back else (sample,)
         plan, stands_for = self._only_plan, _NOTHING
         if plan is None:
             plan, stands_for = self._fitting_plan(samples)

@@ -168,7 +168,8 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     is_sure = (scene.is_sure or not spreads.any()) and (closest[:, :2] == closest[:, 2:]).all()
     channels = 4 if not is_sure else 1 if is_known else 2
     result = np.empty((channels, len(outputs), count))
-    arguments = rows, constants, values, spreads, signals, closest, members, outputs, result
+    columns = (of_kind.reshape(-1) for of_kind in (values, spreads, signals, closest, members))
+    arguments = rows.reshape(-1), constants, *columns, outputs, result
     over_cores(
         run_instructions,
         lambda begin, end: run_instructions(*arguments, begin, end),

@@ -424,7 +424,7 @@ class OnlineRun:
         phases = BEGIN if self._open else BEGIN | FINISH
         while True:
             room.channels = channels = run_sample(
-                room.whole, room.real, room.numbers, room.end, room.leaves, *self._arrays, numbers,
+                *room.arguments, *self._arrays, numbers,
                 room.channels, first_leaf, time_ns, position, begin, self._start_ns, self._channels, phases,
             )  # fmt: skip
             if channels > self._channels:
