@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -128,6 +128,22 @@ class EpisodeReading(NamedTuple):
 AS_STORED: Final = EpisodeReading()
 
 
+class Run(NamedTuple):
+    """An episode while it is read.
+
+    Attributes:
+        group: what `DataSet.open_episode` gives.
+        arrays: by name, those without numbers left out.
+        label: the name of the label.
+    """
+
+    episode: Episode
+    group: Any
+    arrays: Mapping[str, Floats]
+    reading: EpisodeReading = AS_STORED
+    label: str | None = None
+
+
 class DataSet:
     """A robot-learning data set: a folder or a file with episodes, whose arrays have names.
 
@@ -177,13 +193,10 @@ class DataSet:
             UsageError: no such episode, or the mapping has to say something, such as `fps`.
             LogError: the data cannot be read.
         """
-        episode = self.episode(number)
         names = [feature.name for feature in self.features if feature.width] if features is None else features
-        with self.open_episode(episode) as group:
-            arrays = self.read(group, {*names, *self.always_read, *self._label_names(reading)})
-            count = self.count_states(episode, group, arrays)
-            columns = self.poses(episode, group, arrays, count, reading)
-            success = self._success(episode, group, arrays, count, reading)
+        with self._open_run(number, names, reading) as run:
+            arrays, count = run.arrays, self.count_states(run)
+            columns, success = self.poses(run, count), self._success(run, count)
         values, remarks = dict[str, Floats](), list(columns.remarks)
         for name in names:
             if name in arrays and len(arrays[name]) in (count, count - 1):
@@ -199,11 +212,16 @@ class DataSet:
         Raises:
             UsageError, LogError: see `columns`.
         """
+        with self._open_run(number, (), reading) as run:
+            return self._success(run, self.count_states(run))
+
+    @contextmanager
+    def _open_run(self, number: int, names: Iterable[str], reading: EpisodeReading) -> Iterator[Run]:
         episode = self.episode(number)
         with self.open_episode(episode) as group:
-            arrays = self.read(group, {*self.always_read, *self._label_names(reading)})
-            count = self.count_states(episode, group, arrays)
-            return self._success(episode, group, arrays, count, reading)
+            label = reading.label or (self.label.field if self.label else None)
+            arrays = self.read(group, {*names, *self.always_read, *([] if label is None else [label])})
+            yield Run(episode, group, arrays, reading, label)
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[Any]:
         """Return what the arrays of an episode are read from, as a context.
@@ -217,40 +235,32 @@ class DataSet:
         """Return the arrays of some names, (T,) or (T, W) each; those without numbers are left out."""
         raise NotImplementedError
 
-    def count_states(self, episode: Episode, group: Any, arrays: Mapping[str, Floats]) -> int:
+    def count_states(self, run: Run) -> int:
         """Return the number of states; an array of steps may have one row less."""
         raise NotImplementedError
 
-    def poses(
-        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
-    ) -> EpisodeColumns:
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
         """Return the times of all states, with bodies and messages."""
         frames: Integers = np.arange(count, dtype=np.int64)
-        return EpisodeColumns(frame_times_ns(frames, self.required_fps(reading)))
+        return EpisodeColumns(frame_times_ns(frames, self.required_fps(run.reading)))
 
-    def whole_label(self, episode: Episode, group: Any, label: str) -> bool | None:
+    def whole_label(self, run: Run, label: str) -> bool | None:
         """Return the label of an episode that has no array of labels; None without one."""
         return None
 
-    def _label_names(self, reading: EpisodeReading) -> list[str]:
-        name = reading.label or (self.label.field if self.label else None)
-        return [] if name is None else [name]
-
-    def _success(
-        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
-    ) -> Booleans | None:
+    def _success(self, run: Run, count: int) -> Booleans | None:
         """Return the label of an episode: of each state, or of all; None without one."""
-        for label in self._label_names(reading):
-            if label in arrays:
-                return _success_of_states(arrays[label], count, f"{self.name}: {label}")
-            value = self.whole_label(episode, group, label)
-            if value is not None:
-                return np.array(value)
-            if reading.label is not None and self.feature(label) is None:
-                names = [feature.name for feature in self.features]
-                hint = nearest_hint(label, names) or f"it has {listed(names)}"
-                raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
-        return None
+        label = run.label
+        if label is None:
+            return None
+        if label in run.arrays:
+            return _success_of_states(run.arrays[label], count, f"{self.name}: {label}")
+        value = self.whole_label(run, label)
+        if value is None and run.reading.label is not None and self.feature(label) is None:
+            names = [feature.name for feature in self.features]
+            hint = nearest_hint(label, names) or f"it has {listed(names)}"
+            raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
+        return None if value is None else np.array(value)
 
     def shared_files(self) -> list[Path]:
         """Return the files that every episode depends on: all of them, unless the format knows better."""

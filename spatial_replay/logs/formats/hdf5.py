@@ -20,9 +20,9 @@ from spatial_replay.logs.formats.episodes import (
     DataSet,
     Episode,
     EpisodeColumns,
-    EpisodeReading,
     Feature,
     Label,
+    Run,
     frame_times_ns,
     integer_or_none,
     natural_key,
@@ -77,12 +77,10 @@ class InGroups(DataSet):
 
     @contextmanager
     def open_episode(self, episode: Episode) -> Iterator[Group]:
-        """See `DataSet.open_episode`."""
         with open_archive(self.archive) as file:
             yield file.episode(f"{self.folder}/{episode.key}", f"{self.name}#{episode.number}")
 
     def read(self, group: Group, names: AbstractSet[str]) -> dict[str, Floats]:
-        """See `DataSet.read`."""
         arrays = {name: group.array(self.array_path(name)) for name in names}
         return {
             name: numbers(array) for name, array in arrays.items() if array is not None and width_of(array)
@@ -92,9 +90,9 @@ class InGroups(DataSet):
         """Return the path of a feature in the group of an episode."""
         return name
 
-    def whole_label(self, episode: Episode, group: Group, label: str) -> bool | None:
+    def whole_label(self, run: Run, label: str) -> bool | None:
         """See `DataSet.whole_label`: an attribute."""
-        value = group.attribute(label)
+        value = run.group.attribute(label)
         return None if value is None else bool(value)
 
 
@@ -120,7 +118,7 @@ class _Demonstrations(InGroups):
             self._describe(home, number, key) for number, key in zip(places, keys, strict=True)
         )
         first = file.episode(f"{self.folder}/{keys[0]}", f"{self.name}#{places[0]}")
-        rows = self.count_states(self.episodes[0], first, {})
+        rows = self.count_states(Run(self.episodes[0], first, {}))
         self.features = tuple(
             Feature(name, (), width_of(array))
             for name, array in first.arrays()
@@ -233,47 +231,37 @@ class _ManiSkill(_Demonstrations):
             yield "env_states has no actors by name; name objects by `features:`"
 
     def describe(self, home: Group, number: int, key: str) -> Episode:
-        """See `_Demonstrations.describe`."""
         row = self._rows.get(key, {})
         seed, steps = integer_or_none(row.get("episode_seed")), integer_or_none(row.get("elapsed_steps"))
         return Episode(number, key, None if steps is None else steps + 1, self.task, seed)
 
-    def count_states(self, episode: Episode, group: Group, arrays: Mapping[str, Floats]) -> int:
-        """See `DataSet.count_states`."""
+    def count_states(self, run: Run) -> int:
         for folder in ("env_states", "obs"):
-            states, whole = group.group(folder), group.array(folder)
+            states, whole = run.group.group(folder), run.group.array(folder)
             first = whole if states is None else next((array for _, array in states.arrays()), None)
             if first is not None and first.shape:
                 return row_count(first)
-        place = f"{self.name}#{episode.number}"
+        place = f"{self.name}#{run.episode.number}"
         raise LogError(f"{place} has neither env_states nor obs; record with `record_env_state=True`")
 
-    def poses(
-        self,
-        episode: Episode,
-        group: Group,
-        arrays: Mapping[str, Floats],
-        count: int,
-        reading: EpisodeReading,
-    ) -> EpisodeColumns:
-        """See `DataSet.poses`."""
-        folder, times_ns = "env_states/actors", super().poses(episode, group, arrays, count, reading).times_ns
-        actors = group.group(folder)
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
+        folder, times_ns = "env_states/actors", super().poses(run, count).times_ns
+        actors = run.group.group(folder)
         bodies = [
             _body(
-                group.array(f"{folder}/{name}"),
+                run.group.array(f"{folder}/{name}"),
                 name,
-                f"{self.name}#{episode.number}: {folder}/{name}",
-                reading.order or "wxyz",
+                f"{self.name}#{run.episode.number}: {folder}/{name}",
+                run.reading.order or "wxyz",
             )
             for name in (actors.names if actors is not None else ())
         ]
         return EpisodeColumns(times_ns, bodies=tuple(bodies))
 
-    def whole_label(self, episode: Episode, group: Group, label: str) -> bool | None:
+    def whole_label(self, run: Run, label: str) -> bool | None:
         """See `DataSet.whole_label`: an attribute, or a key of the JSON file."""
-        value = super().whole_label(episode, group, label)
-        row = self._rows.get(episode.key, {})
+        value = super().whole_label(run, label)
+        row = self._rows.get(run.episode.key, {})
         return row["success"] if value is None and isinstance(row.get("success"), bool) else value
 
 
@@ -318,9 +306,8 @@ class _IsaacLab(_Demonstrations):
         bodies = None if first is None else first.group(_BODIES)
         return bodies is not None and bool(bodies.names)
 
-    def count_states(self, episode: Episode, group: Group, arrays: Mapping[str, Floats]) -> int:
-        """See `DataSet.count_states`."""
-        place, bodies = f"{self.name}#{episode.number}", group.group(_BODIES)
+    def count_states(self, run: Run) -> int:
+        place, bodies = f"{self.name}#{run.episode.number}", run.group.group(_BODIES)
         if bodies is None or not bodies.names:
             raise LogError(f"{place} has no {_BODIES}; record with the recorder of states")
         poses = bodies.array(f"{bodies.names[0]}/root_pose")
@@ -328,18 +315,10 @@ class _IsaacLab(_Demonstrations):
             raise LogError(f"{place}: {_BODIES}/{bodies.names[0]} has no root_pose")
         return row_count(poses)
 
-    def poses(
-        self,
-        episode: Episode,
-        group: Group,
-        arrays: Mapping[str, Floats],
-        count: int,
-        reading: EpisodeReading,
-    ) -> EpisodeColumns:
-        """See `DataSet.poses`."""
-        times_ns = super().poses(episode, group, arrays, count, reading).times_ns
-        order, bodies = reading.order or self._decide_order(), []
-        for name, place, poses in self._bodies_in(episode, group):
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
+        times_ns = super().poses(run, count).times_ns
+        order, bodies = run.reading.order or self._decide_order(), []
+        for name, place, poses in self._bodies_in(run.episode, run.group):
             body = _body(poses, name, place, order)
             if len(body.positions) != count:
                 rows = len(body.positions)
@@ -430,30 +409,21 @@ class _Robosuite(_Demonstrations):
         first = _first_group(file.group("data"), "demo_")
         return first is not None and first.array("states") is not None
 
-    def count_states(self, episode: Episode, group: Group, arrays: Mapping[str, Floats]) -> int:
-        """See `DataSet.count_states`."""
-        states = group.array("states")
+    def count_states(self, run: Run) -> int:
+        states = run.group.array("states")
         if states is None:
-            raise LogError(f"{self.name}#{episode.number} has no states")
+            raise LogError(f"{self.name}#{run.episode.number} has no states")
         return row_count(states)
 
-    def poses(
-        self,
-        episode: Episode,
-        group: Group,
-        arrays: Mapping[str, Floats],
-        count: int,
-        reading: EpisodeReading,
-    ) -> EpisodeColumns:
-        """See `DataSet.poses`."""
-        place = f"{self.name}#{episode.number}"
-        if reading.model is not None:
-            model = model_from_file(reading.model, reading.assets)
-        elif xml := group.text("model_file"):
-            model = model_from_xml(xml, f"the model_file of {self.name}", reading.assets)
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
+        place = f"{self.name}#{run.episode.number}"
+        if run.reading.model is not None:
+            model = model_from_file(run.reading.model, run.reading.assets)
+        elif xml := run.group.text("model_file"):
+            model = model_from_xml(xml, f"the model_file of {self.name}", run.reading.assets)
         else:
             raise UsageError(f"{place} has no model_file; give the MuJoCo model by `model: scene.xml`")
-        seconds, bodies = model.states(arrays["states"], f"{place}: states")
+        seconds, bodies = model.states(run.arrays["states"], f"{place}: states")
         if not np.isfinite(seconds).all():
             row = int(np.flatnonzero(~np.isfinite(seconds))[0])
             raise LogError(f"{place}: the time of state {row} is {seconds[row]}")
@@ -463,13 +433,13 @@ class _Robosuite(_Demonstrations):
             row = int(back[0])
             jump = f"from {seconds[row]:g} s to {seconds[row + 1]:g} s at state {row + 1}"
             unjudged = f"its time goes {jump}: {SECOND_RUN}"
-            times_ns = frame_times_ns(np.arange(count, dtype=np.int64), reading.fps or 20.0)
+            times_ns = frame_times_ns(np.arange(count, dtype=np.int64), run.reading.fps or 20.0)
         elif count and seconds[0] > 0:
             remarks.append(f"its time starts at {seconds[0]:.3f} s")
         return EpisodeColumns(times_ns, bodies=tuple(bodies), remarks=tuple(remarks), unjudged=unjudged)
 
-    def whole_label(self, episode: Episode, group: Group, label: str) -> bool | None:
+    def whole_label(self, run: Run, label: str) -> bool | None:
         """See `DataSet.whole_label`: an attribute, or true where failures are dropped."""
         if self.label is not None and label == self.label.field == "successful":
             return True
-        return super().whole_label(episode, group, label)
+        return super().whole_label(run, label)

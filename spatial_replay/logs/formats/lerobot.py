@@ -23,9 +23,9 @@ from spatial_replay.logs.formats.episodes import (
     DataSet,
     Episode,
     EpisodeColumns,
-    EpisodeReading,
     Feature,
     Label,
+    Run,
     frame_times_ns,
     integer_or_none,
 )
@@ -104,11 +104,9 @@ class _LeRobot(DataSet):
         self._loaded: tuple[object, AbstractSet[str], Mapping[str, Floats]] = (None, frozenset(), {})
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[list[_Rows]]:
-        """See `DataSet.open_episode`."""
         return nullcontext(self._places(episode.number))
 
     def read(self, group: list[_Rows], names: AbstractSet[str]) -> dict[str, Floats]:
-        """See `DataSet.read`."""
         pieces = [
             {name: table[name][rows.begin : rows.end] for name in names & table.keys()}
             for rows in group
@@ -119,18 +117,16 @@ class _LeRobot(DataSet):
         common = set.intersection(*(set(piece) for piece in pieces))
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in common}
 
-    def count_states(self, episode: Episode, group: Any, arrays: Mapping[str, Floats]) -> int:
-        """See `DataSet.count_states`."""
-        return len(arrays["episode_index"])
+    def count_states(self, run: Run) -> int:
+        return len(run.arrays["episode_index"])
 
-    def poses(
-        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
-    ) -> EpisodeColumns:
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
         """See `DataSet.poses`; the times are those of `frame_index`."""
-        fps, all_frames = self.required_fps(reading), np.arange(count, dtype=np.float64)
+        episode, arrays = run.episode, run.arrays
+        fps, all_frames = self.required_fps(run.reading), np.arange(count, dtype=np.float64)
         frames = arrays.get("frame_index", all_frames)
         remarks, unjudged = tuple(_remarks(arrays, frames, fps, episode.frames)), ""
-        named, files = self._file_by_end.get(self._file_of[episode.number]), [rows.file for rows in group]
+        named, files = self._file_by_end.get(self._file_of[episode.number]), [rows.file for rows in run.group]
         if named is not None and named not in files:
             place = files[0].relative_to(self.path)
             remarks += (f"its rows are in {place}, and not in {named.relative_to(self.path)} as meta says",)
@@ -144,13 +140,11 @@ class _LeRobot(DataSet):
         return EpisodeColumns(times_ns, remarks=remarks, unjudged=unjudged)
 
     def shared_files(self) -> list[Path]:
-        """See `DataSet.shared_files`."""
         meta = [self.path / "meta" / "info.json", self.path / "meta" / "episodes.jsonl"]
         meta += sorted((self.path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
         return [file for file in meta if file.exists()]
 
     def files_of(self, number: int) -> list[Path]:
-        """See `DataSet.files_of`."""
         return [rows.file for rows in self._places(number)]
 
     def _places(self, number: int) -> list[_Rows]:

@@ -22,9 +22,9 @@ from spatial_replay.logs.formats.episodes import (
     DataSet,
     Episode,
     EpisodeColumns,
-    EpisodeReading,
     Feature,
     Label,
+    Run,
     integer_or_none,
 )
 from spatial_replay.logs.formats.hdf5 import InGroups
@@ -88,20 +88,13 @@ class _Minari(DataSet):
         """Return the numbers a frame of each array of an episode."""
         raise NotImplementedError
 
-    def count_states(self, episode: Episode, group: Any, arrays: Mapping[str, Floats]) -> int:
-        """See `DataSet.count_states`."""
-        counts = [len(rows) for name, rows in arrays.items() if name.split("/")[0] not in _OF_STEPS]
-        return max(counts, default=self._count_steps(episode, arrays) + 1)
+    def count_states(self, run: Run) -> int:
+        counts = [len(rows) for name, rows in run.arrays.items() if name.split("/")[0] not in _OF_STEPS]
+        return max(counts, default=_count_steps(run) + 1)
 
-    def _count_steps(self, episode: Episode, arrays: Mapping[str, Floats]) -> int:
-        return len(arrays["terminations"]) if "terminations" in arrays else (episode.frames or 1) - 1
-
-    def poses(
-        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
-    ) -> EpisodeColumns:
-        """See `DataSet.poses`."""
-        times_ns = super().poses(episode, group, arrays, count, reading).times_ns
-        unjudged = _second_run(arrays, self._count_steps(episode, arrays), count)
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
+        times_ns = super().poses(run, count).times_ns
+        unjudged = _second_run(run.arrays, _count_steps(run), count)
         return EpisodeColumns(times_ns, unjudged=unjudged)
 
 
@@ -112,6 +105,10 @@ def _task(about: Mapping[str, Any]) -> str | None:
         return None
     name = specification.get("id") if isinstance(specification, dict) else None
     return name if isinstance(name, str) else None
+
+
+def _count_steps(run: Run) -> int:
+    return len(run.arrays["terminations"]) if "terminations" in run.arrays else (run.episode.frames or 1) - 1
 
 
 def _second_run(arrays: Mapping[str, Floats], steps: int, count: int) -> str:
@@ -130,11 +127,9 @@ class _Hdf5(_Minari, InGroups):
 
     @property
     def archive(self) -> Path:
-        """See `InGroups`."""
         return self.home / "main_data.hdf5"
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
-        """See `_Minari.list_episodes`."""
         with open_archive(self.archive) as file:
             names = [name.removeprefix("episode_") for name in file.names]
             for number in sorted(int(name) for name in names if name.isdecimal()):
@@ -152,7 +147,6 @@ class _Hdf5(_Minari, InGroups):
             }
 
     def array_path(self, name: str) -> str:
-        """See `InGroups.array_path`."""
         return "/".join(f"_index_{part}" if part.isdecimal() else part for part in name.split("/"))
 
 
@@ -160,7 +154,6 @@ class _Tables(_Minari):
     """A data set with a folder of Arrow or Parquet files for each episode."""
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
-        """See `_Minari.list_episodes`."""
         names = [child.name for child in self.home.iterdir() if child.name.isdecimal() and child.is_dir()]
         for number in sorted(map(int, names)):
             file = self.home / str(number) / "metadata.json"
@@ -169,7 +162,6 @@ class _Tables(_Minari):
             yield Episode(number, str(number), None if steps is None else steps + 1, task, seed)
 
     def widths(self, episode: Episode) -> dict[str, int]:
-        """See `_Minari.widths`."""
         widths = {}
         for name, column in self._columns(episode).items():
             values = numbers_from_column(column)
@@ -177,11 +169,9 @@ class _Tables(_Minari):
         return widths
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[Episode]:
-        """See `DataSet.open_episode`."""
         return nullcontext(episode)
 
     def read(self, group: Episode, names: AbstractSet[str]) -> dict[str, Floats]:
-        """See `DataSet.read`."""
         episode, arrays = group, dict[str, Floats]()
         for name, column in self._columns(episode).items():
             values = numbers_from_column(column) if name in names else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
@@ -20,8 +20,8 @@ from spatial_replay.logs.formats.episodes import (
     DataSet,
     Episode,
     EpisodeColumns,
-    EpisodeReading,
     Feature,
+    Run,
 )
 from spatial_replay.logs.formats.mujoco import model_from_file
 from spatial_replay.text import counted
@@ -51,23 +51,20 @@ class _Steps(DataSet):
         """Return the rows of an episode."""
         return slice(self._bounds[episode.number], self._bounds[episode.number + 1])
 
-    def count_states(self, episode: Episode, group: Any, arrays: Mapping[str, Floats]) -> int:
-        """See `DataSet.count_states`."""
-        return episode.frames or 0
+    def count_states(self, run: Run) -> int:
+        return run.episode.frames or 0
 
-    def poses(
-        self, episode: Episode, group: Any, arrays: Mapping[str, Floats], count: int, reading: EpisodeReading
-    ) -> EpisodeColumns:
-        """See `DataSet.poses`."""
-        columns = super().poses(episode, group, arrays, count, reading)
-        if reading.model is None:
+    def poses(self, run: Run, count: int) -> EpisodeColumns:
+        columns = super().poses(run, count)
+        model_file = run.reading.model
+        if model_file is None:
             return columns
-        qpos = self.read(group, {self.qpos}).get(self.qpos)
+        qpos = self.read(run.group, {self.qpos}).get(self.qpos)
         if qpos is None:
             raise UsageError(
                 f"{self.name} has no array {self.qpos!r} for `model`; name objects by `features:`"
             )
-        model = model_from_file(reading.model, reading.assets)
+        model = model_from_file(model_file, run.reading.assets)
         bodies = model.bodies(qpos, f"{self.name}: {self.qpos}")
         return replace(columns, bodies=tuple(bodies), remarks=model.remarks)
 
@@ -98,12 +95,10 @@ class D4rl(_Steps):
 
     @contextmanager
     def open_episode(self, episode: Episode) -> Iterator[tuple[Group, slice]]:
-        """See `DataSet.open_episode`."""
         with open_archive(self.path) as file:
             yield file, self.rows_of(episode)
 
     def read(self, group: tuple[Group, slice], names: AbstractSet[str]) -> dict[str, Floats]:
-        """See `DataSet.read`."""
         file, rows = group
         arrays = {name: file.array(name) for name in names}
         return {name: numbers(array, rows) for name, array in arrays.items() if array is not None}
@@ -154,11 +149,9 @@ class _Npz(_Steps):
                     yield name, shape
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[slice]:
-        """See `DataSet.open_episode`."""
         return nullcontext(self.rows_of(episode))
 
     def read(self, group: slice, names: AbstractSet[str]) -> dict[str, Floats]:
-        """See `DataSet.read`."""
         return {name: self._array(name)[group] for name in names if name in self._shapes}
 
     def _array(self, name: str) -> Floats:
