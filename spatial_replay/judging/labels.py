@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from spatial_replay.batch.run import FoundLog
 from spatial_replay.errors import LogError, MissingFileError, UsageError
-from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
+from spatial_replay.logs.formats.datasets import DATA_SET_ENDINGS, data_set_address, open_data_set
 from spatial_replay.logs.formats.episodes import AS_STORED, DataSet, EpisodeReading
 from spatial_replay.logs.remote import is_address
 from spatial_replay.sources.open_log import LOG_ENDINGS
@@ -84,7 +84,8 @@ def read_labels(
             by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
-        elif not is_address(log.path):
+        elif not is_address(log.path) and not log.path.lower().endswith(DATA_SET_ENDINGS):
+            # a data set that cannot be opened has no episodes for labels
             folders[Path(log.path).parent] = None
     near = [folder / name for folder in folders for name in LABEL_FILES]
     files = [Path(labels or "")] if is_file else [file for file in near if file.is_file()]

@@ -19,6 +19,7 @@ from spatial_replay.errors import GeometryError, LogError, TraceError, UsageErro
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement
 from spatial_replay.logs.formats.datasets import data_set_address
 from spatial_replay.replay.engine import Replay
+from spatial_replay.spec.formula import Specification
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -41,36 +42,28 @@ def episode_stages(
         NoAutomatonError: the spec that judges has no automaton.
         UsageError: it is a template, or under the paper's semantics.
     """
-    (text,) = (file.text for file in case.files if file.name == judgement.file)
+    conditions, texts = case.case.conditions, tuple(file.text for file in case.files)
+    specifications = parsed_specifications(texts, conditions)
+    place = [file.name for file in case.files].index(judgement.file)
     stages: dict[str, Stages] = {}
     with progress("stages", len(judgement.rows)) as advance:
         for row in judgement.rows:
             # what is wrong with a log is in its row
             if row.verdict is not None:
                 with suppress(GeometryError, LogError, TraceError):
-                    stages[row.log] = _stages(Task(row.log, (text,), case.case.conditions), judgement.result)
+                    task = Task(row.log, (texts[place],), conditions)
+                    stages[row.log] = _stages(task, specifications[place], judgement.result)
             advance(1)
     return stages
 
 
-def _stages(task: Task, name: str) -> Stages:
-    # constants that only other files have are not this file's
-    conditions = replace(
-        task.conditions,
-        constants=tuple(pair for pair in task.conditions.constants if _has_constant(task, pair[0])),
-    )
-    files = parsed_specifications(task.specs, conditions)
-    source, options = opened_task(replace(task, conditions=conditions), files)
-    replay = Replay(source, files, options, keep_series=True, keep_leaves=True, certify=False)
+def _stages(task: Task, specification: Specification, name: str) -> Stages:
+    source, options = opened_task(task, [specification])
+    replay = Replay(source, [specification], options, keep_series=True, keep_leaves=True, certify=False)
     results = [result for result in replay.run().results if result.spec.name == name]
     if any(result.object is not None for result in results):
         raise UsageError(f"--stages: {name} is a template, and its objects are at different stages")
-    return stages_of_result(results[0], replay.files[0])
-
-
-def _has_constant(task: Task, name: str) -> bool:
-    (file,) = parsed_specifications(task.specs, replace(task.conditions, constants=()))
-    return name in file.constants
+    return stages_of_result(results[0], specification)
 
 
 def with_stages(judgement: Judgement, stages: Mapping[str, Stages]) -> Judgement:

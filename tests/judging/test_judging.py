@@ -328,6 +328,13 @@ def test_remarks_on_a_data_set_are_printed_and_unknown_versions_refused() -> Non
 
 
 @pytest.mark.usefixtures("push")
+def test_a_data_set_that_cannot_be_opened_is_reported_before_labels() -> None:
+    Path("one.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 99)
+    Path("labels.json").write_text('[{"episode": 0, "success": true}]')
+    assert "one.hdf5 cannot be read" in judge_set("one.hdf5", code=3)
+
+
+@pytest.mark.usefixtures("push")
 def test_a_shaped_reward_is_no_label() -> None:
     text = judge_set("push_v3", "--labels", "next.reward", code=2)
     assert re.search(r"push_v3: next\.reward is no label: it has 0\.\d+; a label has 0 and 1", text)

@@ -292,7 +292,7 @@ def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
             table = parquet.read(columns=present)
     except (OSError, library.ArrowException) as error:
         raise LogError(
-            f"{file.name} cannot be read: {str(error).splitlines()[0]}; download it again"
+            f"{file.name} cannot be read: {str(error).splitlines()[0].rstrip('.')}; download it again"
         ) from None
     columns = ((name, numbers_from_column(table.column(name))) for name in table.column_names)
     return {name: values for name, values in columns if values is not None}

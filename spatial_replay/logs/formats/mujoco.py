@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from spatial_replay.errors import LogError, importing
-from spatial_replay.geometry.arrays import Booleans, Floats, starts_from_counts
+from spatial_replay.geometry.arrays import Floats, starts_from_counts
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.outline import normalise_polygons
 from spatial_replay.logs.formats.episodes import Body
@@ -101,7 +101,12 @@ class SceneModel:
         mujoco.mj_kinematics(model, data)
         self._geoms = {name: self._geoms_of(body, data) for name, body in self._bodies.items()}
         mocap = [model.body(body).name for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
-        self.remarks = (*remarks, *_remarks(mocap))
+        self.remarks = tuple(remarks)
+        if mocap:
+            self.remarks += (
+                f"mocap bodies are not in the states of the model: {', '.join(mocap)}; name such goals by"
+                " `features:`, from observations",
+            )
 
     def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...]:
         """Return the geoms that count for a body's footprint; none if one of them has lost its mesh."""
@@ -191,14 +196,6 @@ class SceneModel:
         return positions, quaternions
 
 
-def _remarks(mocap: Sequence[str]) -> Iterator[str]:
-    if mocap:
-        yield (
-            f"mocap bodies are not in the states of the model: {', '.join(mocap)}; name such goals by"
-            " `features:`, from observations"
-        )
-
-
 # ------------------------------------------------------------------------------------------------ footprints
 
 
@@ -225,15 +222,10 @@ def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats
         bottom=parts.bottom.reshape(len(geoms), count).min(axis=0),
         top=parts.top.reshape(len(geoms), count).max(axis=0),
     )
-    return _with_unknown(merged, is_finite)
-
-
-def _with_unknown(batch: FootprintBatch, is_finite: Booleans) -> FootprintBatch:
-    """Return a batch with a row for each state: the batch's own where finite, else an unknown one."""
     if is_finite.all():
-        return batch
-    rows = np.where(is_finite, np.cumsum(is_finite) - 1, len(batch))
-    return FootprintBatch.concatenate([batch, FootprintBatch.unknown(1)]).select(rows)
+        return merged
+    rows = np.where(is_finite, np.cumsum(is_finite) - 1, count)
+    return FootprintBatch.concatenate([merged, FootprintBatch.unknown(1)]).select(rows)
 
 
 def _rotations(quaternions: Floats) -> Floats:
