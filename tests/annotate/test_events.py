@@ -357,12 +357,10 @@ def test_a_goal_that_is_still_to_come_is_neither_pointed_at_nor_red(tmp_path):
         assert "witness" not in entities
         colour = entities["object/robot"].lines[0].color
         assert colour.r == colour.b
-        assert entities["verdict"].texts[0].text == "delivered pending"
     # the end of the log violates it
     colour = ended["object/robot"].lines[0].color
     assert colour.r > colour.b
-    assert ended["witness"].texts[0].text.strip() == "robot enclosedin bin now: -87"
-    assert ended["verdict"].texts[0].text == "delivered violated"
+    assert ended["witness"].texts[-1].text.strip() == "robot enclosedin bin now: -87"
 
 
 def test_a_result_that_becomes_unknown_is_an_event(tmp_path):
