@@ -29,20 +29,26 @@ def place_names(low: Floats, high: Floats, letters: Floats, blocked: Floats, lin
         line: the height of a name.
     """
     middles = np.empty(low.shape)
+    boxes = list(blocked.swapaxes(0, 1))
     for number in range(low.shape[1]):
         half = np.full((len(low), 2), line / 2.0)
         half[:, 0] *= LETTER * letters[:, number]
         middle = (low[:, number] + high[:, number]) / 2.0
         reach = (high[:, number] - low[:, number]) / 2.0 + half + _GAP * line
-        sides = middle[:, None] + _SIDES * reach[:, None]
-        begin, end = (sides - half[:, None])[:, :, None], (sides + half[:, None])[:, :, None]
-        is_covered = (begin < blocked[:, None, :, 1]) & (blocked[:, None, :, 0] < end)
-        meets = is_covered.all(axis=3).any(axis=2)
-        places = sides[np.arange(len(sides)), meets.argmin(axis=1)]
-        crowded = np.flatnonzero(meets.all(axis=1))
-        top = np.nanmax(blocked[crowded, :, 1, 1], axis=1, initial=-np.inf)
-        places[crowded] = np.stack([middle[crowded, 0], top + half[crowded, 1] + _GAP * line], axis=1)
-        middles[:, number] = places
-        box = np.stack([places - half, places + half], axis=1)
-        blocked = np.concatenate([blocked, box[:, None]], axis=1)
+        left = np.arange(len(low))
+        for side in _SIDES:
+            places = middle[left] + side * reach[left]
+            middles[left, number] = places
+            begin, end = places - half[left], places + half[left]
+            is_covered = np.zeros(len(left), np.bool_)
+            for box in boxes:
+                is_covered |= ((begin < box[left, 1]) & (box[left, 0] < end)).all(axis=1)
+            left = left[is_covered]
+            if not len(left):
+                break
+        top = np.nanmax([box[left, 1, 1] for box in boxes], axis=0, initial=-np.inf)
+        middles[left, number, 0] = middle[left, 0]
+        middles[left, number, 1] = top + half[left, 1] + _GAP * line
+        own = middles[:, number]
+        boxes.append(np.stack([own - half, own + half], axis=1))
     return middles
