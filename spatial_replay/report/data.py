@@ -12,6 +12,8 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.annotate.deciding_leaf import pair_of
+from spatial_replay.annotate.scene.scene_frames import entity_ids
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import NodeResult, SpecResult, worst_first
@@ -397,7 +399,7 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
     )
     if contact is None:
         return None
-    number = deciding.value * divisor_of(deciding.atom)
+    number, pair = deciding.value * divisor_of(deciding.atom), pair_of(deciding.atom)
     is_response = witness.closest is not None
     # as the arrow of the log's scene says it
     holds = "must not hold, holds by " if number >= 0 else ""
@@ -410,6 +412,7 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
         "is_condition": not is_response and witness.missed is not None and witness.missed.is_condition,
         "is_response": is_response,
         "objects": list(deciding.objects),
+        "names": [] if pair is None else entity_ids(pair.names),
     }
 
 

@@ -513,6 +513,7 @@ def scene_value(
     ]
     arrows = [arrow for _, arrow in numbered_arrows]
     outlines = list(dict.fromkeys(arrow.dashes for arrow in arrows))
+    names = list(dict.fromkeys(arrow.names for arrow in arrows))
     box = _box(entities, arrows)
     return {
         "times": packing.add((times_ns[is_kept] - first_ns) / 1e9, "f8"),
@@ -533,6 +534,8 @@ def scene_value(
             "holds": packing.add(np.array([arrow.holds for arrow in arrows]), "u1"),
             "outlines": outlines,
             "outline": packing.add(np.array([outlines.index(arrow.dashes) for arrow in arrows]), "i4"),
+            "names": names,
+            "name": packing.add(np.array([names.index(arrow.names) for arrow in arrows]), "i4"),
             # of those about an earlier sample
             "moments": [
                 None if arrow.moment_ns is None else (arrow.moment_ns - first_ns) / 1e9 for arrow in arrows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -29,6 +29,7 @@ from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_pla
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
+from spatial_replay.spec.formula import RegionName, TrackedName
 from spatial_replay.text import Instant, cut
 
 
@@ -247,6 +248,7 @@ class DrawnViolation(NamedTuple):
         holds: whether it is an atom that holds and should not.
         atom: the atom of the objects that decide a quantifier, where the leaf is one, or "".
         dashes: see `CauseText`.
+        names: ids of the entities that the atom is about.
     """
 
     ends: Floats
@@ -259,6 +261,12 @@ class DrawnViolation(NamedTuple):
     holds: bool = False
     atom: str = ""
     dashes: tuple[float, ...] = ()
+    names: tuple[str, ...] = ()
+
+
+def entity_ids(names: Iterable[TrackedName | RegionName]) -> tuple[str, ...]:
+    """Return the ids of the entities of objects and regions."""
+    return tuple((REGION if isinstance(name, RegionName) else OBJECT) + name.name for name in names)
 
 
 class Arrows(NamedTuple):
@@ -292,8 +300,8 @@ class Arrows(NamedTuple):
             holds,
             found.atoms[atom].text if atom >= 0 else "",
         )
-        dashes = self.texts.causes[self.texts.cause[index]].dashes
-        return DrawnViolation(found.points[index], label, *of, dashes)
+        cause = self.texts.causes[self.texts.cause[index]]
+        return DrawnViolation(found.points[index], label, *of, cause.dashes, entity_ids(cause.names))
 
 
 class SceneFrame(NamedTuple):

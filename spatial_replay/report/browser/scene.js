@@ -82,8 +82,8 @@ function readScene(run) {
   const size = [scene.high[0] - scene.low[0], scene.high[1] - scene.low[1]];
   const coordinates = (steps) => Float64Array.from(
     steps, (step, index) => scene.low[index % 2] + step / STEPS_OF_SCENE * size[index % 2]);
-  const {labels, atoms, moments, outlines, ...found} = scene.violations;
-  const outline = numbers(found.outline);
+  const {labels, atoms, moments, outlines, names, ...found} = scene.violations;
+  const outline = numbers(found.outline), name = numbers(found.name);
   const points = coordinates(numbers(found.points)), places = numbers(found.places);
   const robustness = numbers(found.robustness), holds = numbers(found.holds);
   // of each frame, those of its violated results
@@ -94,7 +94,7 @@ function readScene(run) {
       ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], atom: atoms[index],
       robustness: robustness[index],
       result: places[2 * index], node: places[2 * index + 1], holds: holds[index] === 1, moment: moments[index],
-      outline: outlines[outline[index]],
+      outline: outlines[outline[index]], names: names[name[index]],
     });
   });
   const maps = run.decisions.flatMap((decision) => decision.maps);
@@ -157,8 +157,10 @@ function drawScene(context, clock, scene, layers, width, height) {
     else if (entity.form[frame] !== ABSENT) drawLast(context, entity, frame, at, labels);
   }
   if (decision) drawPlan(context, clock, decision, at);
-  const names = layers.labels ? drawLabels(context, labels, width) : [];
   const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
+  const deciding = violation?.names.flatMap((id) => labels.filter((label) => label.id === id)) ?? [];
+  const names = !layers.labels ? [] : deciding.length
+    ? drawDeciding(context, deciding, violation.ends, at, [width, height]) : drawLabels(context, labels, width);
   if (violation?.outline) drawDashes(context, violation.outline, at);
   const inks = clock.run.results[clock.result]?.left_open ? ["neutral", "quiet"] : ["negative-line", "negative-text"];
   const boxes = labels.filter((each) => !each.isRegion).map((each) => each.box);
@@ -194,7 +196,7 @@ function drawLast(context, entity, frame, at, labels) {
     context.stroke();
   }
   context.setLineDash([]);
-  labels.push({text: `${entity.name}, last seen`, box, isRegion: false});
+  labels.push({id: `object/${entity.name}`, text: `${entity.name}, last seen`, box, isRegion: false});
 }
 
 // The outlines of what an arrow with the number of an earlier sample joins, as they were then.
@@ -251,7 +253,7 @@ function drawEntity(context, entity, frame, at, labels, [red, green, blue], mark
     context.stroke();
   }
   context.setLineDash([]);
-  labels.push({text: entity.name + mark, box, isRegion});
+  labels.push({id: `${entity.kind}/${entity.name}`, text: entity.name + mark, box, isRegion});
 }
 
 // Names of objects, then those of regions; one that would cover another is left out. Returns where they are.
@@ -267,6 +269,38 @@ function drawLabels(context, labels, width) {
     outlined(context, name, x, y, colour(label.isRegion ? "quiet" : "ink"));
   }
   return taken;
+}
+
+const SIDES = [[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]];
+const HALF_LINE = 8;
+
+// Names of what an arrow is about, each at the first free side; like place_names of the annotated scene.
+function drawDeciding(context, labels, [x0, y0, x1, y1], at, [width, height]) {
+  const xs = [at.x(x0), at.x(x1)], ys = [at.y(y0), at.y(y1)];
+  const blocked = labels.filter(({isRegion}) => !isRegion).map(({box}) => box);
+  blocked.push([Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]);
+  return labels.map(({text, box: [left, top, right, bottom], isRegion}) => {
+    context.font = `${isRegion ? "italic " : "600 "}${FONT}`;
+    const half = context.measureText(text).width / 2 + 2;
+    const places = SIDES.map(([across, down]) => [
+      (left + right) / 2 + across * ((right - left) / 2 + half + 4), (top + bottom) / 2 + down * ((bottom - top) / 2 + HALF_LINE + 3),
+    ]);
+    const above = Math.min(...blocked.map((box) => box[1])), below = Math.max(...blocked.map((box) => box[3]));
+    const middle = Math.min(Math.max((left + right) / 2, half), width - half);
+    places.push([middle, above - HALF_LINE - 3], [middle, below + HALF_LINE + 3]);
+    const boxes = places.map(([x, y]) => [x - half, y - HALF_LINE, x + half, y + HALF_LINE]);
+    const isFree = (own) => !blocked.some((other) => meets(own, other));
+    const isInside = (own) => own[0] >= 0 && own[1] >= 0 && own[2] <= width && own[3] <= height;
+    const index = Math.max(boxes.findIndex((own) => isFree(own) && isInside(own)), 0);
+    const place = places[index];
+    blocked.push(boxes[index]);
+    outlined(context, text, ...place, colour(isRegion ? "quiet" : "ink"));
+    return [place[0] - half, place[0] + half, place[1]];
+  });
+}
+
+function meets(one, other) {
+  return one[0] < other[2] && other[0] < one[2] && one[1] < other[3] && other[1] < one[3];
 }
 
 // Whether a text around a place would cover one that is there.
