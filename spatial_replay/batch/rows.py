@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby
-from typing import Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.batch.suite import DEFAULT_CONDITIONS, Conditions
@@ -194,20 +194,22 @@ def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
     except SpatialReplayError:
         return [rows_from_task(task) for task in tasks]
     rows_by_task: dict[Task, TaskRows] = {}
-    sources: dict[Task, Source] = {}
+    sources: dict[Task, tuple[Source, ReplayOptions]] = {}
     begin = time.perf_counter()
     for task in tasks:
         try:
-            sources[task], options = opened_task(task, files)
-            _refuse_unfit(task, sources[task])
+            source, options = opened_task(task, files)
+            _refuse_unfit(task, source)
         except Exception as error:  # one log must not end a batch
             rows_by_task[task] = error_rows(task, *error_from_exception(error))
-            sources.pop(task, None)
-    if not sources or not can_join(files, options):
+            continue
+        sources[task] = source, options
+    if not sources or not can_join(files, next(iter(sources.values()))[1]):
         return [rows_by_task[task] if task in rows_by_task else rows_from_task(task) for task in tasks]
     joint = None
     logs: dict[Task, ShortLog] = {}
-    for task, source in zip(sources, read_together([*sources.values()]), strict=True):
+    whole_sources = read_together([source for source, _ in sources.values()])
+    for (task, (_, options)), source in zip(sources.items(), whole_sources, strict=True):
         try:
             joint = joint or JointReplay(source, files, options)
             log = joint.read(source) if joint.fits(source) else None
@@ -329,9 +331,11 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
     return tuple(rows)
 
 
-def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int]) -> ResultRow:
-    """Return a row with the name, the requirement and the line of a spec."""
-    return replace(row, spec=spec.name, requirement=spec.id, title=spec.title, line=lines[spec.name])
+def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int], **values: Any) -> ResultRow:
+    """Return a row with the name, the requirement and the line of a spec, and other values."""
+    return replace(
+        row, spec=spec.name, requirement=spec.id, title=spec.title, line=lines[spec.name], **values
+    )
 
 
 def _rows_of_log(
@@ -370,9 +374,13 @@ def _rows_of_file(
     lines = spec_lines(file)
     pairs = zip(trees, replayed.results, strict=True)
     # a name that another file has, too, is that of the file's own text here
-    results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
+    results = [
+        result if result.name == result.spec.name else replace(result, name=result.spec.name)
+        for tree, result in pairs
+        if tree.file == index
+    ]
     parts = {part.text: part for part in replayed.vacuous}
-    rows = [_row(_about(log, result.spec, lines), result, replayed.first_ns) for result in results]
+    rows = [_row(log, result, replayed.first_ns, lines) for result in results]
     rows = [
         _with_explanation(row, result, replayed.first_ns)
         if explained is None or (index, row.spec, row.object) in explained
@@ -391,9 +399,11 @@ def _missing(name: Diagnostic) -> str:
     return f"{name.message}; {nearest}{mark}" if mark else name.message
 
 
-def _row(about: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
-    return replace(
-        about,
+def _row(log: ResultRow, result: SpecResult, first_ns: int, lines: Mapping[str, int]) -> ResultRow:
+    return _about(
+        log,
+        result.spec,
+        lines,
         **{name: getattr(result, name) for name in (*RESULT_COLUMNS, "unit", "tested") if name != "name"},
         atom_objects=None,
         reason=None,

@@ -522,12 +522,12 @@ def run_batch(
         tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
-            for group, results in _evaluated_groups(workers, list(tasks)) if tasks else ():
+            for group, rows_of_group in _evaluated_groups(workers, list(tasks)) if tasks else ():
                 now = states_of([task.log for task in group])
-                for task, result in zip(group, results, strict=True):
+                for task, rows_of_log in zip(group, rows_of_group, strict=True):
                     # a log that changed during the run has another key; at an address, readers see to that
                     is_same = now[task.log] == states[task.log]
-                    for key, rows in zip(tasks[task], result, strict=True):
+                    for key, rows in zip(tasks[task], rows_of_log, strict=True):
                         # errors may pass
                         if is_same and key in lasting and all(row.error is None for row in rows):
                             new_rows.add(key, rows)
@@ -545,8 +545,10 @@ def run_batch(
     return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
 
 
-_GROUP_S: Final = 0.25
+_GROUP_S: Final = 0.5
 """How long evaluating the logs that a worker is given at once takes, about."""
+_GROWTH: Final = 8
+"""How many times more logs the next group has, at most: the first one prepares and loads code, too."""
 _MOST_IN_GROUP: Final = 64
 """Logs that a worker is given at once: handing out one takes longer than evaluating a short one."""
 
@@ -589,8 +591,8 @@ class _Groups:
             if rows_of_log[0] and rows_of_log[0][0].error is None
         ]
         if seconds:
-            mean_s = max(sum(seconds) / len(seconds), 1e-6)
-            self._size = max(1, min(int(_GROUP_S / mean_s), _MOST_IN_GROUP))
+            wanted = int(_GROUP_S / max(sum(seconds) / len(seconds), 1e-6))
+            self._size = max(1, min(wanted, _GROWTH * len(seconds), _MOST_IN_GROUP))
 
 
 def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:

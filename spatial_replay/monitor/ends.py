@@ -263,7 +263,8 @@ class RunEnds:
 
     def trim(self, trace: Trace) -> Trace:
         """Return the samples of a trace that count, as far as that is decided."""
-        return replace(within(trace, self.begin_ns, self.end_ns), spans=())
+        counting = within(trace, self.begin_ns, self.end_ns)
+        return replace(counting, spans=()) if counting.spans else counting
 
 
 def trim_trace(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import cast
 
@@ -18,7 +19,7 @@ from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Empty, Floats, Integers, joined
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import Bindings, TraceScene, look_back, tail
+from spatial_replay.monitor.atoms.terms import Bindings, Reach, TraceScene, look_back, tail
 from spatial_replay.monitor.online.codes import distinct_channels, joined_channels
 from spatial_replay.monitor.online.program import Program, compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
@@ -56,6 +57,11 @@ class Instance:
     @property
     def formula(self) -> Formula:
         return self.spec.formula
+
+    @cached_property
+    def reach(self) -> Reach:
+        """How far its terms look back."""
+        return look_back([self.formula])
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,22 +35,16 @@ class ShortLog:
 
     Attributes:
         zero_ns: the time that sentences count from.
+        samples: how many are evaluated, with those that fill pauses.
+        nbytes: their size.
     """
 
     selection: Selection
     traces: Sequence[Trace]
     account: LogAccount
     zero_ns: int
-
-    @property
-    def samples(self) -> int:
-        """How many samples are evaluated, with those that fill pauses."""
-        return sum(map(len, self.traces))
-
-    @property
-    def nbytes(self) -> int:
-        """The size of its samples in bytes."""
-        return sum(trace.nbytes for trace in self.traces)
+    samples: int
+    nbytes: int
 
 
 class JointReplay:
@@ -91,15 +85,16 @@ class JointReplay:
         selection, account = self._selection.over(source), LogAccount(self._plan)
         ends = selection.run_ends()
         traces: list[Trace] = []
-        samples = size = 0
+        samples = nbytes = 0
         for block, trace in selection.read_blocks(messages=False, ends=ends):
-            samples, size = samples + len(trace), size + trace.nbytes
-            if samples > _MOST_SAMPLES or size > _MOST_BYTES:
+            samples, nbytes = samples + len(trace), nbytes + trace.nbytes
+            if samples > _MOST_SAMPLES or nbytes > _MOST_BYTES:
                 return None
             account.add(block, trace)
             traces.append(trace)
         account.check_samples(selection)
-        return ShortLog(selection, traces, account, log_zero_ns(source, selection.window, ends))
+        zero_ns = log_zero_ns(source, selection.window, ends)
+        return ShortLog(selection, traces, account, zero_ns, samples, nbytes)
 
     def is_enough(self, logs: Collection[ShortLog]) -> bool:
         """Return whether more logs would take too much memory."""

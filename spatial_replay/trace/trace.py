@@ -890,9 +890,9 @@ class ReportsBack:
 
     def add(self, trace: Trace) -> None:
         """Add samples, which follow those before."""
-        before, self._last = self._last, trace.slice(len(trace) - 1, len(trace)) if len(trace) else self._last
+        before, self._last = self._last, trace if len(trace) else self._last
         if any(part.reported_ns is not None or part.signals_reported_ns for part in (before, trace)):
-            joined = Trace.concatenate([before, trace])
+            joined = Trace.concatenate([before.slice(len(before) - 1, len(before)), trace])
             if joined.reported_ns is not None:
                 for name, rows, times in zip(joined.names, joined.rows.T, joined.reported_ns.T, strict=True):
                     self._count(name, rows >= 0, times, joined.times_ns)

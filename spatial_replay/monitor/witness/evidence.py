@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import TraceScene, look_back, tail
+from spatial_replay.monitor.atoms.terms import TraceScene, tail
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.spec.formula import Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
@@ -67,7 +67,7 @@ class Evidence:
         self.units = dict(units)
         self._regions = regions
         self._traces = traces
-        self._reach = look_back([instance.formula])
+        self._reach = instance.reach
 
     def bound(self, formula: Formula) -> Formula:
         """Bind a formula of the instance to the object that it is about."""
