@@ -230,11 +230,24 @@ class InstanceStream:
         """
         self.instance = instance
         self.semantics: Semantics = semantics
-        self.first_satisfied_ns: int | None = None
-        self.robustness = np.full(len(instance.program.reports), np.nan)
-        self.settled_ns = np.full((len(instance.program.reports), 2), NEVER, np.int64)
         self._evaluator = Evaluator(instance.formula, instance.program, semantics)
+        self._samples = samples
         self._run = self._evaluator.begin(samples=samples)
+        self._begin()
+
+    def restart(self) -> None:
+        """Start again before the first sample; `final` of the samples so far is lost."""
+        if isinstance(self._run, OnlineRun):
+            self._run.restart()
+        else:
+            self._run = self._evaluator.begin(samples=self._samples)
+        self._begin()
+
+    def _begin(self) -> None:
+        # arrays of their own: results hold those of earlier samples
+        self.first_satisfied_ns: int | None = None
+        self.robustness = np.full(len(self.instance.program.reports), np.nan)
+        self.settled_ns = np.full((len(self.instance.program.reports), 2), NEVER, np.int64)
 
     def __len__(self) -> int:
         """Return the number of samples evaluated."""
@@ -353,7 +366,7 @@ def one_after_another(traces: Sequence[Trace]) -> Trace:
 
 
 def run_together(
-    instances: Sequence[Instance], scene: TraceScene, traces: Iterable[Trace], semantics: Semantics
+    instances: Sequence[Instance], scene: TraceScene, traces: Sequence[Trace], semantics: Semantics
 ) -> Iterator[tuple[list[InstanceStream], list[SeriesBlock]]]:
     """Evaluate instances over each of many traces, whose leaves are measured together.
 
@@ -362,13 +375,17 @@ def run_together(
         scene: of the samples of all traces, `one_after_another`.
 
     Yields:
-        For each trace, the streams that have seen it, and the numbers of each stream.
+        For each trace, the streams that have seen it, and the numbers of each stream. The streams see the
+        next trace afterwards.
     """
     leaves_by_instance = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
+    longest = max(map(len, traces), default=0)
+    streams = [InstanceStream(instance, semantics, longest) for instance in instances]
     begin = 0
     for trace in traces:
         end = begin + len(trace)
-        streams = [InstanceStream(instance, semantics, len(trace)) for instance in instances]
+        for stream in streams if begin else ():
+            stream.restart()
         blocks = [
             stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
             for stream, leaves in zip(streams, leaves_by_instance, strict=True)

@@ -330,7 +330,6 @@ class OnlineRun:
         """
         self._program, self._tile = program, tile
         self.room = room = max(room, tile) if program.keeps_history else tile
-        self._channels, self._position, self._offset, self._start_ns = 1, 0, 0, 0
         signals, parts, reports = len(program.signals), len(program.parts), len(program.reports)
         self._history = np.zeros((CHANNELS, signals, room))
         self._times = np.zeros((1 + CHANNELS * program.windows, room + RING), np.int64)
@@ -346,10 +345,20 @@ class OnlineRun:
         self._numbers = self._work[NUMBERS * parts : series_at].reshape(reports, NUMBERS, shape[1])
         self._series = self._work[series_at : series_at + SERIES * reports].reshape(reports, SERIES, shape[1])
         self._shape = reports, SERIES
+        self._begin()
+
+    def restart(self) -> None:
+        """Forget all samples; the room stays."""
+        for state in (self._history, self._times, self._memory):
+            state.fill(0)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._channels, self._position, self._offset, self._start_ns = 1, 0, 0, 0
         self._newest = 0  # where the numbers of the newest sample stand
         self._open = [
-            (number, [_OpenPart(rows, room)])
-            for number, rows in enumerate(program.part_rows)
+            (number, [_OpenPart(rows, self.room)])
+            for number, rows in enumerate(self._program.part_rows)
             if rows[-1, codes.PART_KIND] == codes.WINDOWED
         ]
         self._see_history()
