@@ -19,7 +19,7 @@ from spatial_replay.batch.rows import Task, rows_from_task
 from spatial_replay.batch.run import prepare, read_specification_text, run_batch
 from spatial_replay.batch.run_table import worst_rows
 from spatial_replay.batch.store import ResultsFolder, run_columns
-from spatial_replay.batch.suite import Suite
+from spatial_replay.batch.suite import Conditions, Suite
 from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
 from spatial_replay.compiled import only
 from spatial_replay.logs.messages import MemorySource
@@ -27,7 +27,7 @@ from spatial_replay.recording.recorder import record_source
 
 LOGS, FEW_LOGS, BARE_LOGS = 1_000, 16, 400
 ROWS = 100_000
-SHORT_LOGS = 100
+SHORT_LOGS, EPISODES = 100, 200
 FOUR_SPECS = """\
 spec stays   = F (G (a dist b <= 0.3))
 spec apart   = G (a dist c >= 0.001)
@@ -121,6 +121,57 @@ def write_short_log(path: Path, rng: random.Random) -> None:
     path.parent.mkdir(exist_ok=True)
     with gzip.open(path, "wt") as stream:
         stream.write("\n".join(lines))
+
+
+def bench_episodes(bench: Any) -> None:
+    """Episodes of a LeRobot data set, 200 frames of three objects under four specs, in this process."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_data_set(folder / "push", EPISODES)
+        (folder / "four.spatial").write_text(FOUR_SPECS)
+        objects = [
+            f"    - {{name: {it}, position: [{it}_x, {it}_y], shape: {{disc: 0.02}}}}\n" for it in "abc"
+        ]
+        (folder / "push.yaml").write_text(f"features:\n  state:\n{''.join(objects)}")
+        conditions = Conditions(mapping=str(folder / "push.yaml"))
+        suite = Suite.of_logs(["push"], [folder / "four.spatial"], conditions)
+        runs = iter(range(1_000))
+
+        def run(_: Any) -> None:
+            cases = prepare(Suite("episodes", folder, suite.cases))
+            run_batch(cases, folder / f"results-{next(runs)}", ThisProcess())
+
+        with only("compiled"):
+            bench.measure("batch", run, per=EPISODES, unit="episode", runs=3, warmups=2)
+
+
+def write_data_set(folder: Path, episodes: int) -> None:
+    """Write a data set of LeRobot v3.0 in which three objects wander, in one file."""
+    import numpy as np
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    frames = 200
+    places = [f"{name}_{axis}" for name in "abc" for axis in "xy"]
+    steps = np.random.default_rng(1).normal(0.0, 0.01, (episodes, frames, len(places)))
+    state = np.cumsum(steps, axis=1).reshape(-1, len(places)).astype(np.float32)
+    columns = {
+        "state": pa.array(list(state), pa.list_(pa.float32())),
+        "frame_index": np.tile(np.arange(frames), episodes),
+        "episode_index": np.repeat(np.arange(episodes), frames),
+    }
+    about = {
+        "episode_index": np.arange(episodes),
+        "length": np.full(episodes, frames),
+        "data/chunk_index": np.zeros(episodes, np.int64),
+        "data/file_index": np.zeros(episodes, np.int64),
+    }
+    for name, table in (("data", columns), ("meta/episodes", about)):
+        (folder / name / "chunk-000").mkdir(parents=True)
+        parquet.write_table(pa.table(table), folder / name / "chunk-000" / "file-000.parquet")
+    features = {"state": {"dtype": "float32", "shape": [len(places)], "names": places}}
+    info = {"codebase_version": "v3.0", "fps": 50, "features": features}
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
 
 
 def bench_evaluate_many(bench: Any) -> None:
