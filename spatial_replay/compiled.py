@@ -396,7 +396,7 @@ def _compile_in_child(task: str, folder: Path, lock: int) -> int:
         "SPATIAL_REPLAY_KERNELS": "compiled",
         "SPATIAL_REPLAY_CACHE": str(folder.parent),
     }
-    # a fork meanwhile would keep the pipe open whose end says that the child has begun
+    # a process forked now would keep the pipe open whose end says that the child has begun
     with _process.fork_lock:
         child = subprocess.Popen(
             [sys.executable, "-P", "-c", _CHILD, task, *sys.path],

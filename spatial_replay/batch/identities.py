@@ -1,4 +1,4 @@
-"""What logs hold, as hashes: equal ones share their results, and those that did not change keep theirs."""
+"""Hashes of logs: equal logs share their results, and unchanged ones keep theirs."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class _LogFiles:
     def of(self, path: str) -> tuple[list[str], int | None]:
         """Return the files that a log consists of, and the number of an episode, None for any other log.
 
-        Those of an episode are the files with its numbers and its metadata.
+        For an episode, they are the files with its numbers and its metadata.
         """
         address = data_set_address(path)
         if address is not None:

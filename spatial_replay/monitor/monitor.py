@@ -133,7 +133,7 @@ class Monitored(NamedTuple):
 
 
 class Settlement(NamedTuple):
-    """What a monitor knows beside its numbers; most samples leave it as it is.
+    """The state of a monitor besides its numbers; most samples leave it as it is.
 
     Attributes:
         settled: what `Update.violations` are found from.

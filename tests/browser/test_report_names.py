@@ -50,7 +50,7 @@ def scenes() -> list[sr.Sample]:
 
 
 def is_of_deciding_object(colour: str) -> bool:
-    """Whether a filled path is of an object that is not grey: its opacity tells it from an arrow."""
+    """Whether a filled path is of an object that is not grey: an arrow has another opacity."""
     match re.findall(r"[\d.]+", colour):
         case [red, green, _, "0.4"]:
             return bool(red != green)

@@ -81,7 +81,7 @@ function makeLane(clock, result, node, number) {
 function nodeLane(clock, result, node, title = `How ${node.text} stands over time`) {
   let stretches = null;
   const strip = canvas(title, (context, width, height) => {
-    // a lane that nobody sees costs nothing
+    // a lane out of sight costs nothing
     stretches ??= stretchesOf(clock.run, result, node);
     const fills = {positive: colour("positive"), negative: colour("negative"), neutral: colour("neutral")};
     for (const stretch of stretches) drawStretch(context, clock, stretch, fills, width, height);
