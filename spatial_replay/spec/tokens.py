@@ -160,8 +160,8 @@ _AFTER_OPERAND = frozenset({"NAME", "RPAR", "RSQB", "NUMBER", "TRUTH"})
 STARTS_FORMULA = frozenset(
     {"LPAR", "NAME", "NOT", "PREFIX", "TRUTH", "QUANTIFIER", "NUMBER", "MINUS", "ENLARGE", "ALL", "CLASS"}
 )
-RATES = frozenset({"speed", "rate"})
-"""Words of rates of change where a bracket follows; elsewhere, names."""
+_CALLED: Mapping[str, str] = MappingProxyType({"speed": "RATE", "rate": "RATE", "center": "CENTER"})
+"""Words of the language where a bracket follows; elsewhere, names."""
 _RELATIONS = frozenset({"RELATION", "DIST", "CLOSER", "BETWEEN", "COMPARE"})
 
 
@@ -195,8 +195,8 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
                     _report(token, faults)
                 else:
                     word = token
-            if token.value in RATES and following[0].type == "LPAR" and token.value not in macros:
-                word = _as(token, "RATE", token.value)
+            if following[0].type == "LPAR" and token.value not in macros:
+                word = _as(token, _CALLED.get(token.value, word.type), word.value)
             result.append(word)
         else:
             result.append(token)
@@ -578,7 +578,7 @@ BINARY_TYPES: frozenset[str] = frozenset({"AND", "OR", "XOR", "IMPLIES", "IFF", 
 KEYWORDS: Mapping[str, str] = MappingProxyType(
     {
         **{word: word.upper() for word in ("use", "const", "region", "group", "def", "spec")},
-        **{word: word.upper() for word in ("in", "except", "all", "class", "height", "center", "than")},
+        **{word: word.upper() for word in ("in", "except", "all", "class", "height", "than")},
         **{
             word: word.upper()
             for word in ("enlarge", "polygon", "box", "circle", "dist", "closer", "between")

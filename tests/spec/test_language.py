@@ -376,3 +376,14 @@ def test_a_class_in_the_place_of_an_object_gets_the_spelling_of_a_class() -> Non
     specification = parse_specification("G (person dist robot >= 1)")
     (diagnosis,) = check_names(specification, ["robot"], [], classes=["Person"])
     assert 'write class "Person" for all of them' in diagnosis.hint
+
+
+def test_center_is_a_name_unless_a_bracket_follows() -> None:
+    text = "F (cup leftof center and center dist cup <= 0.2 and (center above cup))"
+    assert set(object_names(parse_specification(text))) == {"cup", "center"}
+    written = format_formula(formula_of(text))
+    assert '"center"' not in written and formula_of(written) == formula_of(text)
+    inner = atom_of("center(center) enclosedin center")
+    assert inner.terms == (Centre(TrackedName("center")), TrackedName("center"))
+    called = parse_specification("def center(a) = a leftof b\nspec s = center(cup)")
+    assert object_names(called) == ("b", "cup")
