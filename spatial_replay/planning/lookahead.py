@@ -26,7 +26,7 @@ from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.atoms.terms import TraceScene, seam_texts
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
 from spatial_replay.planning.edges import (
     LATER,
@@ -176,7 +176,9 @@ class Arranger:
                         stands = _standing_text(self._standing(field, met >= 0.0))
                         return f"{stands or 'the robot does not reach'} wherever {name} would have to be"
                     missing = -float(met[field.clearance > 0.0].max(initial=-math.inf))
-                    return f"{name}: nowhere would all of it hold, {missing:.4g} is missing at best"
+                    nowhere = f"{name}: nowhere would all of it hold, {missing:.4g} is missing at best"
+                    seams = seam_texts((demand.formula for demand in demands), self._regions)
+                    return "; ".join([nowhere, *seams])
         return ""
 
     @property

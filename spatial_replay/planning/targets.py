@@ -15,6 +15,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, radius_of
+from spatial_replay.monitor.atoms.terms import seam_texts
 from spatial_replay.planning.decisions import Target, points_along
 from spatial_replay.planning.maps import (
     CONSTRAINED,
@@ -299,7 +300,10 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
         best = float(gradient.robustness.max())
         if why := _why_too_large(gradient):
             return why
-        return f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed"
+        about = gradient.made_of.then.about
+        formulas = [about.propositions[number] for cube in gradient.made_of.progress for number, _ in cube]
+        nowhere = f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed"
+        return "; ".join([nowhere, *seam_texts(formulas, about.regions)])
     counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
     if counts[FREE] and has_failed:
         return "it was tried wherever it would hold"

@@ -11,6 +11,7 @@ from typing import Any, Final, Literal, TypeAlias
 
 from spatial_replay.errors import NoAutomatonError, SpecificationError
 from spatial_replay.lazy import Printed
+from spatial_replay.monitor.atoms.terms import seam_texts
 from spatial_replay.sanity.conditions import FactDiagrams, is_solid, members
 from spatial_replay.sanity.examples import Example, shortest_example
 from spatial_replay.sanity.shortest_words import (
@@ -107,7 +108,7 @@ class Examination(Printed):
     Attributes:
         findings: in the order of the text.
         specs: one for each result.
-        notes: what was left out, as sentences.
+        notes: what was left out, and regions that objects cannot cross, as sentences.
     """
 
     findings: tuple[Finding, ...]
@@ -295,6 +296,7 @@ class _Examiner:
             if part.name not in {spec.name for spec in results}:
                 self._examine(part)
         self._pairs(tuple(parts.values()), results)
+        self._notes += seam_texts((spec.formula for spec in results), self._specification.regions)
         described = tuple(self._describe(spec, examples) for spec in results)
         places = sorted(
             self._findings, key=lambda finding: (finding.diagnostic.line, finding.diagnostic.column)

@@ -25,6 +25,7 @@ from spatial_replay.geometry.measure import Operand
 from spatial_replay.monitor.atoms.reports import Reports, before_last_reports, is_signal_known, left_out_of
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    Atom,
     Centre,
     ComputedSignal,
     Earlier,
@@ -43,7 +44,15 @@ from spatial_replay.spec.formula import (
     Variable,
 )
 from spatial_replay.spec.relations import computed_signal
-from spatial_replay.spec.walks import has_rate, iter_terms, named_members, standing, step_of
+from spatial_replay.spec.walks import (
+    base_of,
+    has_rate,
+    iter_formulas,
+    iter_terms,
+    named_members,
+    standing,
+    step_of,
+)
 from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 
@@ -473,6 +482,19 @@ def footprint_from_outline(outline: Outline) -> Footprint:
         (x, y), *_ = outline.vertices
         return Footprint.disc(x, y, outline.radius)
     return Footprint.polygon(outline.vertices)
+
+
+def seam_texts(formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> list[str]:
+    """Return a sentence for each region of several convex parts that formulas ask objects to be enclosed in."""
+    atoms = (part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom))
+    names = dict.fromkeys(
+        getattr(base_of(atom.terms[1]), "name", "") for atom in atoms if atom.relation == "enclosedin"
+    )
+    return [
+        f"{name} is cut into parts; an object across their seam counts as outside"
+        for name in names
+        if name in regions and len(footprint_from_outline(regions[name]).parts) > 1
+    ]
 
 
 def open_group(term: Group | Earlier) -> Group:
