@@ -48,7 +48,7 @@ from spatial_replay.planning.maps import (
     proposition_maps,
 )
 from spatial_replay.planning.paths import reachable, shortest_path
-from spatial_replay.planning.settings import Grid, Settings, Workspace
+from spatial_replay.planning.settings import Grid, Settings, Skill, Workspace
 from spatial_replay.planning.targets import (
     Measured,
     begins_as,
@@ -69,6 +69,8 @@ _MOST_NAMED: Final = 2
 """The most constraints that a reason names."""
 _LONGEST_NAME: Final = 60
 """The most characters of one of them."""
+_DIGITS: Final = 9
+"""Decimal places to which equal lengths and equal robustness agree."""
 
 
 @dataclass(eq=False)
@@ -290,8 +292,7 @@ def with_choice(
 ) -> Consideration:
     """Return an edge with its candidates, the best one chosen; pruned if no candidate has a target.
 
-    The best candidate has the shortest path if it is pushed, the greatest robustness if it is placed; the
-    first one wins a tie.
+    The best candidate is the first one of `by_cost`; of equal ones, the first candidate.
     """
     order = by_cost(candidates, settings)
     if not order:
@@ -314,13 +315,22 @@ def choose_candidate(
 
 def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Target]:
     """Return the targets of those candidates that have one, by number, the best first."""
-    pushes = settings.skill == "push"
     targets = [
         (number, candidate.target)
         for number, candidate in enumerate(candidates)
         if candidate.target is not None
     ]
-    return dict(sorted(targets, key=lambda item: item[1].length if pushes else -item[1].robustness))
+    return dict(sorted(targets, key=lambda item: costs_of(item[1], settings.skill)))
+
+
+def costs_of(target: Target, skill: Skill) -> tuple[float, float]:
+    """Return by what targets are compared, and by what equal ones are.
+
+    Pushes compare lengths of ways first, placed objects robustness. Numbers are rounded, since those of equal
+    targets differ in their last digits.
+    """
+    length, robustness = round(target.length, _DIGITS), round(target.robustness, _DIGITS)
+    return (length, -robustness) if skill == "push" else (-robustness, length)
 
 
 # ----------------------------------------------------------------------------------------------- expectations

@@ -50,7 +50,7 @@ from spatial_replay.planning.edges import (
 )
 from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
 from spatial_replay.planning.maps import concerns, refuse_delays, refuse_unknown
-from spatial_replay.planning.motions import Expectations, Movables, with_choice
+from spatial_replay.planning.motions import Expectations, Movables, costs_of, with_choice
 from spatial_replay.planning.movers import (
     Evasion,
     Lookout,
@@ -519,17 +519,23 @@ class Planner:
         ]
         if aim.is_joint or not rivals:
             return why
-        cost, (least, rival) = (
-            _cost(target, pushes),
-            min((_cost(rival_target, pushes), rival_target.name) for rival_target in rivals),
-        )
-        how = "a longer way" if pushes else "less robustness"
-        if math.isclose(cost, least):
-            how = "as short a way" if pushes else "as much robustness"
-            return f"{why}; {rival} could do it with {how} ({abs(least):.3g}), and comes later in `movable`"
-        if cost > least:
-            how = f"{'a shorter way' if pushes else 'more robustness'}, but no motions lead on from there"
-        return f"{why}; {rival} could do it with {how} ({abs(least):.3g}, here {abs(cost):.3g})"
+        rival = min(rivals, key=lambda rival: costs_of(rival, self.settings.skill))
+        names = [candidate.name for candidate in aim.candidates]
+        is_later = names.index(rival.name) > names.index(name)
+        return f"{why}; {rival.name} could do it with {self._comparison(rival, target, is_later)}"
+
+    def _comparison(self, rival: Target, target: Target, is_later: bool) -> str:
+        """Return in what the target of a rival, later in the order or not, differs from the chosen one."""
+        skill = self.settings.skill
+        rows = list(zip(_COMPARED[skill], costs_of(rival, skill), costs_of(target, skill), strict=True))
+        (same, *_), first, chosen = rows[0]
+        if first != chosen:
+            return _difference_text(rows[0])
+        *_, then, chosen_then = rows[1]
+        if then == chosen_then:
+            order = "comes later " + ("by name" if self.settings.movable is None else "in `movable`")
+            return f"{same} ({abs(first):.3g}) and {rows[1][0][0]}, {f'and {order}' if is_later else _LEADS_NOWHERE}"
+        return f"{same} ({abs(first):.3g}), and {_difference_text(rows[1])}"
 
     def _wanted_text(self, number: int, value: bool) -> str:
         """Return a proposition that has to hold or not, with the specs that it is of; a long one by these."""
@@ -559,8 +565,18 @@ class Planner:
         return f"{labels} unknown: {'; '.join(reasons)}" if reasons else f"{labels} unknown"
 
 
-def _cost(target: Target, pushes: bool) -> float:
-    return target.length if pushes else -target.robustness
+_LENGTH: Final = "the same length of way", "a longer way", "a shorter way"
+_ROBUSTNESS: Final = "the same robustness", "less robustness", "more robustness"
+_COMPARED: Final = {"push": (_LENGTH, _ROBUSTNESS), "place": (_ROBUSTNESS, _LENGTH)}
+"""Words for an equal, a worse and a better target, in the order of `costs_of`."""
+_LEADS_NOWHERE: Final = "but no motions lead on from there"
+
+
+def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
+    """Return that a rival's cost is worse or better than another one."""
+    (_, worse, better), cost, chosen = row
+    numbers = f"({abs(cost):.3g}, here {abs(chosen):.3g})"
+    return f"{worse} {numbers}" if cost > chosen else f"{better} {numbers}, {_LEADS_NOWHERE}"
 
 
 MOST_YIELDED: Final = 300

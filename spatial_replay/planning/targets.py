@@ -59,6 +59,9 @@ _SWEPT: Final = math.radians(10.0)
 Measured = Callable[[Grid, tuple[float, ...]], tuple[GradientMap, Floats]]
 """Gives the map of an object over a grid in some orientations (yaws), and its room there."""
 
+_EQUAL: Final = 1e-9
+"""Difference of robustness of cells that are equally robust."""
+
 
 def find_target(
     gradient: GradientMap,
@@ -91,6 +94,9 @@ def find_target(
         least_room = min(settings.room, float(room[good].max())) if failures else settings.room
         roomy = good & (room >= least_room)
         values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
+        # of equally robust cells, the nearest
+        away = distance_to([centre_of(tracked.footprint)], gradient.grid)
+        values = np.where(values >= values.max() - _EQUAL, -away, -np.inf)
         return _best_target(gradient, values, tracked)
     return _nearest_cell(gradient, good, tracked, settings, failures)
 
