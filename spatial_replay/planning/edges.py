@@ -460,6 +460,8 @@ class FailedMotion(NamedTuple):
 class Attempts:
     """The motions of a run, by the edge that they were for.
 
+    Failures count by edge and object: a robot that often fails, and does the rest, is not given up.
+
     Attributes:
         motions: the number of motions concluded, without refused ones.
     """
@@ -467,7 +469,7 @@ class Attempts:
     def __init__(self) -> None:
         """Begin with none."""
         self.motions = 0
-        self._failed: Counter[Edge] = Counter()
+        self._failed: dict[Edge, Counter[str]] = {}
         self._total: Counter[Edge] = Counter()
         self._places: dict[str, tuple[tuple[float, float], ...]] = {}
         self._left: dict[Edge, int] = {}
@@ -488,14 +490,18 @@ class Attempts:
 
     def why_not_again(self, edge: Edge, most_failed: int) -> Reason | None:
         """Return why an edge is not tried again; None if it may be."""
-        if self._failed[edge] >= most_failed:
-            return Reason(_count_text(self._failed[edge]), self._last.get(edge, ""))
+        if (failed := self.failures(edge)) >= most_failed:
+            return Reason(_count_text(failed), self._last.get(edge, ""))
         # a motion that succeeds clears the failures, so that G F … would go on without end
         return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
 
-    def begin(self, edge: Edge, sample: Sample, settings: Settings) -> None:
-        """Count a motion for an edge, as failed until it is concluded."""
-        self._failed[edge] += 1
+    def failures(self, edge: Edge) -> int:
+        """Return how many motions for an edge have failed that count, of the object with most failures."""
+        return max(self._failed.get(edge, Counter()).values(), default=0)
+
+    def begin(self, edge: Edge, name: str, sample: Sample, settings: Settings) -> None:
+        """Count a motion of an object for an edge, as failed until it is concluded."""
+        self._failed.setdefault(edge, Counter())[name] += 1
         self._total[edge] += 1
         self._begin = sample, settings
 
@@ -533,14 +539,14 @@ class Attempts:
         elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
             # one of several motions, and fewer are left than ever before
             self._left[aim.edge] = len(aim.motions)
-            self._failed[aim.edge] = 0
+            self._failed[aim.edge].clear()
         elif aim.is_joint:
             # a detour after a failure; all motions for an edge are bounded, too
-            self._failed[aim.edge] -= 1
+            del self._failed[aim.edge][target.name]
 
-    def withdraw(self, edge: Edge) -> None:
-        """Count the motion that begins, or began last, as no attempt."""
-        self._failed[edge] -= 1
+    def withdraw(self, edge: Edge, name: str) -> None:
+        """Count the motion of an object that begins, or began last, as no attempt."""
+        self._failed[edge][name] -= 1
         self._total[edge] -= 1
 
     def places_of(self, name: str) -> tuple[tuple[float, float], ...]:

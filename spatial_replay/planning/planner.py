@@ -359,7 +359,7 @@ class Planner:
         elif is_stopped and self._is_evaded and self._yielded < MOST_YIELDED:
             # another object is in the way: the motion did not fail
             self._attempts.motions += 1
-            self._attempts.withdraw(step.aim.edge)
+            self._attempts.withdraw(step.aim.edge, step.target.name)
         else:
             about = step.aim, step.target, outcome, self.states, self._newest()
             self._attempts.conclude(*about, is_stopped=is_stopped)
@@ -370,7 +370,7 @@ class Planner:
         evasion = self._evasion(target)
         if evasion is None or step.aim is None:
             return step
-        self._attempts.withdraw(step.aim.edge)
+        self._attempts.withdraw(step.aim.edge, target.name)
         self._delayed = target
         self._yielded += 1
         aside = evasion.aside
@@ -488,7 +488,7 @@ class Planner:
         (target,) = [candidate.target for candidate in aim.candidates if candidate.is_chosen]
         if target is None:
             raise UsageError("the chosen object has no target")
-        self._attempts.begin(aim.edge, self._newest(), self.settings)
+        self._attempts.begin(aim.edge, target.name, self._newest(), self.settings)
         self._pruned.pop(aim.edge, None)
         verb = "push" if self.settings.skill == "push" else "place"
         edge = f"{aim.edge[0]} -> {aim.edge[1]}"

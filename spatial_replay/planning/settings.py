@@ -303,7 +303,7 @@ class Settings:
         room_from: "later" keeps room only from objects that may still have to be moved on the way to
             acceptance, and from everything if the object itself may. Elsewhere robustness counts. "all"
             always keeps it from everything, whatever robustness that costs.
-        attempts: how many failed motions prune an edge, refused ones included; at least 1.
+        attempts: how many failed motions of one object prune an edge, refused ones included; at least 1.
         motions: how many objects are moved for one edge at most, at least 1. With 1, the planner takes one
             edge by one motion and looks no further, as in the paper.
         lift: how high above where it stood an object is carried, in footprint units, at least 0. Its way then
