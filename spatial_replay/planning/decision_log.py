@@ -45,6 +45,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanMap,
     PlanOutcome,
     PlanRoom,
+    PlanSearch,
     PlanTarget,
     PrunedEdge,
 )
@@ -195,7 +196,7 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
 
 # -------------------------------------------------------------------------------------------------- decisions
 
-PLAN_VERSION: Final = 2
+PLAN_VERSION: Final = 3
 """Version of the messages; a log of another version cannot be recomputed."""
 
 MOST_LISTED: Final = 3
@@ -429,6 +430,7 @@ def decision_message(step: Step, specification: str = "", first_map: int = 0) ->
         pruned=pruned,
         reason=step.reason,
         lost=None if step.lost is None else PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text),
+        search=PlanSearch(**step.search._asdict()),
     )
 
 
@@ -443,6 +445,8 @@ def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> Pla
         pruned=str(consideration.pruned or ""),
         motions=map(_target, consideration.motions),
         joint=consideration.is_joint,
+        failed=consideration.failed,
+        order=consideration.order,
     )
 
 
@@ -549,6 +553,7 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     states = ", ".join(map(str, decision.states))
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
     yield f"  {decision.reason}"
+    yield f"  {effort_text(decision)}"
     if decision.HasField("target"):
         yield f"  {_target_text(decision.target)}{joint_suffix(decision.considered[-1])}"
     said: dict[tuple[str, ...], str] = {}
@@ -564,7 +569,8 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
 def brief_lines(decision: PlanDecision) -> Iterator[str]:
     """Yield at most five lines about one decision."""
     states = ", ".join(map(str, decision.states))
-    yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}: {decision.reason}"
+    head = f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
+    yield f"{head} ({effort_text(decision)}): {decision.reason}"
     if decision.considered:
         edge = decision.considered[-1]
         yield f"  wanted   {_some([guard.text for guard in edge.progress])}{_ban_text(edge)}"
@@ -585,6 +591,15 @@ def _ban_text(edge: PlanEdge) -> str:
     never = [text for text in texts if not _denied(text)]
     both = " and ".join(always if len(always) == 1 else (f"({text})" for text in always))
     return (f"; always {both}" if always else "") + (f"; never {_some(never)}" if never else "")
+
+
+def effort_text(decision: PlanDecision) -> str:
+    """Return which attempt at its edge a decision is, and how much was searched for it."""
+    search, edge = decision.search, decision.considered[-1] if decision.considered else None
+    attempt = f"attempt {edge.failed + 1}" if edge is not None and decision.HasField("target") else ""
+    counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
+    searched = [f"{search.maps:.4g} maps", *(counted(*count) for count in counts if count[0])]
+    return ", ".join([*filter(None, [attempt]), *searched])
 
 
 def _rival_text(candidate: PlanCandidate) -> str:
@@ -609,8 +624,8 @@ def joint_suffix(edge: PlanEdge) -> str:
 
 def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
     """Yield lines about an edge; `said` has the blocks of edges before, which are not repeated."""
-    path = " -> ".join(map(str, edge.path))
-    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
+    path, order = " -> ".join(map(str, edge.path)), edge.order and f"; {edge.order}"
+    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}{order}"
     yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
     if edge.constraints:
         yield f"    never     {_some([guard.text for guard in edge.constraints])}"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import centre_of
@@ -149,6 +149,8 @@ class Consideration:
             planner does not look ahead.
         is_joint: whether objects are moved together for the edge; the chosen candidate's map then has the
             others where these motions bring them.
+        failed: how many motions for the edge have failed before, of those that count as attempts.
+        order: why the edge comes before those on paths that are as short; empty without any.
     """
 
     path: tuple[int, ...]
@@ -159,6 +161,22 @@ class Consideration:
     pruned: Reason | None = None
     motions: tuple[Target, ...] = ()
     is_joint: bool = False
+    failed: int = 0
+    order: str = ""
+
+
+class Search(NamedTuple):
+    """How much was searched for a decision.
+
+    Attributes:
+        maps: maps computed, up to a limit; a look at one sample counts as a quarter of a map.
+        arrangements: of several objects, of which an order of motions was looked for.
+        parking_places: that were tried for objects in the way of others.
+    """
+
+    maps: float = 0.0
+    arrangements: int = 0
+    parking_places: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +207,7 @@ class Step(Displayed):
         reason: the decision as a sentence.
         ahead: the states that a wait expects from time alone; empty if it waits for something else.
         lost: when and by what acceptance was lost; None while the specification can be satisfied.
+        search: how much was searched.
     """
 
     number: int
@@ -201,6 +220,7 @@ class Step(Displayed):
     reason: str
     ahead: tuple[int, ...] = ()
     lost: Loss | None = None
+    search: Search = Search()
 
     @property
     def aim(self) -> Consideration | None:

@@ -23,7 +23,16 @@ from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.witness.path import unknowns_of
-from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outcome, Reason, Stage, Target
+from spatial_replay.planning.decisions import (
+    Consideration,
+    Edge,
+    Guards,
+    Outcome,
+    Reason,
+    Search,
+    Stage,
+    Target,
+)
 from spatial_replay.planning.maps import Cube, concerns
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.format import format_term
@@ -114,10 +123,22 @@ def surplus(lower: _Value, upper: _Value, demand: Demand) -> _Value:
 
 
 class Budget:
-    """How many maps a decision may compute."""
+    """How many maps a decision may compute.
+
+    Attributes:
+        left: the maps left.
+        arrangements: of several objects, of which an order of motions was looked for.
+        parking_places: that were tried for objects in the way of others.
+    """
 
     def __init__(self, maps: float) -> None:
-        self.left = maps
+        self.left, self._maps = maps, maps
+        self.arrangements = self.parking_places = 0
+
+    @property
+    def search(self) -> Search:
+        """What was spent."""
+        return Search(self._maps - self.left, self.arrangements, self.parking_places)
 
     def spend(self, maps: float = 1.0) -> bool:
         """Count maps; return whether there are any left."""
@@ -314,6 +335,19 @@ def consideration_of(
     )
     others = _other_edges(automaton, edge, pruned, symbol)
     return Consideration(states, edge, _guards(automaton, path[:1]), _guards(automaton, others), ())
+
+
+def order_text(automaton: Automaton, path: Sequence[Transition], without: Collection[Edge]) -> str:
+    """Return why the first edge of a path comes before one on a path as short; empty if there is none.
+
+    Args:
+        without: edges that were given up, or that time alone takes.
+    """
+    first = path[0]
+    rival = next(automaton.paths(first.source, {*without, (first.source, first.target)}), ())
+    if len(rival) != len(path):
+        return ""
+    return f"{first.source} -> {rival[0].target} is as short; the state with the lower number comes first"
 
 
 def equivalent_edges(

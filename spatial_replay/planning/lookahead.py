@@ -826,6 +826,7 @@ class Lookahead:
         least: float,
     ) -> Iterator[Ordered]:
         """Yield the motions to an arrangement, in an order in which each is possible."""
+        self._expected.budget.arrangements += 1
         poses = self._without_staying(scene, about, poses)
         robustness = self._expected.robustness(move_objects(scene.sample, poses), aims[0].guard)
         never = consideration.constraints.cubes

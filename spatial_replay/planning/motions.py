@@ -667,6 +667,7 @@ class MotionOrder:
                 for target in self._parking_motions(
                     scene, state, blocker, {name: way}, left, is_first, blocker in beside
                 ):
+                    self.expected.budget.parking_places += 1
                     after = scene.after(target.name, target.pose)
                     movables = self.expected.movables(scene)
                     # a constraint may hold wherever the other object stands

@@ -42,6 +42,7 @@ from spatial_replay.planning.edges import (
     idle_transitions,
     loss_text,
     moved_later,
+    order_text,
     refuse_template,
     specs_of,
     unknown_reasons,
@@ -86,8 +87,8 @@ class Planner:
                 planner.conclude(outcome)
 
     It has to observe every sample, also during an execution: each one moves the automaton. A run ends: an
-    edge is pruned after `Settings.attempts` failed motions, and after `MOST_MOTIONS` in all. Equal samples
-    and outcomes give equal steps.
+    edge is pruned after `Settings.attempts` failed motions of one object, and after `MOST_MOTIONS` in all.
+    Equal samples and outcomes give equal steps.
 
     Attributes:
         specification: what is planned for.
@@ -171,6 +172,8 @@ class Planner:
         self._waiting: Step | None = None
         self._ahead: tuple[int, ...] = ()
         self._steps = 0
+        # of the newest decision
+        self._budget = Budget(MOST_MAPS)
 
     @property
     def settings(self) -> Settings:
@@ -393,6 +396,7 @@ class Planner:
         return len(self._states) > 1 and None in self._symbol and not is_accepting
 
     def _next_step(self) -> Step:
+        self._budget = Budget(MOST_MAPS)
         if self._lacks_members:
             groups = absence_text(self._awaited, self._newest())
             return self._decision("wait", (), f"nothing shows that it is done: no object is in {groups}")
@@ -414,8 +418,7 @@ class Planner:
     def _step_from(self, state: int) -> Step:
         """Return the step for the first edge, over the paths by length, that can be taken."""
         idle = idle_transitions(self.automaton, state, self._symbol)
-        budget = Budget(MOST_MAPS)
-        foresight = self._foresight(self._attempts, budget)
+        foresight = self._foresight(self._attempts)
         considered: list[Consideration] = []
         undecided: dict[int, tuple[Consideration, tuple[Transition, ...], frozenset[Edge]]] = {}
         # time takes idle transitions without any object being moved, so they stay possible
@@ -423,6 +426,11 @@ class Planner:
         pruned = given_up - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) and not idle.along(path):
             aim = consideration_of(self._words, path, pruned, self._symbol)
+            aim = replace(
+                aim,
+                failed=self._attempts.failures(aim.edge),
+                order=order_text(self.automaton, path, pruned | idle.edges),
+            )
             exhausted = self._attempts.why_not_again(aim.edge, self.settings.attempts)
             if exhausted is not None:
                 considered.append(replace(aim, pruned=exhausted))
@@ -442,7 +450,7 @@ class Planner:
             decision = foresight.decide(alone, way, before, together=True)
             if decision.pruned and self._attempts.motions > 0:
                 # a motion may fail by chance: without any other, one that failed is made again
-                again = self._foresight(self._attempts.forgiven(), budget)
+                again = self._foresight(self._attempts.forgiven())
                 repeated = self._consider(alone, way, again.movables)
                 repeated = again.decide(repeated, way, before, together=True)
                 decision = decision if repeated.pruned else repeated
@@ -460,13 +468,13 @@ class Planner:
             is_later = any(reason.kind == LATER for reason in self._pruned.values())
             why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
         said = why_no_path(self.automaton, state, self._pruned, why)
-        if budget.left <= 0:
+        if self._budget.left <= 0:
             said += f"; the search ended after {MOST_MAPS} maps, and there may be a way that it did not find"
         return self._decision("no path", considered, said)
 
-    def _foresight(self, attempts: Attempts, budget: Budget) -> Lookahead:
+    def _foresight(self, attempts: Attempts) -> Lookahead:
         about = self.automaton, self._formulas, self._regions, self.settings
-        return Lookahead(Expectations(*about, attempts, budget), self._newest())
+        return Lookahead(Expectations(*about, attempts, self._budget), self._newest())
 
     def _consider(
         self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
@@ -499,7 +507,7 @@ class Planner:
 
     def _why(self, aim: Consideration, target: Target) -> str:
         """Return why an object is moved, and why this one where another one could be."""
-        name, pushes = target.name, self.settings.skill == "push"
+        name = target.name
         wrong = (
             [literal for literal in cube if self._symbol[literal[0]] is not literal[1]]
             for cube in aim.progress.cubes
@@ -549,7 +557,8 @@ class Planner:
         pruned = tuple(sorted(self._pruned.items()))
         time_ns = self._newest().time_ns
         lost = self._lost
-        return Step(number, time_ns, kind, self.states, tuple(considered), None, pruned, reason, lost=lost)
+        about = self.states, tuple(considered), None, pruned, reason
+        return Step(number, time_ns, kind, *about, lost=lost, search=self._budget.search)
 
     def _newest(self) -> Sample:
         if self._sample is None:

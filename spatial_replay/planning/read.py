@@ -45,6 +45,7 @@ from spatial_replay.planning.decision_log import (
     decision_from_payload,
     decision_lines,
     decision_rows,
+    effort_text,
     explained_decision,
     latest_decisions,
     maps_of,
@@ -254,10 +255,10 @@ def why_not_there(
             outside its map.
         MissingFileError, LogError: the log cannot be read.
     """
-    steps = {logged.step.number: logged.step for logged in read_steps(log)}
+    steps = {logged.step.number: logged for logged in read_steps(log)}
     if number not in steps:
         raise UsageError(f"there is no decision {number}; the log has {min(steps)} to {max(steps)}")
-    step = steps[number]
+    step = steps[number].step
     edges = [
         (edge, candidate)
         for edge in reversed(step.considered)
@@ -276,7 +277,7 @@ def why_not_there(
     settings = planner_of(open_source(log)).settings
     yield (
         f"{name} at ({place[0]:g}, {place[1]:g}) for the edge {edge.edge[0]} -> {edge.edge[1]}: robustness "
-        f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed"
+        f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed ({effort_text(steps[number].message)})"
     )
     layers = map_layers(gradient, settings, candidate.failed)
     for which in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():

@@ -10,7 +10,14 @@ from planning.kinematics import block
 from planning.plans import write_usual_run
 from spatial_replay import Planner, Settings
 from spatial_replay.cli.application import application
-from spatial_replay.planning import Grid, Outcome, Workspace, moved_object
+from spatial_replay.planning import (
+    Grid,
+    Outcome,
+    Workspace,
+    moved_object,
+    read_decisions,
+    read_steps,
+)
 
 AREA = Workspace(Grid.over(0, 0, 1, 1, 0.02))
 
@@ -46,12 +53,59 @@ def test_a_motion_whose_object_is_elsewhere_afterwards_is_named_with_its_place()
     assert "moved, but then not at its target: a at (0.8, 0.4)" in step.reason
 
 
-def test_equal_objects_are_taken_by_their_order():
+def test_a_region_with_a_seam_is_named_where_an_object_would_have_to_cross_it():
+    region = "region corner = polygon((0.2, 0.2), (0.5, 0.2), (0.5, 0.3), (0.3, 0.3), (0.3, 0.5), (0.2, 0.5))"
+    text = f"{region}\nspec s = F (a enclosedin corner)"
+    seam = "corner is cut into parts; an object across their seam counts as outside"
+    step = planner_for(text, {"a": block(0.7, 0.7, size=0.13)}, "a").next_step()
+    assert step.kind == "no path"
+    assert seam in step.reason
+    assert seam in sr.doctor(sr.parse_specification(text), examples=False).notes
+    assert seam not in planner_for(text, {"a": block(0.7, 0.7, size=0.05)}, "a").next_step().reason
+
+
+def test_equal_objects_are_taken_by_their_ways_then_by_their_order():
     objects = {"b": block(0.4, 0.5), "a": block(0.6, 0.5)}
     step = planner_for("F (a leftof b)", objects, "a", "b", skill="place").next_step()
     assert step.target.name == "a"
-    assert "b could do it with as much robustness" in step.reason
-    assert "comes later in `movable`" in step.reason
+    assert "b could do it with the same robustness" in step.reason
+    assert "the same length of way, and comes later in `movable`" in step.reason
+    text = "region r = box(0.4, 0.4, 0.6, 0.6)\nspec s = F (a enclosedin r or b enclosedin r)"
+    step = planner_for(text, {"a": block(0.1, 0.5), "b": block(0.8, 0.5)}, "a", "b", skill="place").next_step()
+    assert step.target.name == "b"
+    assert "a could do it with the same robustness (0.084), and a longer way (0.4, here 0.3)" in step.reason
+
+
+def test_a_decision_tells_its_attempts_and_what_it_searched(tmp_path):
+    """Two blocks change places by parking one, after a motion that failed."""
+    regions = "region p = box(0.1, 0.1, 0.3, 0.3)\nregion q = box(0.5, 0.1, 0.7, 0.3)\n"
+    text = f"{regions}spec s = F (a enclosedin q and b enclosedin p)"
+    objects = {"a": block(0.2, 0.2, size=0.1), "b": block(0.6, 0.2, size=0.1)}
+    planner = Planner(sr.parse_specification(text), Settings(AREA, skill="place"))
+    log = tmp_path / "run.mcap"
+    with sr.Recorder(log, planner=planner) as recorder:
+        recorder.write(sr.Sample(0, objects))
+        recorder.next_step()
+        recorder.write(sr.Sample(1, objects))
+        recorder.conclude(Outcome(False, "it slipped", at="pick"))
+        step = recorder.next_step()
+        recorder.write(sr.Sample(2, objects))
+        recorder.conclude(Outcome(False, "it slipped", at="pick"))
+    assert step.search.maps > 1.0 and step.search.arrangements >= 1 and step.search.parking_places >= 1
+    first, second = read_decisions(log).decisions
+    assert [decision.considered[-1].failed for decision in (first, second)] == [0, 1]
+    effort = f"attempt 2, {step.search.maps:.4g} maps, "
+    assert effort in call("info", log, "--decisions", 1)[0]
+    assert effort in call("plan", "--why", log, "--step", 1, "--object", "a", "--at", "0.5,0.5")[0]
+    assert read_steps(log)[1].step.search == step.search
+
+
+def test_an_edge_is_named_with_those_on_paths_as_short():
+    regions = "region r = box(0.1, 0.1, 0.3, 0.3)\nregion q = box(0.7, 0.1, 0.9, 0.3)\n"
+    text = f"{regions}spec s = (F (a enclosedin r)) and (F (a enclosedin q))"
+    aim = planner_for(text, {"a": block(0.5, 0.5)}, "a").next_step().aim
+    assert aim.order.endswith(" is as short; the state with the lower number comes first")
+    assert aim.order.startswith(f"{aim.edge[0]} -> ") and int(aim.order.split()[2]) > aim.edge[1]
 
 
 def test_alternatives_of_a_step_are_other_good_places():

@@ -68,6 +68,7 @@ class PlanDecision(google.protobuf.message.Message):
     OUTCOME_FIELD_NUMBER: builtins.int
     LOST_FIELD_NUMBER: builtins.int
     MARGIN_FIELD_NUMBER: builtins.int
+    SEARCH_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time in nanoseconds of the sample that it was made on."""
     number: builtins.int
@@ -103,6 +104,10 @@ class PlanDecision(google.protobuf.message.Message):
     def lost(self) -> global___PlanLoss:
         """When and by what acceptance was lost; absent while the specification can be satisfied."""
 
+    @property
+    def search(self) -> global___PlanSearch:
+        """How much was searched for it."""
+
     def __init__(
         self,
         *,
@@ -118,9 +123,10 @@ class PlanDecision(google.protobuf.message.Message):
         outcome: global___PlanOutcome | None = ...,
         lost: global___PlanLoss | None = ...,
         margin: builtins.float | None = ...,
+        search: global___PlanSearch | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_margin", b"_margin", "_number", b"_number", "_time_ns", b"_time_ns", "lost", b"lost", "margin", b"margin", "number", b"number", "outcome", b"outcome", "target", b"target", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_margin", b"_margin", "_number", b"_number", "_time_ns", b"_time_ns", "considered", b"considered", "kind", b"kind", "lost", b"lost", "margin", b"margin", "number", b"number", "outcome", b"outcome", "pruned", b"pruned", "reason", b"reason", "specification", b"specification", "states", b"states", "target", b"target", "time_ns", b"time_ns"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_margin", b"_margin", "_number", b"_number", "_time_ns", b"_time_ns", "lost", b"lost", "margin", b"margin", "number", b"number", "outcome", b"outcome", "search", b"search", "target", b"target", "time_ns", b"time_ns"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_margin", b"_margin", "_number", b"_number", "_time_ns", b"_time_ns", "considered", b"considered", "kind", b"kind", "lost", b"lost", "margin", b"margin", "number", b"number", "outcome", b"outcome", "pruned", b"pruned", "reason", b"reason", "search", b"search", "specification", b"specification", "states", b"states", "target", b"target", "time_ns", b"time_ns"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_margin", b"_margin"]) -> typing.Literal["margin"] | None: ...
     @typing.overload
@@ -129,6 +135,39 @@ class PlanDecision(google.protobuf.message.Message):
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___PlanDecision = PlanDecision
+
+@typing.final
+class PlanSearch(google.protobuf.message.Message):
+    """How much was searched for a decision."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    MAPS_FIELD_NUMBER: builtins.int
+    ARRANGEMENTS_FIELD_NUMBER: builtins.int
+    PARKING_PLACES_FIELD_NUMBER: builtins.int
+    maps: builtins.float
+    """The maps of which a decision computes a limited number; a look at one sample counts as a quarter of a map."""
+    arrangements: builtins.int
+    """The arrangements of several objects of which an order of motions was looked for."""
+    parking_places: builtins.int
+    """The places that were tried for objects in the way of others."""
+    def __init__(
+        self,
+        *,
+        maps: builtins.float | None = ...,
+        arrangements: builtins.int | None = ...,
+        parking_places: builtins.int | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_arrangements", b"_arrangements", "_maps", b"_maps", "_parking_places", b"_parking_places", "arrangements", b"arrangements", "maps", b"maps", "parking_places", b"parking_places"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_arrangements", b"_arrangements", "_maps", b"_maps", "_parking_places", b"_parking_places", "arrangements", b"arrangements", "maps", b"maps", "parking_places", b"parking_places"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_arrangements", b"_arrangements"]) -> typing.Literal["arrangements"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_maps", b"_maps"]) -> typing.Literal["maps"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_parking_places", b"_parking_places"]) -> typing.Literal["parking_places"] | None: ...
+
+global___PlanSearch = PlanSearch
 
 @typing.final
 class PlanLoss(google.protobuf.message.Message):
@@ -169,6 +208,8 @@ class PlanEdge(google.protobuf.message.Message):
     PRUNED_FIELD_NUMBER: builtins.int
     MOTIONS_FIELD_NUMBER: builtins.int
     JOINT_FIELD_NUMBER: builtins.int
+    FAILED_FIELD_NUMBER: builtins.int
+    ORDER_FIELD_NUMBER: builtins.int
     source: builtins.int
     target: builtins.int
     pruned: builtins.str
@@ -177,6 +218,10 @@ class PlanEdge(google.protobuf.message.Message):
     """Whether several objects are moved together for this edge. The map of the chosen one then has the others where
     their motions bring them.
     """
+    failed: builtins.int
+    """How many motions for it have failed before, of those that count as attempts."""
+    order: builtins.str
+    """Why it comes before edges on paths that are as short, or empty."""
     @property
     def path(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
         """The states of the shortest path to acceptance that begins with it."""
@@ -211,9 +256,13 @@ class PlanEdge(google.protobuf.message.Message):
         pruned: builtins.str = ...,
         motions: collections.abc.Iterable[global___PlanTarget] | None = ...,
         joint: builtins.bool = ...,
+        failed: builtins.int | None = ...,
+        order: builtins.str = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "source", b"source", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "candidates", b"candidates", "constraints", b"constraints", "joint", b"joint", "motions", b"motions", "path", b"path", "progress", b"progress", "pruned", b"pruned", "source", b"source", "target", b"target"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_failed", b"_failed", "_source", b"_source", "_target", b"_target", "failed", b"failed", "source", b"source", "target", b"target"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_failed", b"_failed", "_source", b"_source", "_target", b"_target", "candidates", b"candidates", "constraints", b"constraints", "failed", b"failed", "joint", b"joint", "motions", b"motions", "order", b"order", "path", b"path", "progress", b"progress", "pruned", b"pruned", "source", b"source", "target", b"target"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_failed", b"_failed"]) -> typing.Literal["failed"] | None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_source", b"_source"]) -> typing.Literal["source"] | None: ...
     @typing.overload
