@@ -624,8 +624,8 @@ def joint_suffix(edge: PlanEdge) -> str:
 
 def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
     """Yield lines about an edge; `said` has the blocks of edges before, which are not repeated."""
-    path, order = " -> ".join(map(str, edge.path)), edge.order and f"; {edge.order}"
-    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}{order}"
+    path = " -> ".join(map(str, edge.path)) + (edge.order and f"; {edge.order}")
+    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
     yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
     if edge.constraints:
         yield f"    never     {_some([guard.text for guard in edge.constraints])}"

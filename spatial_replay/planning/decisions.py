@@ -220,7 +220,7 @@ class Step(Displayed):
     reason: str
     ahead: tuple[int, ...] = ()
     lost: Loss | None = None
-    search: Search = Search()
+    search: Search = field(default_factory=Search)
 
     @property
     def aim(self) -> Consideration | None:

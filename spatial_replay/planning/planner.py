@@ -536,14 +536,15 @@ class Planner:
         """Return in what the target of a rival, later in the order or not, differs from the chosen one."""
         skill = self.settings.skill
         rows = list(zip(_COMPARED[skill], costs_of(rival, skill), costs_of(target, skill), strict=True))
-        (same, *_), first, chosen = rows[0]
-        if first != chosen:
+        (same, *_), *costs = rows[0]
+        if costs[0] != costs[1]:
             return _difference_text(rows[0])
-        *_, then, chosen_then = rows[1]
-        if then == chosen_then:
-            order = "comes later " + ("by name" if self.settings.movable is None else "in `movable`")
-            return f"{same} ({abs(first):.3g}) and {rows[1][0][0]}, {f'and {order}' if is_later else _LEADS_NOWHERE}"
-        return f"{same} ({abs(first):.3g}), and {_difference_text(rows[1])}"
+        equal = f"{same} ({abs(costs[0]):.3g})"
+        (same, *_), *costs = rows[1]
+        if costs[0] != costs[1]:
+            return f"{equal}, and {_difference_text(rows[1])}"
+        order = "by name" if self.settings.movable is None else "in `movable`"
+        return f"{equal} and {same}, {f'and comes later {order}' if is_later else _LEADS_NOWHERE}"
 
     def _wanted_text(self, number: int, value: bool) -> str:
         """Return a proposition that has to hold or not, with the specs that it is of; a long one by these."""
@@ -583,9 +584,9 @@ _LEADS_NOWHERE: Final = "but no motions lead on from there"
 
 def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
     """Return that a rival's cost is worse or better than another one."""
-    (_, worse, better), cost, chosen = row
-    numbers = f"({abs(cost):.3g}, here {abs(chosen):.3g})"
-    return f"{worse} {numbers}" if cost > chosen else f"{better} {numbers}, {_LEADS_NOWHERE}"
+    (_, worse, better), cost, least = row
+    numbers = f"({abs(cost):.3g}, here {abs(least):.3g})"
+    return f"{worse} {numbers}" if cost > least else f"{better} {numbers}, {_LEADS_NOWHERE}"
 
 
 MOST_YIELDED: Final = 300

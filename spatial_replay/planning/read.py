@@ -277,7 +277,8 @@ def why_not_there(
     settings = planner_of(open_source(log)).settings
     yield (
         f"{name} at ({place[0]:g}, {place[1]:g}) for the edge {edge.edge[0]} -> {edge.edge[1]}: robustness "
-        f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed ({effort_text(steps[number].message)})"
+        f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed "
+        f"({effort_text(steps[number].message)})"
     )
     layers = map_layers(gradient, settings, candidate.failed)
     for which in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():

@@ -71,12 +71,13 @@ def test_equal_objects_are_taken_by_their_ways_then_by_their_order():
     assert "b could do it with the same robustness" in step.reason
     assert "the same length of way, and comes later in `movable`" in step.reason
     text = "region r = box(0.4, 0.4, 0.6, 0.6)\nspec s = F (a enclosedin r or b enclosedin r)"
-    step = planner_for(text, {"a": block(0.1, 0.5), "b": block(0.8, 0.5)}, "a", "b", skill="place").next_step()
+    objects = {"a": block(0.1, 0.5), "b": block(0.8, 0.5)}
+    step = planner_for(text, objects, "a", "b", skill="place").next_step()
     assert step.target.name == "b"
     assert "a could do it with the same robustness (0.084), and a longer way (0.4, here 0.3)" in step.reason
 
 
-def test_a_decision_tells_its_attempts_and_what_it_searched(tmp_path):
+def test_a_decision_reports_its_attempts_and_what_it_searched(tmp_path):
     """Two blocks change places by parking one, after a motion that failed."""
     regions = "region p = box(0.1, 0.1, 0.3, 0.3)\nregion q = box(0.5, 0.1, 0.7, 0.3)\n"
     text = f"{regions}spec s = F (a enclosedin q and b enclosedin p)"

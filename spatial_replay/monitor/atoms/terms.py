@@ -485,7 +485,7 @@ def footprint_from_outline(outline: Outline) -> Footprint:
 
 
 def seam_texts(formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> list[str]:
-    """Return a sentence for each region of several convex parts that formulas ask objects to be enclosed in."""
+    """Return a sentence for each region of several convex parts in which formulas want objects enclosed."""
     atoms = (part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom))
     names = dict.fromkeys(
         getattr(base_of(atom.terms[1]), "name", "") for atom in atoms if atom.relation == "enclosedin"
