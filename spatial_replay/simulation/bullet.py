@@ -198,6 +198,11 @@ class Engine:
         position, turn = self._call("getBasePositionAndOrientation", self._bodies[name])
         return Pose(np.array(position), np.array(self._bullet.getMatrixFromQuaternion(turn)).reshape(3, 3))
 
+    def move(self, name: str, x: float, y: float) -> None:
+        """Move a fixed body, whatever stands in its way; its height and its orientation stay."""
+        (*_, z), turn = self._call("getBasePositionAndOrientation", self._bodies[name])
+        self._call("resetBasePositionAndOrientation", self._bodies[name], (x, y, z), turn)
+
     # -------------------------------------------------------------------------------------- the robot
 
     def set_joints(self, joints: Floats, width: float) -> None:
