@@ -94,7 +94,7 @@ def test_what_is_equal_differs_in_nothing(capsys: pytest.CaptureFixture[str]) ->
     same = ("--spec", "table.spatial")
     assert said(capsys, "diff", "table.jsonl", *same, *same)[0] == 0
     code, out, _ = said(capsys, "diff", "push.mcap", "push.mcap")
-    assert (code, out.splitlines()[1:]) == (0, ["  the same 545 samples"])
+    assert (code, out.splitlines()[1:]) == (0, ["  the same 546 samples"])
     code, out, _ = said(capsys, "diff", "table.jsonl", "table.jsonl")
     assert (code, out.splitlines()[1:]) == (0, ["  the same 300 samples"])
 
@@ -221,7 +221,7 @@ def test_a_diff_names_a_difference_that_rounded_numbers_hide(capsys: pytest.Capt
         Path(f"{name}.spatial").write_text(f"spec gap = G (red dist blue >= {apart})")
     code, out, _ = said(capsys, "diff", "push.mcap", "--spec", "old.spatial", "--spec", "new.spatial")
     assert code == 1
-    assert "gap: violated (-0.01458 m) → violated (-0.01458 m), different by 1e-08 m" in out
+    assert "gap: violated (-0.0148 m) → violated (-0.0148 m), different by 1e-08 m" in out
 
 
 @pytest.mark.usefixtures("folder")
@@ -231,7 +231,7 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     arguments = ("clip", "push.mcap", "--spec", "push_edited.spatial", "--result", "gaps", "-o", "bug.mcap")
     code, out, _ = said(capsys, *arguments)
     assert code == 0
-    assert "gaps: 32 of 545 samples, 4.233 s to 5.267 s of the log" in out
+    assert "gaps: 32 of 546 samples, 4.233 s to 5.267 s of the log" in out
     assert "it begins at 4.233 s, where `gaps` became violated for certain" in out
     assert "it ends at 5.267 s, where the robustness of `gaps` is decided" in out
     longer = said(capsys, "clip", "push.mcap", "--spec", "push_edited.spatial", "-o", "long.mcap")[1]
@@ -243,7 +243,7 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     assert size < Path("push.mcap").stat().st_size / 4
     code, out, _ = said(capsys, "replay", "bug.mcap", "--json", "-")
     (push,) = json.loads(out)["specifications"]
-    assert {node["name"]: node["robustness"] for node in push["nodes"]}["gaps"] == pytest.approx(-0.01458410)
+    assert {node["name"]: node["robustness"] for node in push["nodes"]}["gaps"] == pytest.approx(-0.01480400)
     assert said(capsys, "verify", "bug.mcap")[0] == 0
     assert said(capsys, "verify", "bug.mcap", "--source", "push.mcap")[0] == 0
     assert said(capsys, "verify", "bug.mcap", "--source", "table.jsonl")[0] != 0
@@ -253,7 +253,7 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     before = Path("bug.mcap").read_bytes()
     said(capsys, *arguments)
     assert Path("bug.mcap").read_bytes() == before
-    assert said(capsys, *arguments, "--around", "1s")[1].count("92 of 545 samples") == 1
+    assert said(capsys, *arguments, "--around", "1s")[1].count("92 of 546 samples") == 1
 
 
 @pytest.mark.usefixtures("folder")
