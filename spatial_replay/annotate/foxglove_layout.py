@@ -47,8 +47,8 @@ _MOST_PLOTS: Final = 3
 _MOST_INDICATORS: Final = 6
 """Lights in one row."""
 
-_LEGEND_PIXELS: Final = 170
-"""The width of a legend, beside the curves so that it hides none. Numbers of all digits would not fit in."""
+_LEGEND_PIXELS: Final = 240
+"""The width of a legend with the values at the cursor, beside the curves so that it hides none."""
 
 _LONGEST_LABEL: Final = 24
 """The most characters of a label: what fits into a legend."""
@@ -280,6 +280,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
             "paths": [*paths, zero],
             "isSynced": True,
             "showLegend": True,
+            "showPlotValuesInLegend": True,
             "legendDisplay": "left",
             "sidebarDimension": _LEGEND_PIXELS,
             "xAxisVal": "timestamp",
@@ -440,7 +441,9 @@ def _details(contents: LayoutContents) -> _Details:
     if trees and RECENT_EVENTS in contents.topics:
         shown.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
     if trees:
-        sources = f"{SPECIFICATION}.files[:].source"
+        # a list of texts is shown centred, one text is not
+        which = "0" if all(tree.file == 0 for tree in trees) else ":"
+        sources = f"{SPECIFICATION}.files[{which}].source"
         title = "Specification" if zero is None else f"Specification; {zero}"
         shown.append(("specification", "RawMessages!specification", title, sources))
     if any(contents.has_states):
@@ -481,11 +484,12 @@ def _layout(
         plots, own = _tabs("Tab!curves", [(_tab_title(each), each) for each in curves])
         states = state_strips(contents.trees)
         panels += [*own, states]
-        right += [(plots, 3.0), (states.identifier, 2.5)]
+        # curves have at least 140 pixels on a screen of 1280 × 720
+        right += [(plots, 4.5), (states.identifier, 2.0)]
     if details:
         tabs, own = _tabs("Tab!details", details)
         panels += own
-        right.append((tabs, 5.0))
+        right.append((tabs, 4.0))
     tree = _split("column", left)
     if right:
         second = _split("column", right)

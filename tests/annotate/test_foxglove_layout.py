@@ -15,7 +15,7 @@ from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_live
 from spatial_replay.cli import run as run_command
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.messages import SPECIFICATION, MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import Standing
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.selection import ReplayOptions
@@ -100,6 +100,25 @@ def test_the_scene_has_half_of_the_window_and_details_are_in_tabs(tmp_path):
         "specification",
         "automaton",
     ]
+
+
+def test_curves_have_their_values_and_140_pixels_on_a_small_screen(tmp_path):
+    layout = layout_of(run(tmp_path, TEXT))
+    plot = layout["configById"]["Plot!robustness"]
+    assert plot["showLegend"] and plot["showPlotValuesInLegend"]
+    # a list of one text would be shown centred
+    assert (
+        layout["configById"]["RawMessages!specification"]["topicPath"] == f"{SPECIFICATION}.files[0].source"
+    )
+    height = 720 - _AROUND
+    tree = layout["layout"]
+    height *= 1 - tree["splitPercentage"] / 100
+    column = tree["second"]["second"]
+    assert height * column["splitPercentage"] / 100 - _TITLES >= 140
+
+
+_AROUND, _TITLES = 44 + 64, 30 + 30
+"""Heights in pixels: of a viewer's bars, and of a panel's title and axis."""
 
 
 def test_viewers_with_the_extension_have_a_layout_of_its_panels(tmp_path, capsys):

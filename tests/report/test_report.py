@@ -305,7 +305,10 @@ def test_decisions_for_another_specification_are_marked_so(tmp_path: Path) -> No
         source = open_source(RECORDINGS / "push.mcap")
         run_replay(source, load_files([RECORDINGS / name], source), output=annotated)
         layout = next(each for each in open_source(annotated).attachments() if each.name == "layout.json")
-        marked = (b"decided so, for push.spatial as recorded", b"(map of push.spatial as recorded: dark blue")
+        marked = (
+            b"decided so, for push.spatial as recorded",
+            b"(map of push.spatial as recorded: vermillion",
+        )
         assert said == is_marked == all(each in layout.data for each in marked)
 
 
