@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import re
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.notebook.figures import Html, element
+from spatial_replay.report.panels import unpack_array
 from spatial_replay.text import number_text, with_unit
 
 MOST_CURVES: Final = 60
@@ -57,14 +59,14 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
     if facts is None or numbers is None:
         return
     run, data = json.loads(facts[1]), zlib.decompress(base64.b64decode(numbers[1]))
-    times = _array(run["times"], data)
+    times = unpack_array(run["times"], data)
     for number, result in enumerate(run["results"]):
         samples = result["samples"]
         places = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_POINTS)).astype(np.int64))
         if not samples:
             continue
         # of the root, what it is up to each sample
-        values = _array(result["series"], data)[:samples]
+        values = unpack_array(result["series"], data)[:samples].astype(np.float64)
         title = f"{log}: {result['object']}" if result["object"] else log
         yield Curve(
             title,
@@ -74,11 +76,6 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
             times[result["first"] + places],
             values[places],
         )
-
-
-def _array(reference: Mapping[str, Any], data: bytes) -> Floats:
-    kind, offset, length = (reference[name] for name in ("kind", "offset", "length"))
-    return np.frombuffer(data, f"<{kind}", length, offset).astype(np.float64)
 
 
 def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
@@ -124,13 +121,12 @@ def _final(curve: Curve) -> float:
 def _lines(curve: Curve, end: float, high: float, size: float) -> Iterator[Html]:
     """Yield the tip of a curve, a wide clear line to point at, and the line itself."""
     yield element("title", f"{curve.title}, {curve.verdict}")
-    is_known = np.isfinite(curve.values)
     pieces, is_open = list[str](), False
-    for time, value, known in zip(curve.times, curve.values, is_known, strict=True):
-        if known:
+    for time, value in zip(curve.times, curve.values, strict=True):
+        if math.isfinite(value):
             letter = "L" if is_open else "M"
             pieces.append(f"{letter}{_WIDTH * time / end:.1f} {_HEIGHT * (high - value) / size:.1f}")
-        is_open = bool(known)
+        is_open = math.isfinite(value)
     line = "".join(pieces)
     yield element("path", d=line, **{"class": "area"})
     yield element("path", d=line, **{"class": "bad" if curve.verdict == "violated" else "quiet"})

@@ -1,6 +1,6 @@
 """Panels of a report: their facts as JSON, from a replay, with arrays in a compact form.
 
-Arrays are little-endian bytes one after the other, compressed, in Base64.
+Arrays are packed one after the other (see `packed_bytes`), compressed, in Base64.
 """
 
 from __future__ import annotations
@@ -76,7 +76,6 @@ Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
 Reference: TypeAlias = Mapping[str, Any]
 """Where an array lies in the page: its kind, the offset of its first byte, how many numbers it has."""
 
-_ALIGNMENT: Final = 8
 _LEVEL: Final = 6
 
 
@@ -89,15 +88,36 @@ class Packing:
 
     def add(self, array: NDArray[Any], kind: Kind) -> Reference:
         """Take in an array, flattened by rows, and return where the page finds it."""
-        data = np.ascontiguousarray(array, f"<{kind}").tobytes()
+        data = packed_bytes(array, kind)
         reference = {"kind": kind, "offset": self._size, "length": int(np.size(array))}
-        self._pieces += [data, bytes(-len(data) % _ALIGNMENT)]
-        self._size += len(data) + len(self._pieces[-1])
+        self._pieces.append(data)
+        self._size += len(data)
         return reference
 
     def text(self) -> str:
         """Return everything taken in as a text without characters that HTML interprets."""
         return base64.b64encode(zlib.compress(b"".join(self._pieces), _LEVEL)).decode("ascii")
+
+
+def packed_bytes(array: NDArray[Any], kind: Kind) -> bytes:
+    """Return the numbers of an array, by rows, as bytes that compress well; read.js unpacks them.
+
+    The bits of each number are an unsigned integer. Its difference from the one before is written: the lowest
+    bytes of all differences, then the next ones.
+    """
+    numbers = np.ascontiguousarray(array, f"<{kind}").ravel()
+    codes = numbers.view(f"<u{numbers.itemsize}")
+    differences = np.diff(codes, prepend=np.zeros(1, codes.dtype))
+    return differences.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes()
+
+
+def unpack_array(reference: Reference, data: bytes) -> NDArray[Any]:
+    """Return an array of a page, flat, from the bytes of all its arrays."""
+    dtype, length = np.dtype(f"<{reference['kind']}"), reference["length"]
+    planes = np.frombuffer(data, np.uint8, length * dtype.itemsize, reference["offset"])
+    differences = np.ascontiguousarray(planes.reshape(dtype.itemsize, length).T)
+    codes = np.cumsum(differences.view(f"<u{dtype.itemsize}").ravel(), dtype=f"<u{dtype.itemsize}")
+    return codes.view(dtype)
 
 
 def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -66,9 +66,14 @@ class Page(HTMLParser):
         return [text for inside, text in self.texts if inside and inside[-1] == "script#"]
 
     def numbers(self, reference: dict[str, Any]) -> np.ndarray:
-        return np.frombuffer(
-            self._numbers, TYPES[reference["kind"]], reference["length"], reference["offset"]
-        )
+        kind, length, offset = (reference[name] for name in ("kind", "length", "offset"))
+        size = np.dtype(TYPES[kind]).itemsize
+        codes, code = [], 0
+        for place in range(offset, offset + length):
+            # of the difference, byte after byte, the lowest first
+            code += sum(self._numbers[place + plane * length] << 8 * plane for plane in range(size))
+            codes.append((code % 2 ** (8 * size)).to_bytes(size, "little"))
+        return np.frombuffer(b"".join(codes), TYPES[kind])
 
 
 def page_of(output: Path) -> Page:

@@ -9,7 +9,13 @@ const VALUE = 0, NOW = 1, LOWER = 2, UPPER = 3;
 async function readRun(name = "") {
   const facts = JSON.parse(document.getElementById(`facts${name}`).textContent, (_, value) => printable(value));
   const buffer = await unpacked(document.getElementById(`numbers${name}`).textContent);
-  const numbers = ({kind, offset, length}) => new ARRAYS[kind](buffer, offset, length);
+  const arrays = new Map();
+  const numbers = (reference) => {
+    // an array without numbers has the place of the next one
+    const key = `${reference.offset} ${reference.length}`;
+    if (!arrays.has(key)) arrays.set(key, unpackArray(reference, buffer));
+    return arrays.get(key);
+  };
   const times = numbers(facts.times);
   const run = {
     ...facts,
@@ -32,6 +38,31 @@ async function unpacked(text) {
   for (let i = 0; i < letters.length; i++) packed[i] = letters.charCodeAt(i);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Response(stream).arrayBuffer();
+}
+
+const CODES = {1: Uint8Array, 2: Uint16Array, 4: Uint32Array, 8: Uint32Array};
+
+// An array as report/panels.py packs it: of the bits of all numbers the differences, the lowest bytes of all first.
+function unpackArray({kind, offset, length}, buffer) {
+  const size = ARRAYS[kind].BYTES_PER_ELEMENT;
+  const bytes = new Uint8Array(buffer, offset, size * length);
+  const codes = new CODES[size](size * length / Math.min(size, 4));
+  const byte = (place, plane) => bytes[plane * length + place] << 8 * (plane % 4);
+  let low = 0, high = 0;
+  for (let place = 0; place < length; place++) {
+    let difference = byte(place, 0);
+    for (let plane = 1; plane < Math.min(size, 4); plane++) difference |= byte(place, plane);
+    const sum = low + (difference >>> 0);
+    low = sum >>> 0;
+    if (size < 8) codes[place] = low;
+    else {
+      const upper = byte(place, 4) | byte(place, 5) | byte(place, 6) | byte(place, 7);
+      high = (high + (upper >>> 0) + (sum > low ? 1 : 0)) >>> 0;
+      codes[2 * place] = low;
+      codes[2 * place + 1] = high;
+    }
+  }
+  return new ARRAYS[kind](codes.buffer);
 }
 
 function readResult(result, numbers, times) {
