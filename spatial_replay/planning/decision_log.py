@@ -587,8 +587,8 @@ def brief_lines(decision: PlanDecision) -> Iterator[str]:
 def _ban_text(edge: PlanEdge) -> str:
     """Return what must never hold on the way, and what always has to."""
     texts = [guard.text for guard in edge.constraints]
-    always = [denied for text in texts if (denied := _denied(text))]
-    never = [text for text in texts if not _denied(text)]
+    always = [operand for text in texts if (operand := _operand_of_not(text))]
+    never = [text for text in texts if not _operand_of_not(text)]
     both = " and ".join(always if len(always) == 1 else (f"({text})" for text in always))
     return (f"; always {both}" if always else "") + (f"; never {_some(never)}" if never else "")
 
@@ -720,7 +720,7 @@ def room_sentence(candidate: PlanCandidate) -> str:
     )
 
 
-def _denied(text: str) -> str:
+def _operand_of_not(text: str) -> str:
     """Return what `not (…)` denies; nothing of a text of another form."""
     if not text.startswith("not (") or not text.endswith(")"):
         return ""
@@ -736,8 +736,8 @@ def cause_text(cause: PlanCause) -> str:
         cause.KIND_REACH: "the robot's reach",
         cause.KIND_FAILED: "a motion that failed there",
     }
-    if (denied := _denied(cause.text)) and cause.kind == cause.KIND_CONSTRAINT:
-        return f"{denied}, which would fail,"
+    if (operand := _operand_of_not(cause.text)) and cause.kind == cause.KIND_CONSTRAINT:
+        return f"{operand}, which would fail,"
     return cause.text or texts.get(cause.kind, "something unknown")
 
 
@@ -750,8 +750,8 @@ def cause_sentence(cause: PlanCause) -> str:
         cause.KIND_FAILED: "a motion to a place near it failed",
     }
     if cause.kind == cause.KIND_CONSTRAINT:
-        denied = _denied(cause.text)
-        return f"`{denied}` would fail" if denied else f"`{cause.text}` would hold"
+        operand = _operand_of_not(cause.text)
+        return f"`{operand}` would fail" if operand else f"`{cause.text}` would hold"
     return texts.get(cause.kind, "something that has to hold is unknown there")
 
 

@@ -7,7 +7,7 @@ class Clock {
     this.start = run.times.length ? run.times[0] : 0;
     this.end = run.times.length ? run.times[run.times.length - 1] : 0;
     this.view = [this.start, this.end];
-    this.worst = worstOf(run.results);
+    this.worst = worstOf(run);
     this.result = this.worst;
     this.time = this.opening;
     this.speed = 1;
@@ -126,10 +126,11 @@ class Clock {
   }
 }
 
-// The first result of those that are violated or, without any, unknown.
-function worstOf(results) {
-  const found = ["violated", "unknown"].map((verdict) => results.findIndex((each) => each.verdict === verdict));
-  return found.find((place) => place >= 0) ?? 0;
+// The first result of those that are violated or, without any, unknown; else the one that was planned for.
+function worstOf({results, decisions}) {
+  const places = [...["violated", "unknown"].map((verdict) => results.findIndex((result) => result.verdict === verdict)),
+    results.findIndex(({name}) => name === decisions?.at(-1)?.specification)];
+  return places.find((place) => place >= 0) ?? 0;
 }
 
 // Writes time and result to the address and reads them from it: #t=4.2&r=1.

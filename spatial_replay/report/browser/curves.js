@@ -4,6 +4,8 @@ const CHART_HEIGHT = 250;
 const AXIS_LABEL = 18;
 const MOST_AXES = 3;
 const LEAST_AXIS = 50;
+// The width of a letter at a tick, in pixels.
+const TICK_LETTER = 7;
 
 function makeCurves(clock) {
   const place = element("div", {class: "curves", role: "group", "aria-label": "Robustness over time"});
@@ -128,7 +130,7 @@ function options(clock, result, curves, shown, width) {
       ...Object.fromEntries(scales.map(({key, range}) => [key, {range: () => range}])),
     },
     axes: [
-      {...axis, size: 30, values: (_, ticks) => ticks.map((tick) => `${Number(tick.toFixed(6))} s`)},
+      {...axis, size: 30, values: (chart, ticks) => ticks.map((tick) => timeTick(chart, tick))},
       ...drawn.map(({key, unit}) => ({...axis, scale: key, side: 3, size: axisSize, label: unitText(unit),
         labelSize: AXIS_LABEL, grid: {...axis.grid, show: key === "y"}, values: (_, ticks) => ticks.map(numberText)})),
     ],
@@ -143,6 +145,13 @@ function options(clock, result, curves, shown, width) {
       }],
     },
   };
+}
+
+// The words at a tick; none where the edge of the chart would cut them.
+function timeTick(chart, tick) {
+  const words = `${Number(tick.toFixed(6))} s`;
+  const room = (chart.scales.x.max - tick) / (chart.scales.x.max - chart.scales.x.min) * 0.8 * chart.width;
+  return room < TICK_LETTER * words.length / 2 ? null : words;
 }
 
 function unitText(unit) {

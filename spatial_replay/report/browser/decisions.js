@@ -37,8 +37,8 @@ function makeDecision(clock, decision) {
   const unnamed = decision.maps.filter((map) => map.edge === null);
   const meant = chosenMap(decision);
   const later = decision.edges.flatMap((edge) => (edge.aim ? edge.later : []));
-  const heading = element("div", {}, title, element("p", {}, sentence(decision.reason)),
-    later.length ? element("p", {}, `Planned next: ${later.join(", then ")}.`) : null,
+  const heading = element("div", {}, title, element("p", {}, minusWords(sentence(decision.reason))),
+    later.length ? element("p", {}, `Planned next: ${minusWords(later.join(", then "))}.`) : null,
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
     heading, meant ? makeMap(clock, meant, decision, false) : null, makeRedone(clock, decision.redone),
@@ -51,7 +51,7 @@ function makeRedone(clock, decision) {
   if (!decision) return null;
   const meant = chosenMap(decision);
   return element("section", {class: "redone"}, element("p", {}, element("b", {}, "Redone"), `: ${inShort(decision)}`),
-    element("p", {}, sentence(decision.reason)), meant ? makeMap(clock, meant, decision, false) : null);
+    element("p", {}, minusWords(sentence(decision.reason))), meant ? makeMap(clock, meant, decision, false) : null);
 }
 
 // The map that a decision's target was found on, if the page has it.
@@ -67,7 +67,7 @@ function summaryOf({edges, maps: drawn}) {
 }
 
 function inShort({kind, target}) {
-  if (kind === "execute" && target) return `move ${target.object} to ${target.words}`;
+  if (kind === "execute" && target) return `move ${target.object} to ${minusWords(target.words)}`;
   return {hold: "nothing to do", wait: "wait", "no path": "no way is left"}[kind] ?? kind;
 }
 
@@ -99,7 +99,7 @@ function makeCandidate(clock, decision, candidate, maps, once) {
   const {object, target, rejected, best} = candidate;
   const status = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.status];
   const more = best > target?.robustness ? `; at best ${numberText(best)}` : "";
-  const why = rejected || `to ${target.words}, robustness ${numberText(target.robustness ?? NaN)}${candidate.status === "chosen" ? once : ""}${more}`;
+  const why = minusWords(rejected) || `to ${minusWords(target.words)}, robustness ${numberText(target.robustness ?? NaN)}${candidate.status === "chosen" ? once : ""}${more}`;
   // the map of a decision's target stands beside its heading
   const drawn = maps.filter((map) => !map.chosen);
   return element("div", {class: "candidate"}, element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`),

@@ -43,6 +43,11 @@ function numberText(number) {
   return `${number < 0 ? "−" : ""}${text.replace("-", "−")}`;
 }
 
+// A text with the sign of numbers as `numberText` writes it; names such as run-1 keep theirs.
+function minusWords(text) {
+  return text.replace(/(?<![\p{L}\p{N}_])-(?=[\d.])/gu, "−");
+}
+
 // What grounds mean, each with its words, and how high and how strong it is.
 function key(entries) {
   return element("p", {class: "key"}, ...entries.map(({ground, words, height = 0.8, opacity = 1}) => {

@@ -609,10 +609,6 @@ function roleWords(pointer) {
   return pointer?.is_response ? "what came nearest to what had to follow" : "what decided the verdict";
 }
 
-function minusWords(text) {
-  return text.replace(/-(?=\d)/g, "−");
-}
-
 function partWords({result, node}) {
   return [element("code", {}, node.text), ` of ${result.title}`];
 }
