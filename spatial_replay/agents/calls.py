@@ -61,7 +61,12 @@ class Outcomes(NamedTuple):
 Work: TypeAlias = Callable[[Connection, Call], None]
 Report: TypeAlias = Callable[[str, int, int | None], Awaitable[None]]
 
-_PRELOADED = ("spatial_replay.api", "spatial_replay.batch.run", "spatial_replay.sanity.differences")
+_PRELOADED = (
+    "spatial_replay.api",
+    "spatial_replay.batch.run",
+    "spatial_replay.sanity.differences",
+    *(f"spatial_replay.cli.{name}" for name in ("check", "diff", "distinguish", "info", "replay", "tune")),
+)
 """Imported once, by the process that the processes of all calls are copies of."""
 
 
