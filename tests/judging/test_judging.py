@@ -45,24 +45,28 @@ def judge(*arguments: str, code: int = 0) -> str:
 
 
 @pytest.mark.parametrize(
-    ("folder", "formula", "counts"),
+    ("folder", "limit", "staying", "reaching"),
     [
-        ("push", "F (G (d3 <= 0.05))", (27, 6, 0, 27)),
-        ("push", "F (d3 <= 0.05)", (33, 0, 0, 27)),
-        ("pick-place", "F (G (d3 <= 0.07))", (32, 6, 0, 22)),
-        ("pick-place", "F (d3 <= 0.07)", (38, 0, 0, 22)),
-        ("cubes", "F (G (d3 <= 0.04))", (5, 1, 0, 10)),
-        ("cubes", "F (d3 <= 0.04)", (6, 0, 0, 10)),
+        ("push", 0.05, (27, 6, 0, 27), (33, 0, 0, 27)),
+        ("pick-place", 0.07, (32, 6, 0, 22), (38, 0, 0, 22)),
+        ("cubes", 0.04, (5, 1, 0, 10), (6, 0, 0, 10)),
     ],
 )
 def test_episodes_of_others_agree_as_counted(
-    data_folder: Path, tmp_path: Path, folder: str, formula: str, counts: tuple[int, ...]
+    data_folder: Path,
+    tmp_path: Path,
+    folder: str,
+    limit: float,
+    staying: tuple[int, ...],
+    reaching: tuple[int, ...],
 ) -> None:
-    (tmp_path / "task.spatial").write_text(f"spec task = {formula}\n")
-    judgement = sr.judge(data_folder / "episodes" / folder, tmp_path / "task.spatial")
-    agreement = judgement.agreement
-    assert (agreement.both, agreement.only_theirs, agreement.only_ours, agreement.neither) == counts
-    assert judgement.label_rate == (counts[0] + counts[1], sum(counts))
+    specification, episodes = tmp_path / "task.spatial", data_folder / "episodes" / folder
+    specification.write_text(f"spec stays = F (G (d3 <= {limit}))\nspec reached = F (d3 <= {limit})\n")
+    for result, counts in {"stays": staying, "reached": reaching}.items():
+        judgement = sr.judge(episodes, specification, result=result, output=tmp_path / "results")
+        agreement = judgement.agreement
+        assert (agreement.both, agreement.only_theirs, agreement.only_ours, agreement.neither) == counts
+        assert judgement.label_rate == (counts[0] + counts[1], sum(counts))
 
 
 def test_numbers_are_those_of_scipy_and_statsmodels(data_folder: Path) -> None:
