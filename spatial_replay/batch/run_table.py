@@ -703,3 +703,20 @@ def _described(verdict: str | None, number: float | None) -> str:
     if verdict is None:
         return "an error"
     return f"{verdict} with robustness {'not determined' if number is None else f'{number:.6g}'}"
+
+
+MOST_WORST: Final = 10
+MOST_FLAKY: Final = 20
+"""Worst rows, and flaky results, that a report lists."""
+
+
+def total_cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
+    """Return a table of totals: the headings of its numbers, and rows of three names and then these."""
+    columns = counts_of(rows)
+    cells = []
+    for place, total in enumerate(rows):
+        spec = total.group["spec"] or total.group["file"]
+        names = [total.group["case"], f"{spec} ({EDITED_SINCE})" if total.is_edited else spec, total.about]
+        counts = [f"{numbers[place]:,}" for numbers in columns.values()]
+        cells.append([*names, *counts, "" if total.least is None else f"{total.least:.6g}"])
+    return [*columns, "least robustness"], cells

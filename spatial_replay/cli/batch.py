@@ -271,7 +271,7 @@ def batch(
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.explanations import explain_batch, failing_places
-    from spatial_replay.batch.outputs import is_github, worst_annotations, write_summary
+    from spatial_replay.batch.github import is_github, worst_annotations, write_summary
     from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.run_table import compare, with_baseline
 
@@ -337,7 +337,8 @@ def _write_outputs(
     Args:
         result: the evaluated batch, compared with a baseline if there is one.
     """
-    from spatial_replay.batch.outputs import write_junit, write_pages
+    from spatial_replay.batch.junit import write_junit
+    from spatial_replay.batch.pages import write_pages
     from spatial_replay.batch.store import ResultsFolder
 
     inputs, pages = inputs_of(suite), {}

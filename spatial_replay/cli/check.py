@@ -88,7 +88,7 @@ def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None
     """
     if form == "github":
         # imported here so that --help stays fast
-        from spatial_replay.batch.outputs import annotation, repository_path
+        from spatial_replay.batch.github import annotation, repository_path
 
         for diagnosis in diagnoses:
             file = repository_path(path)
@@ -98,7 +98,7 @@ def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None
                 )
             )
     elif form == "sarif":
-        from spatial_replay.batch.outputs import repository_path
+        from spatial_replay.batch.github import repository_path
 
         show_json(_sarif(repository_path(path), diagnoses))
 

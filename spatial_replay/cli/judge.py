@@ -221,7 +221,7 @@ def _write(
     data_set: Path | None,
     runs: Mapping[str, Stages],
 ) -> None:
-    from spatial_replay.batch.outputs import write_pages
+    from spatial_replay.batch.pages import write_pages
     from spatial_replay.judging.writers import annotate_data_set, labelled_batch, write_labels
 
     if outputs.write_labels is not None:

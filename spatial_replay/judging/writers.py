@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from spatial_replay.batch.outputs import AGREEMENT, LABEL
+from spatial_replay.batch.overview import AGREEMENT, LABEL
 from spatial_replay.batch.run import BatchResult
 from spatial_replay.errors import UsageError
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement

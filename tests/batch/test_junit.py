@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from batch.fleet import batch, write_fleet
 from examples import examples
-from spatial_replay.batch.outputs import write_junit
+from spatial_replay.batch.junit import write_junit
 from spatial_replay.batch.run_table import Tolerance
 from spatial_replay.batch.store import run_columns
 

@@ -1,0 +1,176 @@
+"""Results of a batch in a job on GitHub: annotations of lines, and the summary."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+from spatial_replay.batch.run_table import (
+    MOST_FLAKY,
+    MOST_WORST,
+    damage_word,
+    flaky_results,
+    requirement_of,
+    result_name,
+    summary_text,
+    total_cells,
+    totals,
+    verdict_word,
+    worst_rows,
+)
+from spatial_replay.errors import OutputError
+from spatial_replay.logs.remote import is_address
+from spatial_replay.report.panels import sentence_parts
+from spatial_replay.text import counted, first_lines, printable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+_ANNOTATIONS: Final = 10
+"""GitHub shows no more of one kind for a step."""
+_MOST_COMPARED: Final = 10_000
+"""Number of worst rows that are searched for failures of different kinds."""
+
+
+def is_github(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether this process is a step of a GitHub job."""
+    return environment.get("GITHUB_ACTIONS") == "true"
+
+
+def annotation(
+    severity: Literal["error", "warning"],
+    file: str,
+    line: int,
+    message: str,
+    *,
+    column: int = 0,
+    title: str = "",
+) -> str:
+    """Return the workflow command that marks a line of a file."""
+    place = {"file": file, "line": str(line), "col": str(column) if column else "", "title": title}
+    properties = ",".join(f"{name}={_property(value)}" for name, value in place.items() if value)
+    return f"::{severity} {properties}::{_data(message)}"
+
+
+def repository_path(file: str | Path, environment: Mapping[str, str] = os.environ) -> str:
+    """Return the path of a file as the tools of its repository know it: relative to the repository.
+
+    The repository is the folder of the job on GitHub, else the nearest folder above with a `.git`, else the
+    current one. A file elsewhere keeps its whole path, and an address stays.
+    """
+    if is_address(file):
+        return str(file)
+    path, current = Path(file).absolute(), Path.cwd()
+    job = environment.get("GITHUB_WORKSPACE")
+    above = next((folder for folder in (current, *current.parents) if (folder / ".git").exists()), current)
+    for base in (Path(job) if job else above, above):
+        for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
+            if candidate.is_relative_to(root):
+                return candidate.relative_to(root).as_posix()
+    return path.as_posix()
+
+
+def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
+    """Yield an annotation for each of the worst rows that fail, at the line of its spec.
+
+    Rows of one spec and verdict repeat only where there are not enough others.
+
+    Args:
+        folder: what the paths of specifications are relative to.
+    """
+    rows = [row for row in worst_rows(table, _MOST_COMPARED) if row["failure"] is not None]
+    kinds = Counter[tuple[str, str, str]]()
+    ranks = []
+    for row in rows:
+        kind = (row["file"], row["spec"], verdict_word(row))
+        ranks.append(kinds[kind])
+        kinds[kind] += 1
+    order = sorted(range(len(rows)), key=lambda place: ranks[place])
+    for row in (rows[place] for place in order[:_ANNOTATIONS]):
+        about = requirement_of(row)
+        name = f"{row['spec']} ({about})" if about else row["spec"]
+        message = f"{row['log']}: {row['failure'].rstrip('.')}. {row['reason'] or ''}".rstrip()
+        file = row["file"] if is_address(row["file"]) else folder / row["file"]
+        yield annotation("error", repository_path(file), row["line"], message, title=name)
+
+
+def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) -> None:
+    """Add the totals and the worst rows to the summary of the job, if there is one.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    file = environment.get("GITHUB_STEP_SUMMARY")
+    if not file:
+        return
+    try:
+        with Path(file).open("a", encoding="utf-8") as stream:
+            stream.write(markdown(table))
+    except OSError as error:
+        raise OutputError(f"{file}: the summary could not be written: {error.strerror}") from error
+
+
+def markdown(table: pa.Table) -> str:
+    """Return the totals and the worst rows as Markdown."""
+    numbers, rows = total_cells(totals(table))
+    lines = [
+        "### spatial-replay\n",
+        f"{summary_text(table)}\n",
+        f"| case | spec | requirement | {' | '.join(numbers)} |",
+        f"|---|---|---|{'--:|' * len(numbers)}",
+        *map(_line, rows),
+    ]
+    failing = [row for row in worst_rows(table, MOST_WORST) if row["failure"] is not None]
+    if failing:
+        count = len(table) - table.column("failure").null_count
+        lines += [
+            "",
+            f"{counted(count, 'result')} failed; the worst:",
+            "",
+            "| log | spec | requirement | verdict | failure | reason |",
+            "|---|---|---|---|---|---|",
+        ]
+        for row in failing:
+            names = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
+            verdict = f"{verdict_word(row)}{damage_word(row)}"
+            lines.append(_line([*names, verdict, row["failure"], row["reason"] or ""]))
+    flaky = first_lines([result.text for result in flaky_results(table)], MOST_FLAKY)
+    lines += ["", *(f"- {_markdown_cell(line)}" for line in flaky)] if flaky else []
+    return "\n".join([*lines, "", ""])
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(_markdown_cell(printable(cell, 500)) for cell in cells)} |"
+
+
+def _markdown_cell(sentence: str) -> str:
+    """Return a sentence, its formulas as code, that neither ends its cell nor becomes markup."""
+    pieces = []
+    for number, piece in enumerate(sentence_parts(sentence)):
+        if number % 2:
+            # within code, a backslash escapes nothing but the end of a cell
+            fence = "`" * (max(map(len, _BACKQUOTES.findall(piece)), default=0) + 1)
+            pad = " " if "`" in piece else ""
+            pieces.append(f"{fence}{pad}{piece.replace('|', _PIPE)}{pad}{fence}")
+        else:
+            pieces.append(_MARKUP.sub(r"\\\g<0>", piece).replace("<", "&lt;"))
+    return "".join(pieces)
+
+
+_BACKQUOTES: Final = re.compile("`+")
+_MARKUP: Final = re.compile(r"[\\|\[`*_~]")
+_PIPE: Final = "\\|"
+
+
+def _data(text: str) -> str:
+    """Escape the message of a workflow command: a line break would begin another one."""
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")

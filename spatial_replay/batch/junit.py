@@ -1,0 +1,170 @@
+"""Results of a batch as a JUnit report."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from xml.sax.saxutils import escape, quoteattr
+
+from spatial_replay.batch.run_table import (
+    EDITED_SINCE,
+    WORSE_THAN,
+    Values,
+    flaky_results,
+    requirement_of,
+    totals,
+)
+from spatial_replay.batch.suite import DAMAGED, DOUBTFUL, DROPPED, UNTESTED, VACUOUS
+from spatial_replay.logs.output_file import replacing
+from spatial_replay.text import counted, cut, printable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+LARGEST: Final = 30_000_000
+"""Bytes: GitLab refuses larger reports."""
+_SHORT: Final = 300
+"""Characters of a failure where the full texts would be too long."""
+
+
+def write_junit(
+    path: Path,
+    table: pa.Table,
+    name: str,
+    reports: Mapping[tuple[str, str], str] | None = None,
+    *,
+    inputs: Sequence[Path] = (),
+    largest: int = LARGEST,
+) -> None:
+    """Write the table of a run as a JUnit report.
+
+    A report that would be too large has shorter texts and, if that is not enough, lacks test cases that pass;
+    each test suite says how many.
+
+    Args:
+        name: of the whole: that of the suite.
+        reports: for cases and logs by name, the path of a page about them.
+        inputs: files that the output must not be.
+        largest: bytes of the report, at most.
+
+    Raises:
+        UsageError, OutputError: the file cannot be written.
+    """
+    text = ""
+    for limit, keeps in ((None, True), (_SHORT, True), (_SHORT, False)):
+        text = "".join(_lines(table, name, reports or {}, limit, keeps))
+        if len(text.encode()) <= largest:
+            break
+    with replacing(path, inputs) as stream:
+        stream.write(text.encode())
+
+
+def _lines(
+    table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, keeps: bool
+) -> Iterator[str]:
+    suites: dict[tuple[str, ...], list[Values]] = {}
+    keys = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
+    results = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
+    faults = ("failure", "expected", "error", "error_kind")
+    edited = {
+        (total.group["case"], total.group["file"], total.group["spec"])
+        for total in totals(table)
+        if total.is_edited
+    }
+    flaky: dict[tuple[str, str, str], list[str]] = {}
+    for result in flaky_results(table):
+        flaky.setdefault((result.case, result.file, result.spec), []).append(result.text)
+    for row in table.select([*keys, *results, *faults]).to_pylist():
+        suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
+    failures, errors = _counts(row for rows in suites.values() for row in rows)
+    yield '<?xml version="1.0" encoding="utf-8"?>\n'
+    yield (
+        f'<testsuites name={_quoted(name)} tests="{len(table)}" failures="{failures}" errors="{errors}" '
+        f'time="{_time(row for rows in suites.values() for row in rows)}">\n'
+    )
+    for (case, file, spec), rows in suites.items():
+        written = rows if keeps else [row for row in rows if row["failure"] is not None]
+        failures, errors = _counts(rows)
+        title = f"{case}.{spec or file}"
+        yield (
+            f'<testsuite name={_quoted(title)} tests="{len(rows)}" failures="{failures}" errors="{errors}" '
+            f'skipped="0" file={_quoted(file)} time="{_time(rows)}">\n<properties>\n'
+        )
+        properties = {"specification": f"{file}:{rows[0]['line']}"}
+        properties |= {key: rows[0][key] for key in ("requirement", "title") if rows[0][key]}
+        tested = Counter(row["tested"] for row in rows if row["tested"])
+        if tested:
+            properties["tested"] = ", ".join(f"{count} {kind}" for kind, count in sorted(tested.items()))
+        if (case, file, spec) in edited:
+            properties["baseline"] = EDITED_SINCE
+        pairs = [*properties.items(), *(("flaky", line) for line in flaky.get((case, file, spec), ()))]
+        for key, value in pairs:
+            yield f"<property name={_quoted(key)} value={_quoted(value)}/>\n"
+        yield "</properties>\n"
+        # two files may have a spec of one name
+        class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
+        for row in written:
+            yield from _case(row, class_name, reports, limit)
+        if len(written) < len(rows):
+            left_out = counted(len(rows) - len(written), "test case")
+            yield f"<system-out>{left_out} that passed left out, to keep this report small</system-out>\n"
+        yield "</testsuite>\n"
+    yield "</testsuites>\n"
+
+
+def _case(
+    row: Values, class_name: str, reports: Mapping[tuple[str, str], str], limit: int | None
+) -> Iterator[str]:
+    name = row["log"] if row["object"] is None else f"{row['log']}[{row['object']}]"
+    yield f'<testcase classname={_quoted(class_name)} name={_quoted(name)} time="{row["seconds"]:.3f}">\n'
+    tested = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
+    if row["failure"] is not None:
+        # errors are about the test, failures about what it tests
+        tag = "failure" if row["error"] is None else "error"
+        kind = row["error_kind"] or _unmet(row)
+        texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
+        text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
+        text = cut(text, limit or len(text))
+        message = printable(row["failure"], limit or 1_000)
+        yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"
+        if (row["case"], row["log"]) in reports:
+            yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
+    elif row["untested"] and limit is None:
+        text = _text("\n".join([*tested, *row["untested"]]))
+        yield f"<system-out>{text}</system-out>\n"
+    yield "</testcase>\n"
+
+
+def _unmet(row: Values) -> str:
+    """Return the expectation that a result did not meet, in words that results of one kind share."""
+    failure = row["failure"]
+    kinds = {UNTESTED: "untested"}
+    kinds |= {kind: kind for kind in (DOUBTFUL, WORSE_THAN, EDITED_SINCE, VACUOUS)}
+    kinds |= {"cut": "cut", "left": "left", DROPPED: "dropped", DAMAGED: "damaged log"}
+    for beginning, kind in kinds.items():
+        if failure.startswith(beginning):
+            return kind
+    return "gone" if row["verdict"] is None else f"expected {row['expected']}"
+
+
+def _counts(rows: Any) -> tuple[int, int]:
+    """Return how many rows fail, and how many have errors."""
+    kinds = [row["error"] is None for row in rows if row["failure"] is not None]
+    return sum(kinds), len(kinds) - sum(kinds)
+
+
+def _time(rows: Any) -> str:
+    """Return the seconds that rows took; those of one log took them together."""
+    return f"{sum({(row['case'], row['log']): row['seconds'] for row in rows}.values()):.3f}"
+
+
+def _text(text: str) -> str:
+    """Return a text that XML can hold."""
+    return escape("\n".join(printable(line, len(line)) for line in text.split("\n")))
+
+
+def _quoted(text: str) -> str:
+    return quoteattr(printable(str(text), 1_000))

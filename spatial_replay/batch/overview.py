@@ -1,0 +1,326 @@
+"""The page over all logs of a batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+from urllib.parse import quote
+
+import numpy as np
+
+from spatial_replay import __version__
+from spatial_replay.batch.curves import Curve, draw_curves
+from spatial_replay.batch.run_table import (
+    BASELINE_ROBUSTNESS,
+    MOST_FLAKY,
+    MOST_WORST,
+    Total,
+    Values,
+    damage_word,
+    flaky_results,
+    requirement_of,
+    result_name,
+    robustness_of,
+    summary_text,
+    total_cells,
+    totals,
+    verdict_word,
+    worst_rows,
+)
+from spatial_replay.notebook.figures import Html, element
+from spatial_replay.report.page import asset, html_page, text
+from spatial_replay.report.panels import sentence_parts
+from spatial_replay.text import counted, first_lines, with_unit
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spatial_replay.geometry.arrays import Floats
+
+
+LABEL: Final = "label"
+AGREEMENT: Final = "agreement"
+"""Columns of judged episodes: "success" or "failure", and how that compares with the verdict."""
+_MOST_LOGS: Final = 2_000
+"""Rows of the matrix; a page with more is slow to open."""
+_MOST_SPECS: Final = 60
+"""Columns of the matrix, and distributions."""
+_BINS: Final = 24
+_WIDTH: Final = 480.0
+_HEIGHT: Final = 60.0
+_STYLES: Final = ("browser/page.css", "batch:overview.css")
+
+
+def overview_page(
+    table: pa.Table,
+    name: str,
+    reports: Mapping[tuple[str, str], str],
+    curves: Mapping[str, Sequence[Curve]] = MappingProxyType({}),
+) -> bytes:
+    """Return the page, in UTF-8; equal tables give equal bytes.
+
+    Args:
+        table: of a run.
+        name: of the suite.
+        reports: for cases and logs by name, the address of the page about them, relative to this one.
+        curves: by case, those of the logs with a page.
+    """
+    body = [_header(table, name), element("main", *_panels(table, reports, curves))]
+    scripts = [asset("batch:overview.js")]
+    return html_page(f"{name}: {_headline(table)}", body, scripts, _STYLES, marks=" data-read")
+
+
+def _headline(table: pa.Table) -> str:
+    failures = len(table) - table.column("failure").null_count
+    return f"{failures:,} of {counted(len(table), 'result')} failed" if failures else "everything passed"
+
+
+def _header(table: pa.Table, name: str) -> Html:
+    failed = table.column("failure").null_count < len(table)
+    chip = element("span", _headline(table), **{"class": f"chip is-{'violated' if failed else 'satisfied'}"})
+    logs = len(set(table.column("log").to_pylist()))
+    about = " · ".join([counted(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
+    title = element("div", element("h1", text(name)), chip, **{"class": "title"})
+    return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})
+
+
+def _panels(
+    table: pa.Table, reports: Mapping[tuple[str, str], str], curves: Mapping[str, Sequence[Curve]]
+) -> Iterator[Html]:
+    by_spec = totals(table)
+    yield _panel("Specifications", _totals(by_spec))
+    worst = [row for row in worst_rows(table, MOST_WORST) if row["failure"] is not None]
+    if worst:
+        yield _panel("The worst", _worst(worst, reports))
+    flaky = first_lines([result.text for result in flaky_results(table)], MOST_FLAKY)
+    if flaky:
+        yield _panel("Flaky", element("ul", *(element("li", text(line)) for line in flaky)))
+    plots = _plots(table, by_spec[:_MOST_SPECS], curves)
+    yield _panel("Robustness", element("div", *plots, **{"class": "plots"}))
+    yield _panel("Logs", *_matrix(table, by_spec[:_MOST_SPECS], reports))
+
+
+def _panel(title: str, *content: Html) -> Html:
+    # what may be wider than the page can be scrolled with keys
+    attributes = {"class": "panel", "aria-label": title, "tabindex": "0"}
+    return element("section", element("h2", title), *content, **attributes)
+
+
+def _totals(by_spec: Sequence[Total]) -> Html:
+    names = ("case", "spec", "requirement")
+    numbers, cells = total_cells(by_spec)
+    head = [*(element("th", name) for name in names), *(_number("th", name) for name in numbers)]
+    rows = [
+        element(
+            "tr",
+            *(element("td", text(cell)) for cell in row[: len(names)]),
+            *(_number("td", cell) for cell in row[len(names) :]),
+        )
+        for row in cells
+    ]
+    return element("table", element("thead", element("tr", *head)), element("tbody", *rows))
+
+
+def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
+    names = [element("th", name) for name in ("log", "spec")]
+    texts = [element("th", name) for name in ("failure", "reason")]
+    head = element("tr", *names, _number("th", "robustness"), *texts)
+    body = [
+        element(
+            "tr",
+            element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
+            element("td", *_named(row)),
+            _number("td", robustness_of(row)),
+            element("td", text(row["failure"])),
+            element("td", *_with_code(row["reason"] or "")),
+        )
+        for row in rows
+    ]
+    return element("table", element("thead", head), element("tbody", *body))
+
+
+def _named(row: Values) -> Iterator[Html]:
+    """Yield the name of a result, and below it the requirement that it is about."""
+    yield text(result_name(row["spec"] or row["file"], row["object"]))
+    if about := requirement_of(row):
+        yield element("div", text(about), **{"class": "requirement"})
+
+
+def _with_code(sentence: str) -> Iterator[Html]:
+    """Yield a sentence, its formulas as code."""
+    for number, piece in enumerate(sentence_parts(sentence)):
+        yield element("code", text(piece)) if number % 2 else text(piece)
+
+
+def _plots(
+    table: pa.Table, by_spec: Sequence[Total], curves: Mapping[str, Sequence[Curve]]
+) -> Iterator[Html]:
+    import pyarrow.compute as pc
+
+    has_cases = len({total.group["case"] for total in by_spec}) > 1
+    for total in by_spec:
+        group = total.group
+        fits = pc.and_(
+            pc.and_(pc.equal(table["case"], group["case"]), pc.equal(table["file"], group["file"])),
+            pc.equal(table["spec"], group["spec"]),
+        )
+        rows = table.filter(fits)
+        numbers = np.asarray(rows.column("robustness").to_numpy(), np.float64)
+        finite = numbers[np.isfinite(numbers)]
+        unit = next(filter(None, rows.column("unit").to_pylist()), "")
+        if len(finite):
+            case = group["case"] if has_cases else None
+            title = " · ".join(filter(None, (case, total.requirement, group["spec"])))
+            caption = element("figcaption", text(title), **_tip(total.about))
+            of_spec = [curve for curve in curves.get(group["case"], ()) if group["spec"] in ("", curve.spec)]
+            yield element("figure", caption, _histogram(finite, unit), draw_curves(of_spec, unit))
+
+
+def _histogram(numbers: Floats, unit: str) -> Html:
+    """Return a distribution as a drawing; a bin lies on one side of 0, where the verdict changes."""
+    low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
+    if low == high:
+        high = low + 1.0
+    width = (high - low) / _BINS
+    below = math.ceil(-low / width) if low < 0.0 else 0
+    edges = (np.arange(_BINS + 2) - below) * width
+    counts, _ = np.histogram(numbers, edges)
+    tallest, step = max(1, int(counts.max())), _WIDTH / len(counts)
+    bars = []
+    for number, count in enumerate(counts.tolist()):
+        height = _HEIGHT * count / tallest
+        side = "bad" if number < below else "good"
+        place = {"x": number * step + 0.5, "y": _HEIGHT - height, "width": step - 1.0, "height": height}
+        # what is read is the text beside the drawing, so the tip of a bar says its count
+        tip = element("title", f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}")
+        attributes = {name: f"{value:.2f}" for name, value in place.items()}
+        bars.append(element("rect", tip, **attributes, **{"class": side}))
+    zero = f"{below * step:.2f}"
+    axis = element("line", x1=zero, x2=zero, y1="0", y2=f"{_HEIGHT + 3:.0f}")
+    labels = [
+        element("text", with_unit(low, unit), x="0", y=f"{_HEIGHT + 12:.0f}"),
+        element(
+            "text",
+            with_unit(high, unit),
+            x=f"{_WIDTH:.0f}",
+            y=f"{_HEIGHT + 12:.0f}",
+            **{"text-anchor": "end"},
+        ),
+    ]
+    name = f"Distribution of robustness from {low:.4g} to {high:.4g}"
+    view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
+    return element("svg", *bars, axis, *labels, viewBox=view, role="img", **{"aria-label": name})
+
+
+def _matrix(
+    table: pa.Table, by_spec: Sequence[Total], reports: Mapping[tuple[str, str], str]
+) -> Iterator[Html]:
+    """Yield a row for each log, the worst first, and a column for each spec."""
+    columns = [(total.group["case"], total.group["file"], total.group["spec"]) for total in by_spec]
+    cells: dict[str, dict[tuple[str, str, str], Values]] = {}
+    rows = worst_rows(table, len(table))
+    is_judged = LABEL in table.column_names
+    if is_judged:
+        rows.sort(key=_agrees)
+    for row in rows:
+        column = (row["case"], row["file"], row["spec"])
+        log = cells.get(row["log"])
+        if log is None:
+            if len(cells) >= _MOST_LOGS:
+                continue
+            log = cells[row["log"]] = {}
+        # of a template, the worst object
+        log.setdefault(column, row)
+    logs = len(set(table.column("log").to_pylist()))
+    if logs > len(cells):
+        words = f"The {len(cells):,} worst of {counted(logs, 'log')}; the table of the run has them all."
+        yield element("p", words)
+    cases = {case for case, _, _ in columns}
+    yield _filter()
+    titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
+    abouts = [total.about for total in by_spec]
+    label = [_sortable(LABEL, "")] if is_judged else []
+    head = [_sortable("log", ""), *label, *map(_sortable, titles, ["number"] * len(titles), abouts)]
+    body = []
+    for name, of_log in cells.items():
+        row_cells = [_cell(of_log.get(column)) for column in columns]
+        report = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
+        if is_judged:
+            row_cells.insert(0, _label_cell(next(iter(of_log.values()))))
+        body.append(element("tr", element("td", _linked(report, reports)), *row_cells))
+    yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
+
+
+def _filter() -> Html:
+    """Return what the rows of the matrix can be filtered by, and buttons that go through those that fail."""
+    words = element("input", type="search", placeholder="name", **{"aria-label": "Name of a log"})
+    box = element("label", element("input", type="checkbox", id="only-failing"), " only failing")
+    steps = [
+        element("button", f"{word} failing", type="button", **{"class": "step", "data-step": step})
+        for word, step in (("Previous", "-1"), ("Next", "1"))
+    ]
+    left = element("span", "", id="left", role="status")
+    return element("p", "Marked results fail. ", words, box, *steps, left, id="filter")
+
+
+def _agrees(row: Values) -> bool:
+    """Return whether the label of a row agrees with the verdict, or is not compared with it."""
+    return row[AGREEMENT] not in ("only_theirs", "only_ours")
+
+
+def _label_cell(row: Values) -> Html:
+    if row[LABEL] is None:
+        return element("td", "")
+    kind = "is-satisfied" if row[LABEL] == "success" else "is-violated"
+    words = row[LABEL] if _agrees(row) else f"{row[LABEL]}, {row[AGREEMENT].replace('_', ' ')}"
+    return element("td", words, **{"class": kind if _agrees(row) else f"{kind} fails"})
+
+
+def _cell(row: Values | None) -> Html:
+    if row is None:
+        return element("td", "", **{"class": "number", "data-value": "1e400"})
+    number, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
+    kind = f"number is-{verdict}{' fails' if fails else ''}"
+    was = row.get(BASELINE_ROBUSTNESS)
+    before = f" (was {was:.4g})" if fails and was is not None and was != number else ""
+    if row["verdict"] is None:
+        return element(
+            "td", f"{verdict}{before}", title=row["failure"] or "", **{"class": kind, "data-value": "-1e400"}
+        )
+    words = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
+    value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
+    why = f": {row['failure'].rstrip('.')}" if fails else ""
+    tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}."
+    tip = " ".join(
+        [
+            tip,
+            *filter(None, [row["reason"]]),
+            *(sentence for sentence in row["untested"] or () if sentence.rstrip(".") not in why),
+        ]
+    )
+    words = f"{words}{damage_word(row)}{before}"
+    return element("td", words, title=tip, **{"class": kind, "data-value": value})
+
+
+def _sortable(title: str, kind: str, about: str = "") -> Html:
+    button = element("button", text(title), type="button", **_tip(about))
+    return element("th", button, scope="col", **{"class": kind})
+
+
+def _tip(about: str) -> dict[str, str]:
+    """Return the attribute with which a name shows the requirement that it is about."""
+    return {"title": about} if about else {}
+
+
+def _number(tag: str, words: str) -> Html:
+    return element(tag, words, **{"class": "number"})
+
+
+def _linked(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:
+    """Return the name of a log, given with its case, linked to the page about it."""
+    return element("a", text(log[1]), href=quote(reports[log])) if log in reports else text(log[1])
+
+
+INDEX: Final = "index.html"
