@@ -22,6 +22,7 @@ import click
 from spatial_replay.cli.application import run
 from spatial_replay.cli.terminal import Listener, listening
 from spatial_replay.errors import importing
+from spatial_replay.spec.relations import PLUGINS_VARIABLE
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -81,6 +82,8 @@ def work(channel: Connection, call: Call) -> None:
     output, lines of standard error, document)`.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # plug-ins that the user allows elsewhere stay off: a specification of an agent runs no code
+    os.environ.pop(PLUGINS_VARIABLE, None)
     os.chdir(call.folder)
     tempfile.tempdir = call.folder
     # before any code of the call runs: this process reads nothing else

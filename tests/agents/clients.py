@@ -79,10 +79,12 @@ class Agent:
 
 
 @contextmanager
-def agent(*arguments: object, protocol: str = "auto") -> Iterator[Agent]:
-    """Start a server, and connect a client to it."""
+def agent(*arguments: object, protocol: str = "auto", **variables: str) -> Iterator[Agent]:
+    """Start a server, with some environment variables, and connect a client to it."""
     server = StdioServerParameters(
-        command=sys.executable, args=["-m", "spatial_replay", "mcp", *map(str, arguments)], env=environment()
+        command=sys.executable,
+        args=["-m", "spatial_replay", "mcp", *map(str, arguments)],
+        env=environment(**variables),
     )
     transport = _older(server) if protocol == OLDER else server
     client = Client(transport, mode="legacy" if protocol == OLDER else protocol)

@@ -56,46 +56,52 @@ def newest(logs: Path, reports: Path) -> Iterator[Agent]:
         yield connected
 
 
-@pytest.mark.parametrize("protocol", ["2026-07-28", OLDER])
-def test_a_session_leads_from_a_bag_to_an_explanation(logs: Path, reports: Path, protocol: str) -> None:
-    with agent("--root", logs, "--output", reports, protocol=protocol) as connected:
-        rows = connected.call("list_logs").document["logs"]
-        assert [row["path"] for row in rows] == [
-            "drive",
-            "episodes/table0.jsonl",
-            "episodes/table1.jsonl",
-            "table.jsonl",
-        ]
-        assert (rows[3]["seconds"], rows[3]["objects"]) == (
-            pytest.approx(9.967, abs=1e-3),
-            ["cup", "fork", "milk", "plate", "spoon"],
-        )
-        mapping = connected.call("suggest_mapping", log="drive").document["mapping"]
-        bag = {"log": "drive", "mapping": mapping}
-        assert [row["name"] for row in connected.call("describe_log", **bag).document["objects"]] == [
-            "a",
-            "b",
-        ]
-        assert "'(' is never closed" in connected.call("check", specification="F (a dist b <= 1").text
-        sentence = "F (a dist b <= 4)"
-        assert (
-            "all names, thresholds and windows fit"
-            in connected.call("check", specification=sentence, **bag).text
-        )
-        neighbour = connected.call("distinguish", first=sentence, second="G (a dist b <= 4)")
-        assert neighbour.document["only_first"]["samples"] == ["a dist b <= 4", "not (a dist b <= 4)"]
-        (result,) = connected.call("evaluate", specification=sentence, **bag).document["specifications"]
-        assert result["verdict"] == "satisfied"
-        assert "a and b are" in connected.call("explain", specification=sentence, **bag).text
-        page = connected.call("report", specification=sentence, **bag).document["path"]
-        assert Path(page) == reports / "drive.html"
-        if protocol == OLDER:
-            assert {
-                tool.annotations.read_only_hint for tool in connected.tools.values() if tool.name != "report"
-            } == {True}
-            assert not any(tool.annotations.open_world_hint for tool in connected.tools.values())
+def test_a_session_leads_from_a_bag_to_an_explanation(newest: Agent, reports: Path) -> None:
+    assert newest.client.protocol_version == "2026-07-28"
+    _follow_session(newest, reports)
+    hints = {name: tool.annotations for name, tool in newest.tools.items()}
+    assert {name for name, hint in hints.items() if not hint.read_only_hint} == {"report"}
+    assert not any(hint.open_world_hint for hint in hints.values())
 
 
+def test_an_older_client_is_served_as_well(logs: Path, reports: Path) -> None:
+    with agent("--root", logs, "--output", reports, protocol=OLDER) as connected:
+        _follow_session(connected, reports)
+
+
+def _follow_session(connected: Agent, reports: Path) -> None:
+    rows = connected.call("list_logs").document["logs"]
+    assert [row["path"] for row in rows] == [
+        "drive",
+        "episodes/table0.jsonl",
+        "episodes/table1.jsonl",
+        "table.jsonl",
+    ]
+    assert (rows[3]["seconds"], rows[3]["objects"]) == (
+        pytest.approx(9.967, abs=1e-3),
+        ["cup", "fork", "milk", "plate", "spoon"],
+    )
+    mapping = connected.call("suggest_mapping", log="drive").document["mapping"]
+    bag = {"log": "drive", "mapping": mapping}
+    assert [row["name"] for row in connected.call("describe_log", **bag).document["objects"]] == [
+        "a",
+        "b",
+    ]
+    assert "'(' is never closed" in connected.call("check", specification="F (a dist b <= 1").text
+    sentence = "F (a dist b <= 4)"
+    assert (
+        "all names, thresholds and windows fit" in connected.call("check", specification=sentence, **bag).text
+    )
+    neighbour = connected.call("distinguish", first=sentence, second="G (a dist b <= 4)")
+    assert neighbour.document["only_first"]["samples"] == ["a dist b <= 4", "not (a dist b <= 4)"]
+    (result,) = connected.call("evaluate", specification=sentence, **bag).document["specifications"]
+    assert result["verdict"] == "satisfied"
+    assert "a and b are" in connected.call("explain", specification=sentence, **bag).text
+    page = connected.call("report", specification=sentence, **bag).document["path"]
+    assert Path(page) == reports / "drive.html"
+
+
+JUDGED = ["judge", "episodes", "--spec", "old.spatial"]
 EVALUATED = {"log": "table.jsonl", "specification": "old.spatial"}
 CASES: list[tuple[str, dict[str, Any], list[str]]] = [
     ("describe_log", {"log": "table.jsonl"}, ["info", "table.jsonl", "--json"]),
@@ -289,7 +295,10 @@ def test_pages_are_short_and_the_prompt_quotes_the_sentence(newest: Agent) -> No
 
 def test_a_cancelled_call_a_crash_and_a_limit_end_only_their_process(logs: Path) -> None:
     others = set(processes_of(os.getpid()))
-    with agent("--root", logs, "--limit", "3") as connected:
+    (logs / "cell.py").write_text("raise SystemExit\n")
+    plugins = {"SPATIAL_REPLAY_PLUGINS": str(logs / "cell.py")}
+    with agent("--root", logs, "--limit", "3", **plugins) as connected:
+        assert "error: 'cell' is" in connected.call("check", specification=f"use cell\nspec s = {NEAR}").text
         assert "start the server with --output" in connected.call("report", log="table.jsonl").error
         assert connected.call("check", specification=NEAR).values["exit_code"] == 0
         before = set(processes_of(os.getpid()))

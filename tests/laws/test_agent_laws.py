@@ -24,7 +24,7 @@ values = st.recursive(
 documents = st.dictionaries(st.text(max_size=8), values, max_size=6)
 
 
-@examples(60)
+@examples(25)
 @given(
     st.lists(texts, max_size=40), st.lists(texts, max_size=40), documents, st.lists(documents, max_size=40)
 )
