@@ -139,8 +139,8 @@ class Sample:
         if not 0 <= self.time_ns <= LATEST_NS:
             raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
         objects: dict[str, TrackedObject] = {}
-        given: Mapping[str, object] = self.objects
-        for name, tracked in given.items():
+        tracked_by_name: Mapping[str, object] = self.objects
+        for name, tracked in tracked_by_name.items():
             _require_name(name, "an object")
             if isinstance(tracked, Footprint):
                 tracked = TrackedObject(tracked)
@@ -441,10 +441,10 @@ class Trace(Displayed):
         unknown = self.is_unknown
         turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
         is_close = np.concatenate([[False], np.diff(self.times_ns) == 1, [False]])
-        found = np.zeros(len(self), np.bool_)
+        is_filling = np.zeros(len(self), np.bool_)
         for start, end in turns.reshape(-1, 2)[is_close[turns].reshape(-1, 2).any(axis=1)].tolist():
-            found[start:end] = True
-        return found
+            is_filling[start:end] = True
+        return is_filling
 
     def without_filling(self) -> Trace:
         """Return the samples that the log has."""
@@ -468,18 +468,18 @@ class Trace(Displayed):
             TraceError: times that do not increase, or too many names.
             UsageError: units that are not texts.
         """
-        listed = list(samples)
-        for each in listed:
-            require_sample(each)
-        names = tuple(sorted({name for each in listed for name in (*each.objects, *each.unknown)}))
-        signals = sorted({name for sample in listed for name in sample.signals})
+        sequence = list(samples)
+        for sample in sequence:
+            require_sample(sample)
+        names = tuple(sorted({name for sample in sequence for name in (*sample.objects, *sample.unknown)}))
+        signals = sorted({name for sample in sequence for name in sample.signals})
         require_few(names, signals)
         number = {name: index for index, name in enumerate(names)}
-        rows = np.full((len(listed), len(names)), ABSENT, np.int64)
+        rows = np.full((len(sequence), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
         # what is known of an object that is not known where: its class, in a row after the others
         blank: list[tuple[int, str, str | None]] = []
-        for index, sample in enumerate(listed):
+        for index, sample in enumerate(sequence):
             for name in sorted(sample.objects):
                 rows[index, number[name]] = len(observed)
                 observed.append(sample.objects[name])
@@ -488,24 +488,27 @@ class Trace(Displayed):
             rows[index, number[name]] = -2 - row
         named = [*(tracked.class_name for tracked in observed), *(class_name for *_, class_name in blank)]
         classes = class_order(named)
-        columns = {name: [sample.signals.get(name, np.nan) for sample in listed] for name in signals}
-        known = FootprintBatch.from_footprints(
-            [each.footprint for each in observed], [each.height for each in observed]
+        columns = {name: [sample.signals.get(name, np.nan) for sample in sequence] for name in signals}
+        known_shapes = FootprintBatch.from_footprints(
+            [tracked.footprint for tracked in observed], [tracked.height for tracked in observed]
         )
-        shapes = FootprintBatch.concatenate([known, FootprintBatch.unknown(len(blank))])
-        yaws = [*(np.nan if each.yaw is None else each.yaw for each in observed), *(np.nan for _ in blank)]
+        shapes = FootprintBatch.concatenate([known_shapes, FootprintBatch.unknown(len(blank))])
+        yaws = [
+            *(np.nan if tracked.yaw is None else tracked.yaw for tracked in observed),
+            *(np.nan for _ in blank),
+        ]
         return cls(
-            times_ns=np.array([sample.time_ns for sample in listed], np.int64),
+            times_ns=np.array([sample.time_ns for sample in sequence], np.int64),
             names=names,
             rows=rows,
             footprints=shapes,
             yaw=np.array(yaws, np.float64),
-            uncertainty=np.array([*(each.uncertainty for each in observed), *(0.0 for _ in blank)]),
+            uncertainty=np.array([*(tracked.uncertainty for tracked in observed), *(0.0 for _ in blank)]),
             class_code=np.array([classes.index(name) for name in named], np.int64),
             classes=classes,
             signals={name: np.array(values, np.float64) for name, values in columns.items()},
-            **_reported_of_samples(listed, names, signals),
-            lasting=frozenset().union(*(sample.lasting for sample in listed)),
+            **_reported_of_samples(sequence, names, signals),
+            lasting=frozenset().union(*(sample.lasting for sample in sequence)),
             units=checked_units(units),
         )
 
@@ -521,9 +524,9 @@ class Trace(Displayed):
                 name: self.classes[int(self.class_code[-2 - row])] for name, row in rows if row < ABSENT
             }
             values = ((name, float(column[index])) for name, column in self.signals.items())
-            known = {name: value for name, value in values if value == value}
-            reported_ns = self._reported_in(index, objects, known)
-            yield Sample(time_ns, objects, known, unknown, reported_ns, self.lasting)
+            signals = {name: value for name, value in values if value == value}
+            reported_ns = self._reported_in(index, objects, signals)
+            yield Sample(time_ns, objects, signals, unknown, reported_ns, self.lasting)
 
     def _reported_in(self, index: int, objects: Collection[str], signals: Collection[str]) -> dict[str, int]:
         reported_ns = {
@@ -722,8 +725,8 @@ def _check_shapes(trace: Trace) -> None:
         raise TraceError(f"names are {trace.names}; give each once, in order of code points")
     for column in ("yaw", "uncertainty", "class_code"):
         if (shape := getattr(trace, column).shape) != (observations,):
-            wanted = f"{observations} footprints need ({observations},)"
-            raise TraceError(f"{column} has the shape {shape}; {wanted}")
+            needed = f"{observations} footprints need ({observations},)"
+            raise TraceError(f"{column} has the shape {shape}; {needed}")
     if trace.rows.size and (trace.rows.max() >= observations or trace.rows.min() < -1 - observations):
         raise TraceError(f"a row number lies outside the {observations} observations")
     for name, values in trace.signals.items():
@@ -767,7 +770,7 @@ def _same_samples(a: Trace, b: Trace) -> bool:
     if a.reported_ns is not None and b.reported_ns is not None:
         pairs.append((a.reported_ns, b.reported_ns))
     # only numbers with a point can be NaN
-    return all(np.array_equal(one, other, equal_nan=one.dtype.kind == "f") for one, other in pairs)
+    return all(np.array_equal(first, second, equal_nan=first.dtype.kind == "f") for first, second in pairs)
 
 
 def renumbered(rows: Integers) -> tuple[Integers, Integers]:
@@ -865,18 +868,18 @@ class Pauses:
 
     def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
         """Return a sentence about the pauses of `what`; None without any."""
-        found = self.found()
-        if not found:
+        pauses = self.found()
+        if not pauses:
             return None
         parts: list[str | Instant] = []
-        for start_ns, length_ns in found[:_MOST_LISTED]:
+        for start_ns, length_ns in pauses[:_MOST_LISTED]:
             comma = ", " if parts else ""
             parts += [f"{comma}for {length_ns / 1e9:.3f} s from ", Instant(start_ns, 0), " on"]
-        more = len(found) - _MOST_LISTED
+        more = len(pauses) - _MOST_LISTED
         others = f", and {counted(more, 'more time')}" if more > 0 else ""
         usual = f", where one usually comes every {self.usual_ns / 1e9:.3g} s"
         unknown = "`max_gap` makes what lies there unknown"
-        if max_gap_ns is not None and found[0][1] > max_gap_ns:
+        if max_gap_ns is not None and pauses[0][1] > max_gap_ns:
             unknown = f"what lies in a pause of more than {max_gap_ns / 1e9:g} s is unknown (`max_gap`)"
         return Sentence(f"{what} pause ", *parts, f"{others}{usual}; {unknown}")
 

@@ -53,10 +53,10 @@ class Axes:
     def from_metadata(cls, about: Mapping[str, str]) -> Axes:
         """Return the axes that a log's metadata say its source had; ours, where they say nothing."""
         try:
-            found, signals = (json.loads(about.get(key, "{}")) for key in (AXES_KEY, SIGNAL_UNITS_KEY))
-            y: Literal["up", "down"] = "down" if found.get("y") == "down" else "up"
+            axes, signals = (json.loads(about.get(key, "{}")) for key in (AXES_KEY, SIGNAL_UNITS_KEY))
+            y: Literal["up", "down"] = "down" if axes.get("y") == "down" else "up"
             declared = {name: unit for name, unit in signals.items() if name and isinstance(unit, str)}
-            return cls(y, float(found.get("scale", 1.0)), str(found.get("unit", "")), declared)
+            return cls(y, float(axes.get("scale", 1.0)), str(axes.get("unit", "")), declared)
         except (ValueError, TypeError, AttributeError, RecursionError):
             return cls()
 
@@ -157,9 +157,9 @@ def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B"))
     """
     ratios, example = [], ""
     for name in sorted(set(a.names) & set(b.names)):
-        one, other = _size(a, name), _size(b, name)
-        if min(one, other) > 0.0:
-            ratios.append(one / other)
+        size_a, size_b = _size(a, name), _size(b, name)
+        if min(size_a, size_b) > 0.0:
+            ratios.append(size_a / size_b)
             times, which = (ratios[0], called[0]) if ratios[0] > 1.0 else (1.0 / ratios[0], called[1])
             example = example or f"{name} is {times:,.0f} times as large in {which}"
     if ratios and (min(ratios) >= OTHER_UNITS or max(ratios) <= 1.0 / OTHER_UNITS):
