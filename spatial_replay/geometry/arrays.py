@@ -149,13 +149,13 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
     """
     if isinstance(rows, slice):
         return _mapped(table, lambda name: getattr(table, name)[rows])
-    listed = cache(rows.tolist)
+    row_numbers = cache(rows.tolist)
 
     def chosen(name: str) -> Any:
         column = getattr(table, name)
         if isinstance(column, np.ndarray):
             return column[rows]
-        return column.select(rows) if hasattr(column, "select") else [column[row] for row in listed()]
+        return column.select(rows) if hasattr(column, "select") else [column[row] for row in row_numbers()]
 
     return _mapped(table, chosen)
 
@@ -176,6 +176,6 @@ def concatenated(tables: Sequence[_Table]) -> _Table:
 
 
 def _mapped(table: _Table, column: Callable[[str], Any]) -> _Table:
-    names = (each.name for each in fields(cast(Any, table)))
+    names = (column_field.name for column_field in fields(cast(Any, table)))
     columns = {name: column(name) for name in names if not isinstance(getattr(table, name), Mapping)}
     return cast(_Table, replace(cast(Any, table), **columns))

@@ -127,8 +127,8 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     """
     outlines = normalise_polygons(start, vertices)
     if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
-        each = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
-        return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in each]
+        parts = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
+        return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in parts]
     corners, ends = outlines.vertices.tobytes(), (_OF_VERTEX * outlines.vertex_start).tolist()
     return [
         _checked_part(corners[begin:end], rounding)
@@ -444,7 +444,7 @@ class FootprintBatch:
         packed = [part.packed for footprint in footprints for part in footprint.parts]
         # a part's number of vertices and radius lie before its vertices
         numbers = np.frombuffer(b"".join(packed)).reshape(-1, 2)
-        heads = starts_from_counts([len(each) for each in packed]) // numbers.strides[0]
+        heads = starts_from_counts([len(part) for part in packed]) // numbers.strides[0]
         intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
         return cls(
             part_start=starts_from_counts([len(footprint.parts) for footprint in footprints]),
@@ -514,9 +514,9 @@ class FootprintBatch:
             GeometryError: coordinates that are not those of convex parts.
         """
         is_all = len(rows) == len(self) and list(rows) == list(range(len(self)))
-        chosen = self if is_all else self.select(np.array(rows, np.int64))
-        parts = convex_parts(chosen.vertex_start, chosen.vertices, chosen.radius)
-        return [Footprint(tuple(parts[begin:end])) for begin, end in pairwise(chosen.part_start.tolist())]
+        batch = self if is_all else self.select(np.array(rows, np.int64))
+        parts = convex_parts(batch.vertex_start, batch.vertices, batch.radius)
+        return [Footprint(tuple(parts[begin:end])) for begin, end in pairwise(batch.part_start.tolist())]
 
     def height(self, row: int) -> tuple[float, float] | None:
         """Return the height interval (bottom, top) of one row, or None."""

@@ -176,11 +176,11 @@ def candidate_pairs(
     Returns:
         (P, 2), the lesser of two places among `rows` first, in order.
     """
-    chosen = batch.select(rows)
-    first_vertex = chosen.vertex_start[chosen.part_start[:-1]]
-    radius = np.repeat(chosen.radius, np.diff(chosen.vertex_start))[:, None]
-    least = np.minimum.reduceat(chosen.vertices - radius, first_vertex)
-    greatest = np.maximum.reduceat(chosen.vertices + radius, first_vertex)
+    footprints = batch.select(rows)
+    first_vertex = footprints.vertex_start[footprints.part_start[:-1]]
+    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    least = np.minimum.reduceat(footprints.vertices - radius, first_vertex)
+    greatest = np.maximum.reduceat(footprints.vertices + radius, first_vertex)
     high = closest_pairs(batch, rows[None], uncertainty, enlargement)[0, 2]
     size = max(np.abs(least).max(), np.abs(greatest).max())
     reach = high + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * size
@@ -194,8 +194,8 @@ def candidate_pairs(
         near = (low <= greatest[at, 1] + reach) & (least[at, 1] <= high + reach)
         others = order[at + 1 : end][near]
         pairs.append(np.sort(np.column_stack([np.full_like(others, order[at]), others])))
-    found = np.concatenate(pairs).astype(np.int64)
-    return found[np.lexsort(found.T[::-1])]
+    joined_pairs = np.concatenate(pairs).astype(np.int64)
+    return joined_pairs[np.lexsort(joined_pairs.T[::-1])]
 
 
 @elementwise
