@@ -74,10 +74,10 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         LogError: the file has the name of a log, and is none.
         RemoteError: an address does not answer.
     """
-    given: object = path
-    if not isinstance(given, (str, PathLike)):
+    argument: object = path
+    if not isinstance(argument, (str, PathLike)):
         remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
-        raise UsageError(f"path is {shortened(given)}; {remedy}")
+        raise UsageError(f"path is {shortened(argument)}; {remedy}")
     options = ReadOptions(**reading)
     if (address := data_set_address(path)) is not None:
         return _open_episode(*address, options)
@@ -299,7 +299,7 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
 
     folder = os.fspath(metadata).removesuffix(BAG_METADATA)
     try:
-        listed = bag_metadata_from_bytes(metadata.read(0, LARGEST_METADATA + 1)).files
+        names = bag_metadata_from_bytes(metadata.read(0, LARGEST_METADATA + 1)).files
     except MissingFileError as error:
         raise MissingFileError(
             f"{error}; a ROS 2 bag is the address of its folder, and any other log that of one file, such as "
@@ -308,16 +308,16 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
     except LogError as error:
         raise LogError(f"{metadata} cannot be used: {error}; copy the bag to this machine") from None
     if is_web(metadata):
-        listed = tuple(map(quote, listed))
-    return [metadata, *(RemoteFile(folder + name) for name in listed)]
+        names = tuple(map(quote, names))
+    return [metadata, *(RemoteFile(folder + name) for name in names)]
 
 
 def downloaded_bag(metadata: RemoteFile) -> Path:
     """Return the folder with a copy of the ROS 2 bag at an address; see `downloaded`."""
-    shown = str(metadata).removesuffix(BAG_METADATA)
-    name = shown.rstrip("/").rpartition("/")[2].strip(".") or "bag"
+    address = str(metadata).removesuffix(BAG_METADATA)
+    name = address.rstrip("/").rpartition("/")[2].strip(".") or "bag"
     reason = "the files of a ROS 2 bag are read together"
-    return downloaded_folder(bag_files_at(metadata), shown, reason, name)
+    return downloaded_folder(bag_files_at(metadata), address, reason, name)
 
 
 def format_of(path: LogFile) -> str | None:
@@ -327,13 +327,13 @@ def format_of(path: LogFile) -> str | None:
         MissingFileError: the file cannot be opened.
     """
     head = _head(path)
-    return next((kind for kind, each in FORMATS.items() if each.recognise(head)), None)
+    return next((kind for kind, log_format in FORMATS.items() if log_format.recognise(head)), None)
 
 
 def is_bag_folder(path: Path) -> bool:
     """Return whether a folder holds what a ROS 2 bag is made of."""
     try:
-        return path.is_dir() and any(_BAG_FILE.search(each.name) for each in path.iterdir())
+        return path.is_dir() and any(_BAG_FILE.search(entry.name) for entry in path.iterdir())
     except (OSError, ValueError):
         return False
 
@@ -401,7 +401,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open an external log of messages."""
     if options.mapping is None:
         if isinstance(path, Path) and path.is_dir() and not (path / BAG_METADATA).exists():
-            first = min(each.name for each in path.iterdir() if _BAG_FILE.search(each.name))
+            first = min(entry.name for entry in path.iterdir() if _BAG_FILE.search(entry.name))
             raise UsageError(
                 f"{path.name} is a folder without {BAG_METADATA}; give one of its logs, such as "
                 f"{printable(str(path / first))}, or all of them to `spatial-replay batch`; "

@@ -77,7 +77,7 @@ class Survey:
 
     @property
     def messages(self) -> int:
-        return sum(each.messages for each in self.topics)
+        return sum(topic.messages for topic in self.topics)
 
 
 def messages_in(path: str | PathLike[str]) -> MessageReader | None:
@@ -187,14 +187,14 @@ class Fitness:
     def lacks(self, required: Mapping[str, Any]) -> Iterator[str]:
         """Yield how a log falls short of the `requires` of a suite."""
         yield from self.samples.lacks(required.get("samples", {}), "samples")
-        for name, wanted in required.get("topics", {}).items():
+        for name, requirement in required.get("topics", {}).items():
             if name in self.topics:
-                yield from self.topics[name].lacks(wanted, f"messages of {name}")
+                yield from self.topics[name].lacks(requirement, f"messages of {name}")
             else:
                 yield f"there is no message of {name}"
         for name, share in required.get("objects", {}).items():
-            if (known := self.objects.get(name, 0.0)) < share:
-                yield f"{name} is known in {known:g} of the samples, at least {share:g} are required"
+            if (known_share := self.objects.get(name, 0.0)) < share:
+                yield f"{name} is known in {known_share:g} of the samples, at least {share:g} are required"
 
 
 def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
@@ -277,8 +277,8 @@ class _Counter:
         except LogError as error:
             start = f"topic {topic!r}: "
             what = f"{start}{str(error).removeprefix(start)}, at "
-            here = Sentence(what, Instant(message.log_time_ns, 0))
-            count, first = self._undecodable.get(topic, (0, here))
+            fault = Sentence(what, Instant(message.log_time_ns, 0))
+            count, first = self._undecodable.get(topic, (0, fault))
             self._undecodable[topic] = count + 1, first
 
     def take_remarks(self) -> list[str]:
@@ -422,7 +422,9 @@ class _Tally:
             self.samples_with[name] += len(readable) + len(unreadable)
             self.unreadable[name] += len(unreadable)
             codes = np.unique(trace.class_code[np.concatenate([readable, unreadable])]).tolist()
-            self.classes[name].update(each for code in codes if (each := trace.classes[code]) is not None)
+            self.classes[name].update(
+                class_name for code in codes if (class_name := trace.classes[code]) is not None
+            )
 
     def objects(self) -> tuple[ObjectOverview, ...]:
         return tuple(

@@ -162,9 +162,9 @@ def _write(
         for name, data in metadata:
             if name != RECOVERY:
                 writer.add_metadata(name, data)
-        for each in reader.attachments():
-            at = {"log_time_ns": each.log_time_ns, "create_time_ns": each.create_time_ns}
-            writer.add_attachment(each.name, each.media_type, each.data, **at)
+        for attachment in reader.attachments():
+            at = {"log_time_ns": attachment.log_time_ns, "create_time_ns": attachment.create_time_ns}
+            writer.add_attachment(attachment.name, attachment.media_type, attachment.data, **at)
         for columns in reader.iter_columns(names):
             messages = samples.usable(columns)
             writer.write_messages(messages)
@@ -226,12 +226,12 @@ def _missing(count: int, noun: str) -> str:
 
 def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
     """Return from when to when something was lost, of faults that know it, in order."""
-    known = [
+    times_of_faults = [
         [part.time_ns for part in fault.parts if isinstance(part, Instant)]
         for fault in faults
         if isinstance(fault, Sentence)
     ]
-    return tuple(sorted({(min(times), max(times)) for times in known if times}))
+    return tuple(sorted({(min(times), max(times)) for times in times_of_faults if times}))
 
 
 class _Samples:
@@ -256,12 +256,12 @@ class _Samples:
 
     def usable(self, messages: Messages) -> Messages:
         """Return messages without samples that cannot be decoded, or repeat a time."""
-        own = np.flatnonzero(np.isin(messages.channel, self._own))
-        if not len(own):
+        sampled = np.flatnonzero(np.isin(messages.channel, self._own))
+        if not len(sampled):
             return messages
-        _, sound = decode_samples(messages, own, self._last_ns, self._fault)
+        _, sound = decode_samples(messages, sampled, self._last_ns, self._fault)
         self._find_gaps(messages.sequence[sound], messages.log_time_ns[sound])
-        return select(messages, without(messages, own, sound)) if len(sound) < len(own) else messages
+        return select(messages, without(messages, sampled, sound)) if len(sound) < len(sampled) else messages
 
     def gaps(self) -> tuple[SampleGap, ...]:
         """Return the gaps, with the one between the last sample and as many as the recording declares."""
