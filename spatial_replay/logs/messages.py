@@ -99,13 +99,13 @@ class Messages:
     def from_rows(cls, channels: Mapping[int, Channel], rows: Sequence[Row]) -> Messages:
         """Return the messages one by one as columns."""
         *numbers, payloads = zip(*rows, strict=True) if rows else [()] * len(Row._fields)
-        channel, sequence, log_ns, publish_ns = (np.array(each, np.int64) for each in numbers)
+        channel, sequence, log_ns, publish_ns = (np.array(column, np.int64) for column in numbers)
         return Messages(channels, channel, sequence, log_ns, publish_ns, payloads)
 
     def rows(self) -> Iterator[Row]:
         """Iterate over the messages one by one."""
         columns = (self.channel, self.sequence, self.log_time_ns, self.publish_time_ns)
-        return map(Row._make, zip(*(each.tolist() for each in columns), self.payloads, strict=True))
+        return map(Row._make, zip(*(column.tolist() for column in columns), self.payloads, strict=True))
 
     def __len__(self) -> int:
         return len(self.payloads)
@@ -144,8 +144,8 @@ class Messages:
     def of_topics(self, topics: Collection[str]) -> Self:
         """Return the messages of some topics, in the same order."""
         numbers = [number for number, channel in self.channels.items() if channel.topic in topics]
-        chosen = np.flatnonzero(np.isin(self.channel, numbers))
-        return self if len(chosen) == len(self) else select(self, chosen)
+        places = np.flatnonzero(np.isin(self.channel, numbers))
+        return self if len(places) == len(self) else select(self, places)
 
     def within(self, start_ns: int, end_ns: int) -> Self:
         """Return the messages logged from one time to before another, in the same order."""
@@ -199,11 +199,11 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 def join(streams: Sequence[Messages]) -> Messages:
     """Join messages, one stream after the other."""
-    known = {id(channel): channel for stream in streams for channel in stream.channels.values()}
-    by_rank = {_rank(channel): channel for channel in known.values()}
+    distinct = {id(channel): channel for stream in streams for channel in stream.channels.values()}
+    by_rank = {_rank(channel): channel for channel in distinct.values()}
     number = {rank: place for place, rank in enumerate(sorted(by_rank))}
-    own = {identity: number[_rank(channel)] for identity, channel in known.items()}
-    renumbered = [replace(stream, channel=_renumbered(stream, own)) for stream in streams]
+    numbers = {identity: number[_rank(channel)] for identity, channel in distinct.items()}
+    renumbered = [replace(stream, channel=_renumbered(stream, numbers)) for stream in streams]
     channels = {place: by_rank[rank] for rank, place in number.items()}
     return replace(concatenated([Messages(), *renumbered]), channels=channels)
 
@@ -308,7 +308,7 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
     """
     times = np.concatenate([before.times_ns, trace.times_ns])
     gaps = np.flatnonzero(np.diff(times) > max_gap_ns).tolist()
-    parts, done = [], 0
+    parts, filled_to = [], 0
     for gap in gaps:
         begin = gap + 1 - len(before)
         last = trace.slice(begin - 1, begin) if begin else before
@@ -328,9 +328,9 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
             faults=(),
             remarks=(),
         )
-        parts += [trace.slice(done, begin), unknown]
-        done = begin
-    return Trace.concatenate([*parts, trace.slice(done, len(trace))]) if gaps else trace
+        parts += [trace.slice(filled_to, begin), unknown]
+        filled_to = begin
+    return Trace.concatenate([*parts, trace.slice(filled_to, len(trace))]) if gaps else trace
 
 
 OWN_PREFIX = "/spatial/"
@@ -479,7 +479,11 @@ def is_image_type(name: str) -> bool:
 
 def image_topics(channels: Iterable[Channel]) -> set[str]:
     """Return the topics whose messages are images."""
-    return {each.topic for each in channels if each.schema is not None and is_image_type(each.schema.name)}
+    return {
+        channel.topic
+        for channel in channels
+        if channel.schema is not None and is_image_type(channel.schema.name)
+    }
 
 
 ALL, MAPPED = "all", "mapped"
@@ -494,7 +498,8 @@ def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
         mapped: the topics that the samples are made of.
     """
     return any(
-        each == ALL or (each == MAPPED and topic in mapped) or fnmatchcase(topic, each) for each in keep
+        pattern == ALL or (pattern == MAPPED and topic in mapped) or fnmatchcase(topic, pattern)
+        for pattern in keep
     )
 
 
@@ -512,9 +517,9 @@ def protobuf_channel(topic: str, message: type[Message]) -> Channel:
 
 def _with_dependencies(file: Any, found: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
     """Return a file of message types and all that it imports, each behind its own imports."""
-    for each in file.dependencies:
-        if each.name not in found:
-            _with_dependencies(each, found)
+    for dependency in file.dependencies:
+        if dependency.name not in found:
+            _with_dependencies(dependency, found)
     found[file.name] = file
     return found.values()
 

@@ -253,8 +253,8 @@ def _first_group(
         return None, alone
     same = template.matches(rows) if len(template) == rows.shape[1] else ~alone
     if same[0]:
-        chosen = rows if same.all() else rows[same]
-        return _Group(first.samples, layout, _padded(template.words(chosen))), same
+        matching_rows = rows if same.all() else rows[same]
+        return _Group(first.samples, layout, _padded(template.words(matching_rows))), same
     # another encoder's order of fields: the library's own bytes mean the same
     row = rows_of([message.SerializeToString(deterministic=True)])
     return _Group(first.samples, layout, _padded(template.words(row))), alone
@@ -320,8 +320,10 @@ def _whole(group: _Group, slot: int) -> Integers:
 def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
     faults: dict[int, str] = {}
     for name in {name for group in groups for name in group.layout.signals}:
-        given = np.concatenate([group.samples for group in groups if name in group.layout.signals])
-        samples, counts = np.unique(given, return_counts=True)
+        samples_of_groups = np.concatenate(
+            [group.samples for group in groups if name in group.layout.signals]
+        )
+        samples, counts = np.unique(samples_of_groups, return_counts=True)
         faults |= {int(index): f"signal {name!r} is there twice" for index in samples[counts > 1]}
     return faults
 

@@ -171,11 +171,11 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
         raise UsageError(f"{output} is a folder; give the name of a file in it")
     if not output.parent.is_dir():
         raise UsageError(f"{output} cannot be written: there is no folder {output.parent}; create it first")
-    for each in inputs:
-        if output.exists() and each.exists() and output.samefile(each):
+    for path in inputs:
+        if output.exists() and path.exists() and output.samefile(path):
             raise UsageError(f"{output} is an input too and would be lost; give the output another name")
-        if each.is_dir() and output.resolve().is_relative_to(each.resolve()):
-            raise UsageError(f"{output} lies in the folder {each}, which is an input; write it elsewhere")
+        if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
+            raise UsageError(f"{output} lies in the folder {path}, which is an input; write it elsewhere")
 
 
 def refuse_ending(output: Path) -> None:
@@ -209,8 +209,8 @@ def refuse_addresses(output: Path, remedy: str = "write to this machine, and cop
         UsageError: it is an address.
     """
     if output.parts and output.parts[0] in _SCHEMES:
-        shown = str(output).replace(":/", "://", 1)
-        raise UsageError(f"{shown} is an address; {remedy}")
+        address = str(output).replace(":/", "://", 1)
+        raise UsageError(f"{address} is an address; {remedy}")
 
 
 def output_error(output: Path, error: OSError) -> OutputError:

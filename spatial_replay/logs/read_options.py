@@ -106,9 +106,9 @@ class ReadOptions:
         """
         for name, value in self.given().items():
             if name not in taken:
-                shown = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
+                text = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
                 raise UsageError(
-                    f"{_option(name, shown)} does not apply to {log} ({kind}): {_REASONS[name]}; leave it out"
+                    f"{_option(name, text)} does not apply to {log} ({kind}): {_REASONS[name]}; leave it out"
                 )
 
 
@@ -220,11 +220,11 @@ class FaultList:
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
         """Return the faults since the last call; with `last`, a line that counts those beyond the limit."""
-        taken, self._waiting = self._waiting, []
+        faults, self._waiting = self._waiting, []
         if last and self._count > MOST_FAULTS:
             more = self._count - MOST_FAULTS
-            taken.append(f"… and {more} more fault{'s' if more > 1 else ''} of this kind or another")
-        return tuple(taken)
+            faults.append(f"… and {more} more fault{'s' if more > 1 else ''} of this kind or another")
+        return tuple(faults)
 
 
 class FaultKinds(FaultList):
@@ -252,11 +252,11 @@ class FaultKinds(FaultList):
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
         """Return the first faults of kinds since the last call; with `last`, also how many more."""
-        taken = super().take()
+        faults = super().take()
         if not last:
-            return taken
+            return faults
         counts, self._more = self._more, Counter()
         more = (
             f"… and {count:,} more like this: {self._first.get(kind, kind)}" for kind, count in counts.items()
         )
-        return (*taken, *more)
+        return (*faults, *more)

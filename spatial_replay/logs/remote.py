@@ -65,11 +65,11 @@ class RangeStream(io.RawIOBase):
         They are fetched in batches when the first of them is read, and one batch ahead.
         """
         batch, size, most = list[Range](), 0, _BATCH_BYTES
-        wanted = list(ranges)
-        if sum(end - begin for begin, end in wanted) > _BATCH_BYTES:
+        in_order = list(ranges)
+        if sum(end - begin for begin, end in in_order) > _BATCH_BYTES:
             # the reader may stop after the first messages
             most = _BATCH_BYTES // 32
-        for begin, end in wanted:
+        for begin, end in in_order:
             batch.append((begin, end))
             self._batch_of.setdefault(begin, len(self._batches))
             size += end - begin
@@ -107,9 +107,9 @@ class RangeStream(io.RawIOBase):
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "remote-batches")
         # not ahead of the first one: a search for the first sample needs no other
-        for each in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
-            if each not in self._fetching:
-                self._fetching[each] = self._thread.submit(self._file.fetch, self._batches[each])
+        for number in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
+            if number not in self._fetching:
+                self._fetching[number] = self._thread.submit(self._file.fetch, self._batches[number])
         self._fetching[batch].result()
 
 
@@ -156,13 +156,13 @@ def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
 
 def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
     """Return ranges in order, joined over the smallest gaps as long as these add up to little."""
-    ordered = sorted(each for each in ranges if each[1] > each[0])
-    wanted = sum(end - begin for begin, end in ordered)
+    ordered = sorted(span for span in ranges if span[1] > span[0])
+    needed_bytes = sum(end - begin for begin, end in ordered)
     gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
     bridged, wasted = set[int](), 0
     for gap, index in gaps:
         wasted += max(gap, 0)
-        if wasted > _WASTE * wanted:
+        if wasted > _WASTE * needed_bytes:
             break
         bridged.add(index)
     result: list[Range] = []
@@ -289,7 +289,7 @@ def sendable(path: str | PathLike[str]) -> Path | str:
 
 def local_files(paths: Iterable[str | PathLike[str]]) -> list[Path]:
     """Return the paths among some that are on this machine."""
-    return [Path(each) for each in paths if not is_address(each)]
+    return [Path(path) for path in paths if not is_address(path)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,7 +399,7 @@ class RemoteFile(PathLike[str]):
         end = min(end, self.version.size)
         if end - begin > MOST_HELD_BYTES // 2:
             bounds = range(begin, end, _PIECE_BYTES)
-            return b"".join(self.iter_pieces([(each, min(each + _PIECE_BYTES, end)) for each in bounds]))
+            return b"".join(self.iter_pieces([(start, min(start + _PIECE_BYTES, end)) for start in bounds]))
         while True:
             with self._lock:
                 missing = self._held.missing(begin, end)
@@ -466,11 +466,11 @@ class RemoteFile(PathLike[str]):
 
     def _range(self, wanted: Range) -> bytes:
         """Read a range of the version that is known."""
-        known = self._version
+        version_before = self._version
         # a weak tag never fits; then the answer's own tag is compared
-        strong = {"if_match": known.tag} if known and known.is_exact else {}
+        strong = {"if_match": version_before.tag} if version_before and version_before.is_exact else {}
         version, _, data = self._part({"range": wanted, **strong})
-        if version != known or len(data) != wanted[1] - wanted[0]:
+        if version != version_before or len(data) != wanted[1] - wanted[0]:
             raise self._changed()
         return data
 
@@ -547,7 +547,7 @@ def open_store(scheme: str, bucket: str) -> Any:
     Raises:
         RemoteError: it cannot be one.
     """
-    settings = tuple(sorted(each for each in os.environ.items() if each[0].startswith(_SETTINGS)))
+    settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(_SETTINGS)))
     return _store(scheme, bucket, settings)
 
 
@@ -556,9 +556,9 @@ def _store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> A
     """Return the store of a bucket, which reads these settings from the environment."""
     stores = obstore_library().store
     options: dict[str, Any] = {"client_options": _CLIENT, "retry_config": _RETRIES}
-    made = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)
+    open_bucket = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)
     try:
-        return made(bucket, **options) if made else stores.HTTPStore.from_url(bucket, **options)
+        return open_bucket(bucket, **options) if open_bucket else stores.HTTPStore.from_url(bucket, **options)
     except (ValueError, obstore_library().exceptions.BaseError) as error:
         raise store_failure(
             f"{scheme}://{bucket.partition('?')[0].rpartition('/')[2]}", scheme, error
@@ -660,8 +660,8 @@ def downloaded_folder(files: Sequence[RemoteFile], shown: str, reason: str, belo
     versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
     parent = user_cache_folder("downloads")
-    known = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
-    folder = parent / hashlib.sha256("\n".join(known).encode()).hexdigest()[:32]
+    identities = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
+    folder = parent / hashlib.sha256("\n".join(identities).encode()).hexdigest()[:32]
     if all(version.is_exact for version in versions) and all(
         _has(folder / below / _name(file), file.version.size) for file in files
     ):
