@@ -165,10 +165,10 @@ def diff_specifications(
     """
     constants, how = _evaluation(options)
     source = _source(log, options)
-    one, other = (_files(file, source, constants)[0] for file in (old, new))
-    diff = diff_over_source(source, one, other, how)
+    old_file, new_file = (_files(file, source, constants)[0] for file in (old, new))
+    diff = diff_over_source(source, old_file, new_file, how)
     if output is not None:
-        sides = (source, [one], how), (source, [other], how)
+        sides = (source, [old_file], how), (source, [new_file], how)
         write_comparison(diff, sides, Path(output), inputs=_inputs(log, [old, new], options))
     return diff
 
@@ -198,10 +198,10 @@ def diff_logs(
     """
     constants, how = _evaluation(options)
     sources = _source(a, options), _source(b, options)
-    own = [source for source in sources if recorded_texts(source)]
+    sources_with_texts = [source for source in sources if recorded_texts(source)]
     files: list[Specification] = []
-    if specifications is not None or own:
-        files = _files(specifications, (own or [sources[0]])[0], constants)
+    if specifications is not None or sources_with_texts:
+        files = _files(specifications, (sources_with_texts or [sources[0]])[0], constants)
     diff = diff_sources(sources, files, (how, how), align=align)
     if output is not None:
         sides = (sources[0], files, how), (sources[1], files, how)
@@ -254,9 +254,9 @@ def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, 
     """Take the options of evaluating out, and return them; those of reading remain."""
     refuse_unknown(options, (*Evaluating.__annotations__, "specifications", "output"))
     window = Window(options.pop("start_ns", 0), options.pop("end_ns", FOREVER), options.pop("every", 1))
-    each, constants = options.pop("each", None), options.pop("constants", None)
+    choice, constants = options.pop("each", None), options.pop("constants", None)
     semantics, strict_names = options.pop("semantics", "ltlf"), options.pop("strict_names", False)
-    return constants, ReplayOptions(window, dict(each or {}), semantics, strict_names)
+    return constants, ReplayOptions(window, dict(choice or {}), semantics, strict_names)
 
 
 def tune(
@@ -298,7 +298,10 @@ def tune(
         (file,) = load_specifications([local_copy(specification)], constants=constants)
     refuse_unknown(reading, Reading.__annotations__)
     ranges = vary.values() if isinstance(vary, Mapping) else [vary]
-    if any(each is not None and not (isinstance(each, tuple | list) and len(each) == 2) for each in ranges):
+    if any(
+        bounds is not None and not (isinstance(bounds, tuple | list) and len(bounds) == 2)
+        for bounds in ranges
+    ):
         raise UsageError(f"vary is {shortened(vary)}; give ranges by name, as in {{'near': (40, 100)}}")
     runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
     return tune_runs(file, runs, dict(vary or {}), each=each, seed=seed)
@@ -334,8 +337,8 @@ def learn(
 
 
 def _logs(logs: Log | Sequence[Log]) -> list[LogFile | Trace]:
-    listed = [logs] if isinstance(logs, Trace | str | PathLike) else list(logs)
-    return [each if isinstance(each, Trace) else log_file(each) for each in listed]
+    paths = [logs] if isinstance(logs, Trace | str | PathLike) else list(logs)
+    return [path if isinstance(path, Trace) else log_file(path) for path in paths]
 
 
 def evaluate_logs(
@@ -549,9 +552,11 @@ def _listed(specifications: Specifications | None) -> list[Specification | PathN
         return []
     if isinstance(specifications, Specification | str | PathLike):
         return [specifications]
-    for each in specifications:
-        if not isinstance(each, Specification | str | PathLike):
-            raise UsageError(f"specifications has {shortened(each)}; give specifications or their files")
+    for specification in specifications:
+        if not isinstance(specification, Specification | str | PathLike):
+            raise UsageError(
+                f"specifications has {shortened(specification)}; give specifications or their files"
+            )
     return list(specifications)
 
 
@@ -559,25 +564,29 @@ def _files(
     specifications: Specifications | None, source: Source, constants: Mapping[str, float | str] | None
 ) -> list[Specification]:
     """Return the specifications to evaluate, in the order in which they are given."""
-    chosen: list[Specification | Path] = []
-    for each in _listed(specifications):
-        one = each if isinstance(each, Specification) else local_copy(each)
+    choices: list[Specification | Path] = []
+    for specification in _listed(specifications):
+        choice = specification if isinstance(specification, Specification) else local_copy(specification)
         # each path counts once
-        if isinstance(one, Specification) or one not in chosen:
-            chosen.append(one)
-    paths = [each for each in chosen if isinstance(each, Path)]
-    if constants and chosen and not paths:
+        if isinstance(choice, Specification) or choice not in choices:
+            choices.append(choice)
+    paths = [choice for choice in choices if isinstance(choice, Path)]
+    if constants and choices and not paths:
         raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
-    loaded = load_files(paths, source, constants=constants) if paths or not chosen else []
-    if not chosen:
+    loaded = load_files(paths, source, constants=constants) if paths or not choices else []
+    if not choices:
         return loaded
     files = iter(loaded)
-    return [each if isinstance(each, Specification) else next(files) for each in chosen]
+    return [choice if isinstance(choice, Specification) else next(files) for choice in choices]
 
 
 def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:
     """Return the files that are read."""
-    files = [each for each in _listed(specifications) if not isinstance(each, Specification)]
+    files = [
+        specification
+        for specification in _listed(specifications)
+        if not isinstance(specification, Specification)
+    ]
     mapping = reading.get("mapping")
     logs = [] if isinstance(log, Trace) else [log]
     return local_files([*logs, *files, *([] if mapping is None else [mapping])])

@@ -30,9 +30,9 @@ _ERROR_NUMBER: Final = re.compile(r"\[Errno (\d+)\]")
 def system_reason(error: Exception) -> str:
     """Return why the system refuses something, in its own words: "permission denied"."""
     number = getattr(error, "errno", None)
-    if number is None and (listed := _ERROR_NUMBER.search(str(error))) is not None:
+    if number is None and (match := _ERROR_NUMBER.search(str(error))) is not None:
         # several attempts to connect failed, each with its own error
-        number = int(listed[1])
+        number = int(match[1])
     # names that are not found have numbers below 0, of another list
     words = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
     return (words or str(error) or type(error).__name__).lower()

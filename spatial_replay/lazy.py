@@ -25,7 +25,7 @@ def loaded_when_used(package: dict[str, Any]) -> tuple[Callable[[str], Any], Cal
     def modules() -> dict[str, str]:
         tree = ast.parse(Path(package["__file__"]).read_text(encoding="utf-8"))
         imports = (node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom))
-        return {each.name: node.module or "" for node in imports for each in node.names}
+        return {alias.name: node.module or "" for node in imports for alias in node.names}
 
     def load(name: str) -> Any:
         if name not in package["__all__"]:

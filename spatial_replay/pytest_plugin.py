@@ -79,7 +79,7 @@ class ReplayItem(pytest.Item):
         """Evaluate the log, unless another of its specs has, and fail for each result that does not pass."""
         rows = [row for row in _results(self.session).rows(self.task)[self._file] if row.spec == self._spec]
         ids = dict.fromkeys([*filter(None, (row.requirement for row in rows)), *self._case.requirements])
-        self.user_properties += [("requirement", each) for each in ids]
+        self.user_properties += [("requirement", identifier) for identifier in ids]
         self.user_properties += [("untested", text) for row in rows for text in row.untested]
         failures = [text for row in rows if (text := self._failure(row)) is not None]
         if failures:

@@ -51,7 +51,7 @@ def assert_satisfied(
             verdict=result.verdict,
             lower=result.lower,
             tested=result.tested,
-            untested=[each.message for each in result.untested],
+            untested=[part.message for part in result.untested],
             vacuous=result.vacuous,
             doubtful=[doubt.text for doubt in result.doubts],
             dropped=replayed.dropped.text,
@@ -65,7 +65,7 @@ def assert_satisfied(
             lines = [f"{replayed.log}: {title}: {failure}", about, *map(str, explanation)]
             reasons.append("\n".join(filter(None, lines)))
     if "vacuous" not in expectation.allow:
-        reasons += [f"{replayed.log}: {each.message}" for each in replayed.vacuous]
+        reasons += [f"{replayed.log}: {part.message}" for part in replayed.vacuous]
     reasons += [f"{replayed.log} is damaged: {fault}" for fault in replayed.faults[:1]]
     if reasons:
         raise AssertionError("\n\n".join(reasons))

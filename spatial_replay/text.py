@@ -61,12 +61,12 @@ class Sentence(str):
     parts: tuple[str | Instant, ...]
 
     def __new__(cls, *parts: str | Instant) -> Sentence:
-        made = super().__new__(cls, "".join(map(str, parts)))
+        sentence = super().__new__(cls, "".join(map(str, parts)))
         # a part may be a clause with times of its own
-        made.parts = tuple(
-            own for part in parts for own in (part.parts if isinstance(part, Sentence) else (part,))
+        sentence.parts = tuple(
+            inner for part in parts for inner in (part.parts if isinstance(part, Sentence) else (part,))
         )
-        return made
+        return sentence
 
 
 CALENDAR_NS: Final = 500_000_000 * 10**9
@@ -180,16 +180,16 @@ def json_value(value: Any) -> Any:
     if isinstance(value, str):
         return str(value)
     if isinstance(value, Mapping):
-        return {str(key): json_value(each) for key, each in value.items()}
+        return {str(key): json_value(element) for key, element in value.items()}
     if is_dataclass(value) or hasattr(value, "_fields"):
         return json_fields(value)
-    return [json_value(each) for each in value] if isinstance(value, tuple | list) else value
+    return [json_value(element) for element in value] if isinstance(value, tuple | list) else value
 
 
 def json_fields(record: Any, *names: str) -> dict[str, Any]:
     """Return attributes of a record for JSON, by their names without "is_"; without names, all its fields."""
-    own = names or getattr(record, "_fields", None) or [each.name for each in fields(record)]
-    return {name.removeprefix("is_"): json_value(getattr(record, name)) for name in own}
+    keys = names or getattr(record, "_fields", None) or [field.name for field in fields(record)]
+    return {key.removeprefix("is_"): json_value(getattr(record, key)) for key in keys}
 
 
 def printable(text: str, longest: int = _LONGEST) -> str:
@@ -218,8 +218,10 @@ def escaped(text: str, kept: str = "") -> str:
     if text.isprintable():
         return text
     return "".join(
-        each if each.isprintable() or each in kept else each.encode("unicode_escape").decode()
-        for each in text
+        character
+        if character.isprintable() or character in kept
+        else character.encode("unicode_escape").decode()
+        for character in text
     )
 
 
@@ -235,15 +237,15 @@ def time_text(time_ns: int, first_ns: int = 0) -> str:
 
 def times_apart(*times_ns: int) -> tuple[Sentence, ...]:
     """Return times in seconds; in nanoseconds, too, if some that differ would read the same."""
-    times = tuple(Sentence(Instant(each, 0)) for each in times_ns)
+    times = tuple(Sentence(Instant(time_ns, 0)) for time_ns in times_ns)
     if len(set(times)) == len(set(map(int, times_ns))):
         return times
-    return tuple(Sentence(time, f" ({each} ns)") for time, each in zip(times, times_ns, strict=True))
+    return tuple(Sentence(time, f" ({time_ns} ns)") for time, time_ns in zip(times, times_ns, strict=True))
 
 
 def requirement_text(identifier: str | None, title: str | None) -> str:
     """Return the id of a requirement and its words, as far as it has them: "REQ-12: no one is hit"."""
-    return ": ".join(each for each in (identifier, title) if each)
+    return ": ".join(part for part in (identifier, title) if part)
 
 
 def names_of(title: str, requirement: str | None) -> tuple[str, ...]:
