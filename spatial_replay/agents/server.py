@@ -90,19 +90,16 @@ _DESCRIBED: Final = 12
 _NAMED: Final = 15
 """Objects of a log that it names."""
 _OPTIONS: Final = {
+    r"with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info \S+ --suggest-mapping": (
+        "as mapping; suggest_mapping writes a first one"
+    ),
     "--spec": "specification",
-    "--mapping": "mapping",
-    "--labels": "labels",
     "--from": "start",
-} | {
     "--to": "end",
-    "--result": "result",
     "--const": "constants",
-    "--hz": "hz",
-    "--good": "good",
-    "--bad": "bad",
+    **{f"--{name}": name for name in ("mapping", "labels", "result", "hz", "good", "bad")},
 }
-"""Arguments of tools, by the options that errors of commands name."""
+"""Words of the tools for those in errors of commands, by patterns."""
 
 
 class Tools:
@@ -398,15 +395,19 @@ class Tools:
                 return _failure(self._error(outcome.err, files))
             values = document
         values = _without({_ROWS[tool]: values} if isinstance(values, list) else values, _LEFT_OUT)
-        return _answer(tool, outcome.code, _lines(outcome.out), _lines(outcome.err), values, start)
+        lines = _lines(outcome.out)
+        if tool != "report":
+            # files of the call are removed
+            lines = [line for line in lines if not line.startswith("wrote ")]
+        return _answer(tool, outcome.code, lines, _lines(outcome.err), values, start)
 
     def _error(self, text: str, files: Files) -> str:
         """Return the error of a command in the words of the tools."""
         lines = _lines(text)
         errors = [line for line in lines if line.startswith("error: ")]
         text = "\n".join(lines if not errors or len(lines) < 12 else errors).removeprefix("error: ")
-        for option, argument in _OPTIONS.items():
-            text = text.replace(f"{option} ", f"{argument} ")
+        for pattern, words in _OPTIONS.items():
+            text = re.sub(rf"{pattern}\b", words, text)
         return text.replace(f"{files.folder}/", "") or "the command failed without a message"
 
 

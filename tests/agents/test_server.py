@@ -229,6 +229,13 @@ def test_odd_arguments_are_errors_with_a_remedy(newest: Agent, logs: Path) -> No
     assert "give other_specification" in newest.call("diff", **both).error
     assert "is not the name of a file" in newest.call("report", name="../x", **both).error
     assert "no_such" in newest.call("explain", result="no_such", **both).error
+    for log, remedy in (
+        ("drive", "suggest_mapping writes a first one"),
+        ("old.spatial", "give it by specification"),
+    ):
+        error = newest.call("evaluate", log=log, specification=NEAR).error
+        assert remedy in error
+        assert "--" not in error
 
 
 def test_names_from_a_log_stay_data(newest: Agent, logs: Path) -> None:
