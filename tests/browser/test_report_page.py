@@ -51,7 +51,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     report_of_recording(folder / "satisfied.html", "table.jsonl", "table.spatial")
     report_of_recording(folder / "planned.html", "push.mcap")
     record_plan_of(folder / "layers.mcap", SPEC, OBJECTS, TIDYING)
-    write_report(open_source(folder / "layers.mcap"), [], folder / "layers.html")
+    files = [sr.parse_specification(f"spec first = G (cup dist pan >= 0)\n{SPEC}")]
+    write_report(open_source(folder / "layers.mcap"), files, folder / "layers.html")
     report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
     write_ticked_log(folder / "ticks.mcap")
     write_report(open_source(folder / "ticks.mcap"), [], folder / "ticks.html")
@@ -356,7 +357,7 @@ def test_the_address_keeps_the_time(open_page: Open) -> None:
 
 def test_pressing_on_a_lane_or_the_curves_moves_the_cursor(open_page: Open) -> None:
     page = open_page("violated")
-    for place in (page.locator(".strip").first, page.locator(".u-over")):
+    for place in (page.locator(".lane .strip").first, page.locator(".u-over")):
         box = place.bounding_box()
         assert box is not None
         place.click(position={"x": box["width"] / 2, "y": box["height"] / 2})
@@ -371,7 +372,7 @@ def test_lanes_and_curves_share_one_time_axis(open_page: Open) -> None:
             page.locator(place).first.evaluate(
                 "each => [each.getBoundingClientRect().left, each.clientWidth]"
             )
-            for place in (".strip", ".u-over")
+            for place in (".lane .strip", ".u-over")
         ]
         assert np.allclose(*edges, atol=1.5)
 
@@ -383,7 +384,7 @@ def test_each_unit_has_an_axis_of_its_own(open_page: Open) -> None:
     left, width = page.locator(".u-over").evaluate(
         "each => [each.getBoundingClientRect().left, each.clientWidth]"
     )
-    assert page.locator(".strip").first.evaluate("each => each.getBoundingClientRect().left") == left
+    assert page.locator(".lane .strip").first.evaluate("each => each.getBoundingClientRect().left") == left
     assert width > 0
     assert open_page("violated").locator(".curves .u-axis").count() == 2
 
@@ -567,6 +568,8 @@ def test_a_map_shows_each_relation_and_answers_for_every_cell(
     open_page: Open, pages: Mapping[str, Path]
 ) -> None:
     page = open_page("layers")
+    # of satisfied results, the one that was planned for is shown
+    expect(page.locator("#tree .which")).to_contain_text("tidy at 0.100 s")
     # that of the target, beside the decision
     figure = page.locator(".card").nth(0).locator("> figure")
     made, choice, answer = (
