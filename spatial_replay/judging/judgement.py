@@ -444,12 +444,22 @@ def _rows_of(table: pa.Table, spec: _Spec) -> pa.Table:
     import pyarrow.compute as pc
 
     is_named = pc.or_(pc.equal(table["spec"], spec.name), pc.equal(table["spec"], ""))
-    return table.select(_READ).filter(pc.and_(pc.equal(table["file"], spec.file), is_named))
+    return table.select(list(_READ)).filter(pc.and_(pc.equal(table["file"], spec.file), is_named))
 
 
-_READ: Final = ["log", "file", "spec", "failure", "verdict", "unit", "robustness", "zero_ns", "reason"]
-_READ += ["satisfied_at_ns", "first_satisfied_ns", "tested", "untested", "doubtful", "dropped"]
-_READ += ["faults", "error"]
+_READ: Final = (
+    *("log", "file", "spec", "failure", "verdict", "unit", "robustness", "zero_ns", "reason"),
+    *(
+        "satisfied_at_ns",
+        "first_satisfied_ns",
+        "tested",
+        "untested",
+        "doubtful",
+        "dropped",
+        "faults",
+        "error",
+    ),
+)
 """The columns of a run that a judgement reads: the others hold long texts."""
 
 
