@@ -269,7 +269,7 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
     for number, decision in reversed(list(enumerate(decisions))):
         seek(page, decision.time_ns)
         expect(page.locator(".decision-title")).to_contain_text(f"Decision {number}")
-        text = page.locator(".card").inner_text()
+        text = page.locator(".card").inner_text().replace(MINUS, "-")
         for edge in decision.considered:
             for candidate in edge.candidates:
                 assert candidate.object in text
