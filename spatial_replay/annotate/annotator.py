@@ -143,25 +143,25 @@ class Annotator:
         self._units = units
         self._files = files
         self._trees = trees
-        self._automata = [each.automaton for each in automata]
-        chosen = [tree for tree in trees if tree.is_called(arrow)] or trees
+        self._automata = [spec_automaton.automaton for spec_automaton in automata]
+        arrow_trees = [tree for tree in trees if tree.is_called(arrow)] or trees
         self._samples = NewestSamples()
         self._results = [
             _Result(
                 tree,
                 instance,
-                kept,
+                spec_automaton,
                 files[tree.file],
                 EventReporter(tree, instance, files[tree.file], semantics, units, self._samples),
                 settles=semantics == "ltlf",
-                has_arrow=tree in chosen,
+                has_arrow=tree in arrow_trees,
             )
-            for tree, instance, kept in zip(trees, instances, automata, strict=True)
+            for tree, instance, spec_automaton in zip(trees, instances, automata, strict=True)
         ]
-        self._runs = [each.run for each in self._results]
+        self._runs = [result.run for result in self._results]
         self.standing = StandingEncoder(trees, self._runs, units)
-        requirements = [each for result in self._results for each in result.requirements]
-        named = frozenset(name for each in requirements for name in each.objects)
+        requirements = [requirement for result in self._results for requirement in result.requirements]
+        named = frozenset(name for requirement in requirements for name in requirement.objects)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
         self.extent: SceneBounds | None = None
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
@@ -184,7 +184,7 @@ class Annotator:
     @property
     def _over(self) -> list[str]:
         """Deciding atoms of the results that are decided so far."""
-        return [each.reporter.over for each in self._results]
+        return [result.reporter.over for result in self._results]
 
     def count_from(self, zero_ns: int) -> None:
         """Set the time that texts count from; without it, that of the first sample."""
@@ -268,10 +268,10 @@ class Annotator:
             results: for each tree its result, if there is one: they know what they were tested by.
         """
         events = list[EncodedEvent]()
-        for each, final in zip(self._results, finals, strict=True):
-            events += each.reporter.end(time_ns, final)
-        for each, result in zip(self._results, results, strict=False):
-            events += each.reporter.untested(time_ns, result)
+        for follower, final in zip(self._results, finals, strict=True):
+            events += follower.reporter.end(time_ns, final)
+        for follower, result in zip(self._results, results, strict=False):
+            events += follower.reporter.untested(time_ns, result)
         return [*self._events(events), *self._finals(time_ns, finals)]
 
     def _finals(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
@@ -305,7 +305,7 @@ class Annotator:
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result."""
-        encoded = [each.robustness(block) for each, block in zip(self._results, blocks, strict=True)]
+        encoded = [result.robustness(block) for result, block in zip(self._results, blocks, strict=True)]
         return self._in_order(_ROBUSTNESS, blocks, encoded)
 
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
@@ -316,12 +316,12 @@ class Annotator:
         return sorted(events, key=lambda each: each.time_ns)
 
     def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
-        times_ns = np.array([each.time_ns for each in events], np.int64)
-        logs = [each.log.SerializeToString(deterministic=True) for each in events]
+        times_ns = np.array([event.time_ns for event in events], np.int64)
+        logs = [event.log.SerializeToString(deterministic=True) for event in events]
         by_time = groupby(events, attrgetter("time_ns"))
-        recent = {time_ns: self._recent(list(own)) for time_ns, own in by_time}
+        recent = {time_ns: self._recent(list(same_time)) for time_ns, same_time in by_time}
         return [
-            self._messages(_EVENTS, times_ns, [each.event for each in events]),
+            self._messages(_EVENTS, times_ns, [event.event for event in events]),
             self._messages(_EVENT_LOG, times_ns, logs),
             self._messages(_RECENT_EVENTS, np.array([*recent], np.int64), [*recent.values()]),
         ]
@@ -341,12 +341,12 @@ class Annotator:
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False
     ) -> Messages:
         pairs = zip(self._results, blocks, strict=True)
-        results = [each.evaluated(block, is_final=is_final) for each, block in pairs]
-        drawn = self._encoder.encode(trace, results, self._scene)
-        if drawn.frames is not None:
-            self._show(drawn.frames)
-        self._scene = drawn.state
-        return self._messages(_SCENE, drawn.times_ns, drawn.payloads)
+        results = [result.evaluated(block, is_final=is_final) for result, block in pairs]
+        scene_messages = self._encoder.encode(trace, results, self._scene)
+        if scene_messages.frames is not None:
+            self._show(scene_messages.frames)
+        self._scene = scene_messages.state
+        return self._messages(_SCENE, scene_messages.times_ns, scene_messages.payloads)
 
     def _in_order(
         self, channel: Channel, blocks: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
@@ -378,12 +378,12 @@ def _ended(block: SeriesBlock, final: Floats) -> SeriesBlock:
 
 def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
     """Return the regions of all files; where two differ on a name, the later one gets its file's name."""
-    shown: dict[str, Outline] = {}
+    outlines: dict[str, Outline] = {}
     for file in files:
         for name, outline in file.regions.items():
-            is_taken = name in shown and shown[name] != outline
-            shown[f"{file.filename}:{name}" if is_taken else name] = outline
-    return shown
+            is_taken = name in outlines and outlines[name] != outline
+            outlines[f"{file.filename}:{name}" if is_taken else name] = outline
+    return outlines
 
 
 _FRAME = protobuf_channel(FRAME, FrameTransform)

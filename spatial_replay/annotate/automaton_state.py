@@ -83,8 +83,10 @@ class AutomatonRun:
         self._order = order
         self._table = TransitionTable.of(automaton)
         numbers = {id(node): number for number, _, node in iter_nodes(formula)}
-        self.propositions = tuple(_node_of(each.formula, formula, numbers) for each in automaton.propositions)
-        self._is_node = [id(each.formula) in numbers for each in automaton.propositions]
+        self.propositions = tuple(
+            _node_of(proposition.formula, formula, numbers) for proposition in automaton.propositions
+        )
+        self._is_node = [id(proposition.formula) in numbers for proposition in automaton.propositions]
         self._possible = np.zeros(len(automaton.states), np.bool_)
         self._possible[automaton.initial] = True
         self._are_nodes = all(self._is_node)
@@ -93,7 +95,9 @@ class AutomatonRun:
         self._is_behind = False
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
-        self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
+        self._about = np.array(
+            [[state in members for members in about] for state in automaton.states], np.bool_
+        )
         self._after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
         self._text = lru_cache(_MOST_TEMPLATES)(self._described)
 
@@ -105,7 +109,7 @@ class AutomatonRun:
         before, after = self._steps(values)
         encoded = []
         for members in _alike(before, after):
-            sources, targets = (tuple(_members(each[members[0]]).tolist()) for each in (before, after))
+            sources, targets = (tuple(_members(steps[members[0]]).tolist()) for steps in (before, after))
             template = self._template(sources, targets)
             marks = np.empty((len(members), len(self.propositions) + 3), np.uint8)
             marks[:, :-3] = _TRUTHS[values[:, members]].T
@@ -187,8 +191,8 @@ class AutomatonRun:
         for number in np.flatnonzero(unclear.any(axis=1)).tolist():
             # a number that is not determined can still have a determined sign
             formula = self._automaton.propositions[number].formula
-            done = evaluate_offline(formula, self._order, block.leaves, block.times_ns)
-            low, high = done.ends(0, wide=False)
+            evaluation = evaluate_offline(formula, self._order, block.leaves, block.times_ns)
+            low, high = evaluation.ends(0, wide=False)
             values[number, unclear[number]] = UNKNOWN
             values[number, unclear[number] & (low >= 0.0)] = TRUE
             values[number, unclear[number] & (high < 0.0)] = FALSE
@@ -228,8 +232,8 @@ class AutomatonRun:
         if len(sources) == 1:
             message.source = sources[0]
         if len(sources) == len(targets) == 1 and sources != targets:
-            taken = self._automaton.transition(sources[0], targets[0])
-            message.guard = "" if taken is None else _shortened(self._guard(taken))
+            transition = self._automaton.transition(sources[0], targets[0])
+            message.guard = "" if transition is None else _shortened(self._guard(transition))
         message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
         return WireTemplate.of(message)
 
@@ -332,14 +336,14 @@ def automata_of(
         compiled_before: attachments of a log; an automaton among them is used where it would take MONA.
         known: automata of specs of these files, which are not compiled again.
     """
-    stored = [each.data for each in compiled_before if _is_stored(each)]
-    found = {id(each.spec.formula): each for each in known}
+    stored = [attachment.data for attachment in compiled_before if _is_stored(attachment)]
+    by_formula = {id(spec_automaton.spec.formula): spec_automaton for spec_automaton in known}
     for tree in trees:
-        if id(tree.formula) not in found:
+        if id(tree.formula) not in by_formula:
             file = files[tree.file]
-            spec = next(each for each in file.results if each.formula is tree.formula)
-            found[id(tree.formula)] = _spec_automaton(tree.name, file, spec, semantics, stored)
-    return [found[id(tree.formula)] for tree in trees]
+            spec = next(named_spec for named_spec in file.results if named_spec.formula is tree.formula)
+            by_formula[id(tree.formula)] = _spec_automaton(tree.name, file, spec, semantics, stored)
+    return [by_formula[id(tree.formula)] for tree in trees]
 
 
 def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list[Attachment]:
@@ -349,16 +353,21 @@ def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list
         prefix: what the names of the specification's own attachments begin with.
     """
     attachments = []
-    for each in {each.name: each for each in automata}.values():
-        if each.automaton is None:
+    for spec_automaton in {spec_automaton.name: spec_automaton for spec_automaton in automata}.values():
+        if spec_automaton.automaton is None:
             continue
-        texts = {_STORED: ("application/json", stored_text(each.automaton, each.specification, each.spec))}
-        if _has_few_literals(each.automaton):
-            texts[".dot"] = ("text/vnd.graphviz", each.automaton.to_dot())
-            texts[".hoa"] = ("text/plain", each.automaton.to_hoa())
+        texts = {
+            _STORED: (
+                "application/json",
+                stored_text(spec_automaton.automaton, spec_automaton.specification, spec_automaton.spec),
+            )
+        }
+        if _has_few_literals(spec_automaton.automaton):
+            texts[".dot"] = ("text/vnd.graphviz", spec_automaton.automaton.to_dot())
+            texts[".hoa"] = ("text/plain", spec_automaton.automaton.to_hoa())
         for suffix, (kind, text) in texts.items():
             attachments.append(
-                Attachment(f"{AUTOMATA_PREFIX}{prefix}{each.name}{suffix}", kind, text.encode())
+                Attachment(f"{AUTOMATA_PREFIX}{prefix}{spec_automaton.name}{suffix}", kind, text.encode())
             )
     return attachments
 

@@ -65,10 +65,10 @@ class SampleHash:
             for hashed, column in zip(hashes, columns, strict=True):
                 _take_in(hashed, column)
         for name, values in trace.signals.items():
-            known = np.flatnonzero(~np.isnan(values))
-            if len(known):
+            places = np.flatnonzero(~np.isnan(values))
+            if len(places):
                 hashed = self._signals.setdefault(name, hashlib.sha256())
-                pairs = np.rec.fromarrays([trace.times_ns[known], values[known]])
+                pairs = np.rec.fromarrays([trace.times_ns[places], values[places]])
                 _take_in(hashed, pairs.tobytes())
         for name, reported_ns in trace.signals_reported_ns.items():
             is_known = ~np.isnan(trace.signals[name])
@@ -142,12 +142,12 @@ def plan_sha256(plan: Mapping[str, str]) -> str:
 
 def specifications_json(files: Sequence[Specification]) -> str:
     """Return specifications as metadata lists them, in JSON: name, SHA-256 of their text, plug-ins."""
-    listed = []
+    entries = []
     for file in files:
         text = format_specification(file).encode("utf-8", "surrogatepass")
         plugins = {"plugins": file.plugins} if file.plugins else {}
-        listed.append({"name": file.filename, "sha256": hashlib.sha256(text).hexdigest(), **plugins})
-    return json.dumps(listed)
+        entries.append({"name": file.filename, "sha256": hashlib.sha256(text).hexdigest(), **plugins})
+    return json.dumps(entries)
 
 
 class EvaluationHashes:

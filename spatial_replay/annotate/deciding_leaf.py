@@ -104,14 +104,16 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
     """
     numbers = {leaf_key(leaf): index for index, leaf in enumerate(leaves)}
     nodes = nodes_with_operands(formula)
-    found: list[dict[tuple[int, int], None]] = [{} for _ in nodes]
-    for own_leaves, (node, operands) in zip(found[::-1], nodes[::-1], strict=True):
+    entries_of_nodes: list[dict[tuple[int, int], None]] = [{} for _ in nodes]
+    for own_leaves, (node, operands) in zip(entries_of_nodes[::-1], nodes[::-1], strict=True):
         if isinstance(node, Atom | Quantified):
             own_leaves[numbers[leaf_key(node)], 1] = None
         for place, operand in enumerate(operands):
             for sign in operand_signs(node, place):
-                own_leaves.update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
-    return [_columns(list(each)) for each in found]
+                own_leaves.update(
+                    dict.fromkeys((leaf, leaf_sign * sign) for leaf, leaf_sign in entries_of_nodes[operand])
+                )
+    return [_columns(list(entries)) for entries in entries_of_nodes]
 
 
 def find_leaf(
@@ -128,14 +130,14 @@ def find_leaf(
     if np.isinf(number):
         return None
     lows, highs = (end[below.indices] for end in ends)
-    own = np.where((below.signs > 0.0) == low, lows, highs)
+    numbers = np.where((below.signs > 0.0) == low, lows, highs)
     is_unknown = (lows == -np.inf) & (highs == np.inf)
-    hits = np.flatnonzero(is_unknown if np.isnan(number) else own * below.signs == number)
+    hits = np.flatnonzero(is_unknown if np.isnan(number) else numbers * below.signs == number)
     if not len(hits):
         return None
     end = End.LOW if (below.signs[hits[0]] > 0.0) == low else End.HIGH
-    shown = number if np.isnan(number) else float(own[hits[0]]) + 0.0
-    return DecidingLeaf(int(below.indices[hits[0]]), shown, end, time_ns)
+    leaf_number = number if np.isnan(number) else float(numbers[hits[0]]) + 0.0
+    return DecidingLeaf(int(below.indices[hits[0]]), leaf_number, end, time_ns)
 
 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
@@ -285,9 +287,9 @@ class LeafHistory:
             return None
         if verdict is Verdict.VIOLATED:
             conjuncts = conjuncts_of(self._nodes[node], "", node)
-            node = next(each.node for each in conjuncts if series[each.node, 3] < 0.0)
-        done = evaluate_unfinished(self._formula, self._order, samples.leaves, samples.times_ns)
-        return self._leaf(deciding_path(done, node, _END_OF[verdict]), samples, done, verdict)
+            node = next(conjunct.node for conjunct in conjuncts if series[conjunct.node, 3] < 0.0)
+        evaluation = evaluate_unfinished(self._formula, self._order, samples.leaves, samples.times_ns)
+        return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
 
     def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return what decides a node that was pending up to the end of the log; None beyond the bound.
@@ -305,8 +307,8 @@ class LeafHistory:
         if verdict is Verdict.VIOLATED:
             pending, conjuncts = np.full(final.shape, NEVER), conjuncts_of(self._nodes[node], "", node)
             node = find_causes(conjuncts, values, final, pending)[0].node
-        done = evaluate_offline(self._formula, self._order, samples.leaves, samples.times_ns)
-        return self._leaf(deciding_path(done, node, _END_OF[verdict]), samples, done, verdict)
+        evaluation = evaluate_offline(self._formula, self._order, samples.leaves, samples.times_ns)
+        return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
 
     def _until(self, time_ns: int | None) -> SeriesBlock | None:
         """Return the samples up to a time, or all."""
@@ -319,12 +321,12 @@ class LeafHistory:
         self, path: DecidingPath, samples: SeriesBlock, done: OfflineNodes, verdict: Verdict
     ) -> DecidingLeaf | None:
         """Return the leaf at the end of a path, with what was missed; None if it has no finite number."""
-        found = self._end_of(path, samples)
-        if found is None or verdict is not Verdict.VIOLATED:
-            return found
+        deciding = self._end_of(path, samples)
+        if deciding is None or verdict is not Verdict.VIOLATED:
+            return deciding
         missed, closest = missed_response(path, done, self._bindings)
         response = None if closest is None else self._end_of(closest, samples)
-        return found._replace(missed=missed, response=response)
+        return deciding._replace(missed=missed, response=response)
 
     def _end_of(self, path: DecidingPath, samples: SeriesBlock) -> DecidingLeaf | None:
         node, sample = path.steps[-1].node, path.steps[-1].sample
@@ -396,11 +398,11 @@ def leaf_pairs(
     """
     below = leaves_below(instance.formula, instance.program.leaves)
     leaves = tuple(substitute(leaf, instance.bindings) for leaf in instance.program.leaves)
-    pairs, known = tuple(map(pair_of, leaves)), RELATION_NAMES | relations
-    texts = tuple(format_formula(leaf, relations=known) for leaf in leaves)
+    pairs, relation_names = tuple(map(pair_of, leaves)), RELATION_NAMES | relations
+    texts = tuple(format_formula(leaf, relations=relation_names) for leaf in leaves)
     divisors = np.array([divisor_of(leaf) for leaf in instance.program.leaves])
     of_requirements = tuple(below[requirement.node] for requirement in requirements)
-    return LeafPairs(leaves, pairs, of_requirements, regions, divisors, texts, known)
+    return LeafPairs(leaves, pairs, of_requirements, regions, divisors, texts, relation_names)
 
 
 def pair_of(leaf: Formula) -> Pair | None:

@@ -75,7 +75,8 @@ class AnnotatedEvaluation:
         self._arrow, self.units = arrow, units
 
         self._evaluations = [
-            EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
+            EvaluationStream(file_instances, file.regions, semantics)
+            for file_instances, file in zip(instances, files, strict=True)
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
@@ -132,7 +133,7 @@ class AnnotatedEvaluation:
             outlines = map(footprint_from_outline, shown_regions(self._files).values())
             for ring in (ring for outline in outlines for ring in outlines_of(outline)):
                 extent = extent.with_points(ring)
-        has_states = [each.automaton is not None for each in self.automata]
+        has_states = [spec_automaton.automaton is not None for spec_automaton in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
         return LayoutContents(

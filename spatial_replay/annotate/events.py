@@ -143,11 +143,11 @@ def track(
     integers, worst = before.integers.copy(), before.worst.copy()
     places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
     room = len(nodes) * (len(times_ns) // LASTING + 2)
-    found, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
-    count = _track(times_ns, series, nodes, settles, integers, worst, places, found, numbers)
+    change_rows, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
+    count = _track(times_ns, series, nodes, settles, integers, worst, places, change_rows, numbers)
     changes = []
     for row, (worst_before, worst_after) in zip(
-        found[:count].tolist(), numbers[:count].tolist(), strict=True
+        change_rows[:count].tolist(), numbers[:count].tolist(), strict=True
     ):
         node, sample, code, start, end, place, next_code, next_start, next_end, next_place = row
         period = Period(code, start, end, worst_before, place) if code != START else None
@@ -361,7 +361,7 @@ class EventReporter:
         self._leaves = instance.program.leaves
         below = leaves_below(tree.formula, self._leaves)
         self._reported = _reported_nodes(tree, below, file, units)
-        self._nodes = np.array([each.node for each in self._reported], np.int64)
+        self._nodes = np.array([reported.node for reported in self._reported], np.int64)
         self._history = LeafHistory(tree.formula, self._leaves, instance.bindings) if self._settles else None
         self._values = np.empty(0)
         self._bindings = instance.bindings
@@ -419,10 +419,10 @@ class EventReporter:
                 time_ns,
                 (time_ns, time_ns),
                 Log.WARNING,
-                facts | {"node": str(each.node or 0), "vacuous": each.reason, "part": each.text},
-                each.message,
+                facts | {"node": str(reason.node or 0), "vacuous": reason.reason, "part": reason.text},
+                reason.message,
             )
-            for each in dict.fromkeys((*result.vacuous, *result.untested))
+            for reason in dict.fromkeys((*result.vacuous, *result.untested))
         ]
 
     def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> DecidingLeaf | None:
@@ -447,10 +447,10 @@ class EventReporter:
                 self.settled = self._violation(settled, time_ns)
             self._remember(change.node, settled, time_ns)
         else:
-            found = self._deciding_leaf(change.node, after, block)
-            witness = because = self._words(found, time_ns)
+            deciding = self._deciding_leaf(change.node, after, block)
+            witness = because = self._words(deciding, time_ns)
             if after.code in _VERDICTS:
-                self._remember(change.node, found, time_ns)
+                self._remember(change.node, deciding, time_ns)
         now = PeriodText(
             after, witness, change_sentence(reported.title, after, because, reported.unit), settled
         )
@@ -486,8 +486,8 @@ class EventReporter:
         period, witness, sentence, decided = now
         facts = self._facts(reported) | self._facts_of(period, witness, "")
         if decided is not None:
-            shown = decided.shown
-            facts |= {"witness_node": str(shown.node), "witness_ns": str(shown.time_ns)}
+            leaf = decided.shown
+            facts |= {"witness_node": str(leaf.node), "witness_ns": str(leaf.time_ns)}
         if past is not None:
             before, sentence = past.period, f"{sentence} {past.sentence}"
             facts |= self._facts_of(before, past.witness, "_before")
@@ -551,13 +551,13 @@ class EventReporter:
         """Return what decided in words, and the same with how long before a time; nothing for None."""
         if found is None:
             return "", ""
-        missed, shown = found.missed, found.shown
-        before_ns = since_ns - shown.time_ns
+        missed, deciding = found.missed, found.shown
+        before_ns = since_ns - deciding.time_ns
         is_violated = verdict is Verdict.VIOLATED and (missed is None or not missed.is_condition)
-        words = self._words(shown, now_ns, past=before_ns > 0, is_violated=is_violated)
-        if abs(shown.bound) < abs(shown.number):
-            leaf, _ = self._leaf(shown, now_ns)
-            words += uncertain_text(amount_text(abs(shown.bound), leaf, self._units))
+        words = self._words(deciding, now_ns, past=before_ns > 0, is_violated=is_violated)
+        if abs(deciding.bound) < abs(deciding.number):
+            leaf, _ = self._leaf(deciding, now_ns)
+            words += uncertain_text(amount_text(abs(deciding.bound), leaf, self._units))
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
         response = ""
         if missed is not None:
@@ -609,7 +609,7 @@ def _reported_nodes(
         below: of each node of the tree, its leaves.
     """
     specs = {spec.name: spec for spec in file.specs}
-    found: list[ReportedNode] = []
+    reported_nodes: list[ReportedNode] = []
     root = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
     names: set[str] = set()
     needed = {0}
@@ -631,8 +631,10 @@ def _reported_nodes(
         if any(about):
             title = f"{title} ({requirement_text(*about)})"
         is_needed, unit = identifier in needed, declared_unit(node, units)
-        found.append(ReportedNode(identifier, title, name, line, below[identifier], *about, is_needed, unit))
-    return found
+        reported_nodes.append(
+            ReportedNode(identifier, title, name, line, below[identifier], *about, is_needed, unit)
+        )
+    return reported_nodes
 
 
 def _line(source: str, start: int, end: int) -> int:

@@ -143,9 +143,9 @@ class Requirement(NamedTuple):
         standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
         standing[now >= 0.0] = Standing.HOLDING
         is_pending = np.full(now.shape, not self.can_violate)
-        for each in (self.conjunct if self.can_violate else None, self.obligation):
-            if each is not None:
-                is_pending |= each.is_open(series, at)
+        for obligation in (self.conjunct if self.can_violate else None, self.obligation):
+            if obligation is not None:
+                is_pending |= obligation.is_open(series, at)
         fails = now < 0.0
         standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
         if self.obligation is not None:
@@ -162,9 +162,9 @@ class Requirement(NamedTuple):
             series: (N, 4, T), of which lower and upper are those of the finished log.
             at: (S,) indices of samples.
         """
-        own = self.obligation or Obligation(self.node, self.sign)
-        low, high = (series[own.node, 2, at], series[own.node, 3, at])
-        if own.sign < 0.0:
+        obligation = self.obligation or Obligation(self.node, self.sign)
+        low, high = (series[obligation.node, 2, at], series[obligation.node, 3, at])
+        if obligation.sign < 0.0:
             low, high = -high, -low
         fails = (high < 0.0) & ~self.conjunct.is_open(series, at)
         return np.where(low >= 0.0, low, np.where(fails, high, np.nan))
@@ -182,32 +182,36 @@ def requirements_of(
     """
     places = _places(formula)
     is_plain = [is_spatial(place.formula) for place in places]
-    found = [
+    located = [
         (identifier, place)
         for identifier, place in enumerate(places)
         if place.sign and is_plain[identifier] and (place.parent is None or not is_plain[place.parent])
     ]
     if splits:
-        found = [(each, places[each]) for identifier, _ in found for each in _conjuncts(places, identifier)]
+        located = [
+            (conjunct, places[conjunct])
+            for identifier, _ in located
+            for conjunct in _conjuncts(places, identifier)
+        ]
     invariant = {
-        None if place.obligation is None else place.obligation.node for _, place in found if place.always
+        None if place.obligation is None else place.obligation.node for _, place in located if place.always
     }
     requirements = []
-    for identifier, place in found:
+    for identifier, place in located:
         obligation = place.obligation
         is_goal = not place.always and obligation is not None
         beside = is_goal and obligation is not None and obligation.node in invariant
-        own = _requirement(identifier, place, object)
-        requirements.append(own._replace(can_violate=not (is_goal and (beside or not settles))))
+        requirement = _requirement(identifier, place, object)
+        requirements.append(requirement._replace(can_violate=not (is_goal and (beside or not settles))))
     return tuple(requirements)
 
 
 def _conjuncts(places: Sequence[_Place], identifier: int) -> list[int]:
     """Return the conjuncts of a node without temporal operators, in the sign in which it counts."""
-    operands = [each for each, place in enumerate(places) if place.parent == identifier]
+    operands = [child for child, place in enumerate(places) if place.parent == identifier]
     if not operands or not _needs_all(places[identifier]):
         return [identifier]
-    return [conjunct for each in operands for conjunct in _conjuncts(places, each)]
+    return [conjunct for operand in operands for conjunct in _conjuncts(places, operand)]
 
 
 class _Place(NamedTuple):
@@ -295,7 +299,7 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
     regions: set[str] = set()
     groups: set[ClassMembers] = set()
     for node, around in iter_bound(place.formula):
-        bindings = {name: base_of(each.group) for each in around for name in each.variables}
+        bindings = {name: base_of(quantifier.group) for quantifier in around for name in quantifier.variables}
         terms: tuple[Term, ...] = node.terms if isinstance(node, Atom) else ()
         if isinstance(node, Quantified):
             terms = (node.group,)
@@ -331,5 +335,5 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
 
 
 def _excluded(group: Group, object: str | None) -> frozenset[str]:
-    names = [object if isinstance(each, Variable) else each.name for each in group.excluded]
+    names = [object if isinstance(term, Variable) else term.name for term in group.excluded]
     return frozenset(name for name in names if name is not None)

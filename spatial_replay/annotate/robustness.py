@@ -129,7 +129,7 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
                 message.specification,
                 message.object or None,
                 ids,
-                tuple(each or None for each in names),
+                tuple(name or None for name in names),
             )
             rows.setdefault(heading, []).append(message)
     return [
@@ -138,14 +138,17 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
             object,
             np.array(ids, np.int64),
             names,
-            np.array([each.time_ns for each in own], np.uint64).astype(np.int64),
+            np.array([message.time_ns for message in messages], np.uint64).astype(np.int64),
             np.array(
-                [[(node.value, node.now, node.lower, node.upper) for node in each.nodes] for each in own]
+                [
+                    [(node.value, node.now, node.lower, node.upper) for node in message.nodes]
+                    for message in messages
+                ]
             )
-            .reshape(len(own), -1, 4)
+            .reshape(len(messages), -1, 4)
             .transpose(1, 2, 0),
         )
-        for (name, object, ids, names), own in rows.items()
+        for (name, object, ids, names), messages in rows.items()
     ]
 
 
@@ -214,7 +217,7 @@ def encode_curves(
     thinning = Thinning(times_ns, most)
     message = Curves(
         time=thinning.seconds(first_ns),
-        specifications=[_result(each, thinning) for each in results],
+        specifications=[_result(result, thinning) for result in results],
         summary=summary,
     )
     return message.SerializeToString(deterministic=True)

@@ -70,9 +70,9 @@ class ReportedTree(NamedTuple):
         """Return a text about the formula with the object in place of the template's parameter."""
         if self.parameter is None or self.object is None:
             return text
-        own = re.escape(self.parameter)
+        parameter = re.escape(self.parameter)
         name = written_name(self.object, RELATION_NAMES)
-        return re.sub(rf'(?<![\w"]){own}(?![\w"])', lambda _: name, text)
+        return re.sub(rf'(?<![\w"]){parameter}(?![\w"])', lambda _: name, text)
 
     def written(self, source: str) -> list[str]:
         """Return the text of each node as the file writes it, with the object in place of the parameter.
@@ -87,17 +87,17 @@ class ReportedTree(NamedTuple):
         is_quantifier: list[bool] = []
         for _, parent, node in iter_nodes(self.formula):
             spans.append(node.span)
-            own = " ".join(source[node.span.start : node.span.end].split())
+            source_text = " ".join(source[node.span.start : node.span.end].split())
             is_bound = parent is not None and is_quantifier[parent]
-            is_quantifier.append(is_bound or _QUANTIFIER.match(own) is not None)
+            is_quantifier.append(is_bound or _QUANTIFIER.match(source_text) is not None)
             is_expanded = parent is not None and spans[parent] == node.span
-            text = "" if is_expanded or is_bound else own
+            text = "" if is_expanded or is_bound else source_text
             texts.append(self.named(text or format_formula(node)))
         return texts
 
     def calls(self, source: str) -> dict[int, str]:
         """Return the text of each node that is a `def` with its arguments, as the file writes it."""
-        nodes, written = list(iter_nodes(self.formula)), self.written(source)
+        nodes, spec_text = list(iter_nodes(self.formula)), self.written(source)
         spans, defined = [node.span for _, _, node in nodes], set(_DEFINED.findall(source))
         # what a def stands for has the place of its call
         expanded = {
@@ -107,18 +107,18 @@ class ReportedTree(NamedTuple):
         }
         above = {parent for identifier, parent, _ in nodes if identifier in expanded}
         return {
-            identifier: written[identifier]
+            identifier: spec_text[identifier]
             for identifier, _, node in nodes
             if node.name is None
             and identifier not in expanded
-            and (identifier in above or _is_call(node, written[identifier], defined))
+            and (identifier in above or _is_call(node, spec_text[identifier], defined))
         }
 
 
 def _is_call(node: Formula, written: str, defined: Collection[str]) -> bool:
     """Return whether a single atom is what a `def` of these names stands for."""
-    found = _CALL.match(written) if isinstance(node, Atom) else None
-    return found is not None and found[1] in defined
+    call = _CALL.match(written) if isinstance(node, Atom) else None
+    return call is not None and call[1] in defined
 
 
 def reported_trees(
@@ -131,8 +131,8 @@ def reported_trees(
     """
     names = [spec.name for file in files for spec in file.results]
     trees = []
-    for index, (file, own) in enumerate(zip(files, instances, strict=True)):
-        for instance in own:
+    for index, (file, file_instances) in enumerate(zip(files, instances, strict=True)):
+        for instance in file_instances:
             clashes = names.count(instance.name) > 1
             name = f"{PurePath(file.filename).stem}.{instance.name}" if clashes else instance.name
             spec = instance.spec
@@ -187,12 +187,12 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     Args:
         units: those that are declared, of signals by their names, of lengths by "".
     """
-    found = {_declared(unit, units) for unit in units_of(formula)}
-    if len(found) > 1:
+    declared_units = {_declared(unit, units) for unit in units_of(formula)}
+    if len(declared_units) > 1:
         return MIXED
-    if not found and any(iter_atoms(formula)):
+    if not declared_units and any(iter_atoms(formula)):
         return DIMENSIONLESS  # comparisons of modes alone are infinite
-    return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
+    return declared_units.pop() if declared_units else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
 def unit_words(unit: str) -> str:
@@ -204,7 +204,7 @@ def unit_words(unit: str) -> str:
 def _add_nodes(
     result: SpecificationResult, tree: ReportedTree, file: Specification, units: Mapping[str, str]
 ) -> None:
-    relations, written = RELATION_NAMES | file.relations, tree.written(file.source)
+    relations, spec_text = RELATION_NAMES | file.relations, tree.written(file.source)
     for identifier, parent, formula_node in iter_nodes(tree.formula):
         node = result.nodes.add(
             id=identifier,
@@ -214,7 +214,7 @@ def _add_nodes(
             span_start=formula_node.span.start,
             span_end=formula_node.span.end,
             unit=unit_of(formula_node, units),
-            written=written[identifier],
+            written=spec_text[identifier],
         )
         if parent is not None:
             node.parent = parent
@@ -275,8 +275,8 @@ def logged_specifications(files: Sequence[Specification], units: Mapping[str, st
             count += 1
             stem = f"{first}-{count}"
         stems.add(stem)
-        own = replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}")
-        logged.append(with_numbers(own, units))
+        contained = replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}")
+        logged.append(with_numbers(contained, units))
     return logged
 
 

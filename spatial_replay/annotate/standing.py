@@ -143,8 +143,8 @@ class StandingEncoder:
             blocks: of each tree; an object's result may have fewer samples.
             over: of each tree, what decided it, if that has happened in these samples or before.
         """
-        chosen = spaced(times_ns, self._written_ns)
-        shown_ns = times_ns[chosen]
+        samples = spaced(times_ns, self._written_ns)
+        shown_ns = times_ns[samples]
         series, words, since, least = [], [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
@@ -153,7 +153,7 @@ class StandingEncoder:
             since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
             least.append(np.append(self._least_ns[index], self._became_least(index, block))[at])
         self.pass_over(blocks)
-        if not len(chosen):
+        if not len(samples):
             return shown_ns, []
         self._written_ns = int(shown_ns[-1])
         return shown_ns, self._messages(shown_ns, series, words, np.array([since, least]), over)
@@ -208,10 +208,10 @@ class StandingEncoder:
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
             outcomes.append(FinalStanding(code, by, Instant(min(least_ns, time_ns), zero_ns), unit))
-        self.outcomes, codes = tuple(outcomes), [each.standing for each in outcomes]
+        self.outcomes, codes = tuple(outcomes), [outcome.standing for outcome in outcomes]
         since = [at_ns if code == VIOLATED else 0 for code, at_ns in zip(codes, since_ns, strict=True)]
         self.order = np.lexsort((np.array(since), _RANKS[codes])).tolist()
-        words, times_ns = [([each], np.zeros(1, np.int64)) for each in self._words], np.array([time_ns])
+        words, times_ns = [([text], np.zeros(1, np.int64)) for text in self._words], np.array([time_ns])
         instants = np.array([since_ns, self._least_ns])[:, :, None]
         [payload] = self._messages(times_ns, series, words, instants, over, final=True)
         return payload
@@ -236,8 +236,8 @@ class StandingEncoder:
     ) -> Sequence[bytes]:
         """Encode messages; `instants_ns` (2, R, S) are since when each result is violated, and so bad."""
         since_ns = instants_ns[0]
-        codes = [standing_codes(each, final=final) for each in series]
-        of_results = np.array([each[0] for each in codes])
+        codes = [standing_codes(node_series, final=final) for node_series in series]
+        of_results = np.array([node_codes[0] for node_codes in codes])
         worst = worst_results(of_results, since_ns)
         # the first of those violated first
         order = np.argsort(
@@ -246,25 +246,25 @@ class StandingEncoder:
             kind="stable",
         )
         counts = (of_results == VIOLATED).sum(axis=0)
-        marks = [codes[each.tree][each.node, :, None] for each in self._entries]
-        numbers = [_finite(series[each.tree][each.node, each.number, :, None]) for each in self._entries]
+        marks = [codes[entry.tree][entry.node, :, None] for entry in self._entries]
+        numbers = [_finite(series[entry.tree][entry.node, entry.number, :, None]) for entry in self._entries]
         encoded, of_violated = [], dict[int, tuple[Floats, Floats, Floats]]()
         is_listed = np.arange(len(order))[:, None] < counts
         keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
         for members in equal_places(combined(keys, len(times_ns))):
             first = int(members[0])
-            violated = tuple((each, over[each]) for each in order[: counts[first], first].tolist())
+            violated = tuple((place, over[place]) for place in order[: counts[first], first].tolist())
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
-            own = [each[members] for each in (times_ns[:, None], *numbers)]
-            for each, _ in layout.violated:
-                if each not in of_violated:
-                    seconds = (np.minimum(instants_ns[:, each], times_ns) - (self.zero_ns or 0)) / 1e9
+            columns = [column[members] for column in (times_ns[:, None], *numbers)]
+            for place, _ in layout.violated:
+                if place not in of_violated:
+                    seconds = (np.minimum(instants_ns[:, place], times_ns) - (self.zero_ns or 0)) / 1e9
                     since, at = np.round(seconds, 3)[:, :, None]
-                    of_violated[each] = since, rounded(_finite(-series[each][0, 3, :, None])), at
-                own += [column[members] for column in of_violated[each]]
-            own_marks = np.concatenate([each[members] for each in marks], axis=1)
-            encoded.append((members, self._template(layout).encode(words_of(own), own_marks)))
+                    of_violated[place] = since, rounded(_finite(-series[place][0, 3, :, None])), at
+                columns += [column[members] for column in of_violated[place]]
+            own_marks = np.concatenate([mark[members] for mark in marks], axis=1)
+            encoded.append((members, self._template(layout).encode(words_of(columns), own_marks)))
         return ordered(encoded)
 
     def _made_template(self, layout: _Layout) -> WireTemplate:

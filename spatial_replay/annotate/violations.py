@@ -75,10 +75,10 @@ class Shade:
 
     def now_of(self, name: str, now: Floats, at: Sequence[int] | np.ndarray) -> Floats:
         """Return the number of one of the objects that the quantifier binds, given the part's (S,)."""
-        own = self.bound.get(name)
-        if own is None:
+        numbers = self.bound.get(name)
+        if numbers is None:
             return now
-        return np.where((now < 0.0) & ~np.isnan(own[at]), own[at], now)
+        return np.where((now < 0.0) & ~np.isnan(numbers[at]), numbers[at], now)
 
 
 class ShadeTracker:
@@ -91,12 +91,12 @@ class ShadeTracker:
         self._regions = regions
         nodes = nodes_of(instance.formula)
         self._leaves = [
-            _separable(substitute(nodes[each.node], instance.bindings), each.sign) for each in parts
+            _separable(substitute(nodes[part.node], instance.bindings), part.sign) for part in parts
         ]
         numbers = {leaf_key(leaf): index for index, leaf in enumerate(instance.program.leaves)}
         self.shades: tuple[Shade, ...] = tuple(
-            Shade(each, leaf=-1 if leaf is None else numbers[leaf_key(nodes[each.node])])
-            for each, leaf in zip(parts, self._leaves, strict=True)
+            Shade(part, leaf=-1 if leaf is None else numbers[leaf_key(nodes[part.node])])
+            for part, leaf in zip(parts, self._leaves, strict=True)
         )
 
     def extend(self, trace: Trace, block: SeriesBlock) -> None:
@@ -110,22 +110,22 @@ class ShadeTracker:
     def _extended(self, shade: Shade, leaf: Quantified | None, trace: Trace, block: SeriesBlock) -> Shade:
         part = shade.requirement
         now = part.sign * block.series[part.node, 1]
-        known = now[~np.isnan(now)]
-        least = min(shade.least, float(known.min(initial=math.inf)))
-        is_known = shade.is_known and len(known) == len(now)
+        determined = now[~np.isnan(now)]
+        least = min(shade.least, float(determined.min(initial=math.inf)))
+        is_known = shade.is_known and len(determined) == len(now)
         fails = np.flatnonzero(now < 0.0)
         bound: dict[str, Floats] = {}
         bodies, worst = tuple[Formula, ...](), np.full(len(now), -1, np.int64)
         if leaf is not None and len(fails):
-            chosen = trace.take(np.searchsorted(trace.times_ns, block.times_ns[fails]))
-            tuples, bodies, of_fails = _numbers_of(leaf, part.sign, TraceScene(chosen, self._regions))
+            failing = trace.take(np.searchsorted(trace.times_ns, block.times_ns[fails]))
+            tuples, bodies, of_fails = _numbers_of(leaf, part.sign, TraceScene(failing, self._regions))
             if bodies:
                 is_least = of_fails == now[fails]
                 worst[fails] = np.where(is_least.any(axis=0), is_least.argmax(axis=0), -1)
-            for names, own in zip(tuples, of_fails, strict=True):
+            for names, binding_numbers in zip(tuples, of_fails, strict=True):
                 for name in names:
                     numbers = bound.setdefault(name, np.full(len(now), np.nan))
-                    numbers[fails] = np.fmin(numbers[fails], own)
+                    numbers[fails] = np.fmin(numbers[fails], binding_numbers)
         least_bound = dict(shade.least_bound)
         for name, numbers in bound.items():
             least_bound[name] = float(np.fmin.reduce(numbers, initial=least_bound.get(name, math.inf)))
@@ -272,7 +272,7 @@ def worst_robustness(
     for result in results:
         of = Requirement.outcome if result.is_final else Requirement.robustness
         shades = tuple(map(Shade, result.requirements)) if result.shades is None else result.shades
-        parts = result._replace(requirements=tuple(each.requirement for each in shades))
+        parts = result._replace(requirements=tuple(shade.requirement for shade in shades))
         own_ns = result.block.times_ns
         at = np.minimum(np.searchsorted(own_ns, presence.times_ns), max(len(own_ns) - 1, 0))
         for shade, (requirement, whole) in zip(
@@ -308,7 +308,7 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
     """
     times_ns = trace.times_ns[samples]
     which, requirement, robustness = _first(results, times_ns)
-    found = Violations(
+    violations = Violations(
         result=which,
         node=np.full(len(samples), -1, np.int64),
         leaf=np.full(len(samples), -1, np.int64),
@@ -322,18 +322,20 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
         atoms=[],
     )
     for index, result in enumerate(results):
-        here = np.flatnonzero(which == index)
-        if result.leaf_pairs is not None and len(here):
-            nodes = np.array([each.node for each in result.requirements], np.int64)
-            found.node[here] = nodes[requirement[here]]
-            at = np.searchsorted(result.block.times_ns, times_ns[here])
-            found.leaf[here], found.holds[here] = _deciding(result, result.leaf_pairs, requirement[here], at)
-            _point_at_settled(result, times_ns, here, found)
-            leaf = found.leaf[here]
-            known = here[leaf >= 0]
-            found.robustness[known] *= result.leaf_pairs.divisors[leaf[leaf >= 0]]
-            _locate(result, trace, samples, here, found)
-    return found
+        places = np.flatnonzero(which == index)
+        if result.leaf_pairs is not None and len(places):
+            nodes = np.array([demand.node for demand in result.requirements], np.int64)
+            violations.node[places] = nodes[requirement[places]]
+            at = np.searchsorted(result.block.times_ns, times_ns[places])
+            violations.leaf[places], violations.holds[places] = _deciding(
+                result, result.leaf_pairs, requirement[places], at
+            )
+            _point_at_settled(result, times_ns, places, violations)
+            leaf = violations.leaf[places]
+            located = places[leaf >= 0]
+            violations.robustness[located] *= result.leaf_pairs.divisors[leaf[leaf >= 0]]
+            _locate(result, trace, samples, places, violations)
+    return violations
 
 
 def _shows_settled(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
@@ -353,7 +355,7 @@ def _shows_settled(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bo
 
 def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
     """Return the requirement that a leaf is in."""
-    within = [each for each in result.requirements if each.node <= node]
+    within = [requirement for requirement in result.requirements if requirement.node <= node]
     return within[-1] if within else None
 
 
@@ -363,13 +365,13 @@ def _point_at_settled(result: EvaluatedResult, times_ns: Integers, here: Integer
         return
     found.leaf[here[times_ns[here] == result.settled.time_ns]] = -1
     leaf = result.settled.shown
-    there = here[_shows_settled(result, times_ns[here])]
-    if leaf is None or not len(there):
+    places = here[_shows_settled(result, times_ns[here])]
+    if leaf is None or not len(places):
         return
-    found.leaf[there], found.node[there] = leaf.leaf, leaf.node
-    found.robustness[there] = -abs(leaf.number)
-    found.holds[there] = leaf.number > 0.0
-    found.moment_ns[there] = np.where(times_ns[there] == leaf.time_ns, -1, leaf.time_ns)
+    found.leaf[places], found.node[places] = leaf.leaf, leaf.node
+    found.robustness[places] = -abs(leaf.number)
+    found.holds[places] = leaf.number > 0.0
+    found.moment_ns[places] = np.where(times_ns[places] == leaf.time_ns, -1, leaf.time_ns)
 
 
 def _robustness(
@@ -430,17 +432,17 @@ def _deciding(
     leaves = result.block.leaves
     low, high = low_and_high(len(leaves), wide=False)
     for number in np.unique(requirement[requirement >= 0]).tolist():
-        there = np.flatnonzero(requirement == number)
-        below, own = pairs.below[number], result.requirements[number]
+        samples = np.flatnonzero(requirement == number)
+        below, demand = pairs.below[number], result.requirements[number]
         if not len(below.indices):
             continue  # a constant
-        places = below.indices[:, None], at[there][None, :]
+        places = below.indices[:, None], at[samples][None, :]
         lows, highs = leaves[low][places], leaves[high][places]
-        now = result.block.series[own.node, 1, at[there]]
+        now = result.block.series[demand.node, 1, at[samples]]
         is_hit = (lows == highs) & (lows * below.signs[:, None] == now)
         first = is_hit.argmax(axis=0)
-        leaf[there] = np.where(is_hit.any(axis=0), below.indices[first], -1)
-        is_turned[there] = own.sign * below.signs[first] < 0.0
+        leaf[samples] = np.where(is_hit.any(axis=0), below.indices[first], -1)
+        is_turned[samples] = demand.sign * below.signs[first] < 0.0
     return leaf, is_turned
 
 
@@ -458,13 +460,13 @@ def _locate(
     # of all samples, these are often few
     leaf, scene = found.leaf[here], TraceScene(trace.take(samples[here]), result.leaf_pairs.regions)
     for index in np.unique(leaf).tolist():
-        there = np.flatnonzero(leaf == index)
+        with_leaf = np.flatnonzero(leaf == index)
         pair = result.leaf_pairs.pairs[index]
         if pair is not None:
-            _point_at(scene, pair, there, here[there], found)
-        for body, places in _iter_deciding(result, result.leaf_pairs, index, scene, there):
+            _point_at(scene, pair, with_leaf, here[with_leaf], found)
+        for body, places in _iter_deciding(result, result.leaf_pairs, index, scene, with_leaf):
             of_body = pair_of(body)
-            those = there[places]
+            those = with_leaf[places]
             if of_body is not None and len(those):
                 found.atom[here[those]] = len(found.atoms)
                 found.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), of_body))
@@ -509,13 +511,13 @@ def _iter_worst(
     """Yield what a quantifier with many bindings asks of those with the least number, as `_iter_deciding`."""
     if not isinstance(leaf, Quantified):
         return
-    chosen = TraceScene(scene.trace.take(samples), scene.regions)
-    tuples = permutations(chosen.candidates(leaf.group), len(leaf.variables))
+    part_scene = TraceScene(scene.trace.take(samples), scene.regions)
+    tuples = permutations(part_scene.candidates(leaf.group), len(leaf.variables))
     least, bodies = np.full(len(samples), np.inf), dict[int, Formula]()
     worst = np.full(len(samples), -1, np.int64)
     begin = 0
     while some := list(islice(tuples, _MOST_BINDINGS)):
-        of_some, numbers = _numbers_of_bindings(leaf, sign, chosen, some)
+        of_some, numbers = _numbers_of_bindings(leaf, sign, part_scene, some)
         numbers = np.where(np.isnan(numbers), np.inf, numbers)
         is_less = numbers.min(axis=0) < least
         worst[is_less] = begin + numbers.argmin(axis=0)[is_less]
@@ -529,7 +531,7 @@ def _iter_worst(
 def _point_at(scene: TraceScene, pair: Pair, samples: Integers, there: Integers, found: Violations) -> None:
     """Fill in the points of some samples of a scene, those of the violations `there`."""
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
-    first, second = (Operand(each.rows[samples], each.enlargement) for each in operands)
+    first, second = (Operand(operand.rows[samples], operand.enlargement) for operand in operands)
     numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
     found.points[there] = numbers[:, :4].reshape(-1, 2, 2)
     found.top[there] = numbers[:, 5]

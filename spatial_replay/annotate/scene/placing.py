@@ -49,6 +49,6 @@ def place_names(low: Floats, high: Floats, letters: Floats, blocked: Floats, lin
         top = np.nanmax([box[left, 1, 1] for box in boxes], axis=0, initial=-np.inf)
         middles[left, number, 0] = middle[left, 0]
         middles[left, number, 1] = top + half[left, 1] + _GAP * line
-        own = middles[:, number]
-        boxes.append(np.stack([own - half, own + half], axis=1))
+        centres = middles[:, number]
+        boxes.append(np.stack([centres - half, centres + half], axis=1))
     return middles

@@ -110,16 +110,16 @@ def arrow_texts(
         first_ns: the time of the log's first sample.
         unit: of lengths.
     """
-    shown = np.flatnonzero(found.is_shown)
-    robustness = np.where(found.holds, -found.robustness, found.robustness)[shown].tolist()
+    messages = np.flatnonzero(found.is_shown)
+    robustness = np.where(found.holds, -found.robustness, found.robustness)[messages].tolist()
     texts = [robustness_text(number, unit).encode() for number in robustness]
     lengths = np.fromiter(map(len, texts), np.int64, len(texts))
     of = found.result, found.leaf, found.holds, found.moment_ns, found.atom
-    columns = [each[shown] for each in of]
+    columns = [column[messages] for column in of]
     causes, cause = list[CauseText](), np.zeros(len(found.result), np.int64)
-    for places in equal_places(combined([*columns, lengths], len(shown))):
-        cause[shown[places]] = len(causes)
-        result, leaf, holds, moment_ns, atom = (int(each[places[0]]) for each in columns)
+    for places in equal_places(combined([*columns, lengths], len(messages))):
+        cause[messages[places]] = len(causes)
+        result, leaf, holds, moment_ns, atom = (int(column[places[0]]) for column in columns)
         pairs = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text, pair = ("", None) if pairs is None else (pairs.texts[leaf], pairs.pairs[leaf])
         if atom >= 0:
@@ -130,7 +130,7 @@ def arrow_texts(
         names = () if pair is None else pair.names
         causes.append(CauseText(said, int(lengths[places[0]]), dashes, names))
     numbers = [b""] * len(found.result)
-    for index, number in zip(shown.tolist(), texts, strict=True):
+    for index, number in zip(messages.tolist(), texts, strict=True):
         numbers[index] = number
     return ArrowTexts(tuple(causes), cause, numbers)
 
@@ -142,8 +142,8 @@ def _outlines_then(settled: SettledViolation | None) -> tuple[float, ...]:
     sample = settled.sample
     rows = sample.rows[0, [sample.names.index(name) for name in settled.objects]]
     rings = rings_of(sample.footprints.select(rows[rows >= 0]), 0.0)
-    listed = [ring for index in range(int((rows >= 0).sum())) for ring in rings.rings_of(index)]
-    return tuple(dashes_of(listed).reshape(-1).tolist()) if listed else ()
+    outlines = [ring for index in range(int((rows >= 0).sum())) for ring in rings.rings_of(index)]
+    return tuple(dashes_of(outlines).reshape(-1).tolist()) if outlines else ()
 
 
 _LONGEST_CAUSE: Final = 60
@@ -284,13 +284,15 @@ class Arrows(NamedTuple):
 
     def at(self, index: int) -> DrawnViolation | None:
         """Return the arrow in one message, if there is one."""
-        found = self.violations
-        if not found.is_shown[index]:
+        violations = self.violations
+        if not violations.is_shown[index]:
             return None
-        robustness, holds = float(found.robustness[index]), bool(found.holds[index])
+        robustness, holds = float(violations.robustness[index]), bool(violations.holds[index])
         label = self.texts.label(index)
-        moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
-        node, leaf, atom = (int(each[index]) for each in (found.node, found.leaf, found.atom))
+        moment_ns = int(violations.moment_ns[index]) if violations.moment_ns[index] >= 0 else None
+        node, leaf, atom = (
+            int(column[index]) for column in (violations.node, violations.leaf, violations.atom)
+        )
         of = (
             self.result,
             node,
@@ -298,10 +300,10 @@ class Arrows(NamedTuple):
             leaf,
             moment_ns,
             holds,
-            found.atoms[atom].text if atom >= 0 else "",
+            violations.atoms[atom].text if atom >= 0 else "",
         )
         cause = self.texts.causes[self.texts.cause[index]]
-        return DrawnViolation(found.points[index], label, *of, cause.dashes, entity_ids(cause.names))
+        return DrawnViolation(violations.points[index], label, *of, cause.dashes, entity_ids(cause.names))
 
 
 class SceneFrame(NamedTuple):
@@ -324,7 +326,7 @@ class SceneFrame(NamedTuple):
     @property
     def corners(self) -> int:
         """How many corners its outlines have."""
-        return sum(len(ring) for each in self.entities.values() for ring in each.rings)
+        return sum(len(ring) for entity in self.entities.values() for ring in entity.rings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,13 +356,13 @@ class SceneFrames:
     @cached_property
     def _details(self) -> tuple[Integers, Sequence[Arrows], NDArray[np.uint8], NDArray[np.uint8]]:
         """The chosen messages, their arrows, and the shades of their objects and regions, a result each."""
-        chosen = np.arange(len(self.times_ns)) if self.chosen is None else self.chosen
-        return chosen, self._find_arrows(chosen), *self._find_shades(chosen)
+        messages = np.arange(len(self.times_ns)) if self.chosen is None else self.chosen
+        return messages, self._find_arrows(messages), *self._find_shades(messages)
 
     def frame(self, index: int) -> SceneFrame:
         """Return what one of the chosen messages shows."""
-        chosen, found, of_objects, of_regions = self._details
-        place = int(np.searchsorted(chosen, index))
+        messages, arrows, of_objects, of_regions = self._details
+        place = int(np.searchsorted(messages, index))
         entities = {
             REGION + region.name: DrawnEntity(tuple(border_of(region)), _bytes(colour), shades.tobytes())
             for region, colour, shades in zip(
@@ -377,7 +379,7 @@ class SceneFrames:
             colour = _bytes(self.object_colours[index, column])
             shade = of_objects[place, column].tobytes()
             entities[OBJECT + name] = DrawnEntity(rings, colour, shade, last >= 0)
-        return SceneFrame(entities, found, place)
+        return SceneFrame(entities, arrows, place)
 
 
 class SceneContent(NamedTuple):

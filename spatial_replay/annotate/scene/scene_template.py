@@ -200,8 +200,8 @@ class SceneBounds(NamedTuple):
             low, high = _corners_of_part(vertices)
         if not len(vertices):
             return before
-        own = cls(low[0], low[1], high[0], high[1])
-        return own if before is None else before.with_points(np.array([low, high]))
+        box = cls(low[0], low[1], high[0], high[1])
+        return box if before is None else before.with_points(np.array([low, high]))
 
     def with_points(self, points: Floats) -> SceneBounds:
         """Return the box around this one and some points (P, 2)."""
@@ -439,7 +439,7 @@ class SceneLayout(NamedTuple):
     @property
     def has_heights(self) -> bool:
         """Whether any object has a height."""
-        return any(drawn.form.has_height for drawn in self.objects)
+        return any(figure.form.has_height for figure in self.objects)
 
 
 class Region(NamedTuple):
@@ -497,7 +497,7 @@ def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedR
     sizes = [region.size for region in regions]
     message, order = SceneUpdate(), list[int]()
     for number, (region, size) in enumerate(zip(regions, sizes, strict=True)):
-        smaller = sum(other < size for other in sizes)
+        smaller = sum(other_size < size for other_size in sizes)
         depth = _LABEL_LIFT * smaller / len(regions) * min(sizes)
         entity = _add_entity(message, REGION + region.name)
         _add_region(entity, region, depth, named=named)
@@ -524,8 +524,8 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
         gone.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     places, end = _places(layout, regions.number)
     label, order = list[int](), [*regions.order]
-    for drawn, own in zip(layout.objects, places, strict=True):
-        order += _order_of_object(drawn, own)
+    for figure, object_places in zip(layout.objects, places, strict=True):
+        order += _order_of_object(figure, object_places)
     for name, length in layout.missing:
         entity = _add_entity(last, OBJECT + name)
         _add_dashes(entity, np.full((length - 1, 2), SLOT), lift)
@@ -547,7 +547,7 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
         for x in range(begin, middle, 2):
             order += [x, x + 1, middle + 2]
         order += range(middle, middle + 3 + len(label))
-    objects = [_encoded_object(drawn, lift) for drawn in layout.objects]
+    objects = [_encoded_object(figure, lift) for figure in layout.objects]
     # messages are joined by joining their bytes
     encoded = b"".join([_encoded(gone), regions.entities, *objects, _encoded(last)])
     # the arrow's label is the last of all fields
@@ -579,7 +579,7 @@ class _Places(NamedTuple):
 
 def _places(layout: SceneLayout, regions: int) -> tuple[list[_Places], int]:
     """Return where the numbers of each object begin, and where those of the arrow."""
-    counts = [2 * sum(drawn.form.rings) for drawn in layout.objects]
+    counts = [2 * sum(figure.form.rings) for figure in layout.objects]
     points = len(_STAMP_WORDS) + 3 * regions
     *begins, colours = accumulate(counts, initial=points)
     middles = colours + 3 * len(counts)
@@ -713,7 +713,7 @@ _NS: Final = 1_000_000_000
 
 def _offsets(payload: bytes, wanted: bytes) -> list[int]:
     """Return where some bytes are in a payload."""
-    return [found.start() for found in re.finditer(re.escape(wanted), payload)]
+    return [hit.start() for hit in re.finditer(re.escape(wanted), payload)]
 
 
 def encoded_stamps(times_ns: Integers) -> Words:

@@ -98,21 +98,21 @@ class SceneNumbers:
         if count:
             # those that are shown follow each other
             first = content.observations[samples, content.names.index(layout.objects[0].name)]
-            corners = sum(sum(drawn.form.rings) for drawn in layout.objects)
+            corners = sum(sum(figure.form.rings) for figure in layout.objects)
             columns.append(_runs(content.rings.points, content.rings.start[first], corners))
             of_objects = self._of_objects[: 3 if layout.has_heights else 2]
-            columns += [_runs(each, first, count) for each in of_objects]
+            columns += [_runs(rows, first, count) for rows in of_objects]
         for name, length in layout.missing:
             rows = content.missing[samples, content.names.index(name)]
             columns.append(
                 np.array([content.last.rows[row] for row in rows.tolist()]).reshape(-1, 2 * length)
             )
         if isinstance(layout.witness, CauseText):
-            found, witness = content.violations, layout.witness
+            violations, witness = content.violations, layout.witness
             labels = witness.ends([content.numbers[index] for index in samples.tolist()])
-            z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
+            z = np.fmax(violations.top[samples], 0.0) + 3.0 * LIFT * self._scale
             spots = content.spots[samples, : len(layout.names)]
-            at = found.points[samples], z, spots, content.label[samples]
+            at = violations.points[samples], z, spots, content.label[samples]
             columns += numbers_of_witness(*at, self._scale, labels, witness.words)
         return words_of(columns)
 
@@ -223,17 +223,17 @@ class SceneEncoder:
         state = state or SceneState()
         if state.zero_ns is None and len(trace):
             state = replace(state, zero_ns=int(trace.times_ns[0]))
-        written = spaced(trace.times_ns, state.written_ns)
-        times_ns = trace.times_ns[written]
-        if not len(written):
+        sample_places = spaced(trace.times_ns, state.written_ns)
+        times_ns = trace.times_ns[sample_places]
+        if not len(sample_places):
             return SceneMessages(times_ns, [], self.pass_over(trace, state), None)
-        state, scales, first = self.scaled(state, trace, trace.rows[written])
+        state, scales, first = self.scaled(state, trace, trace.rows[sample_places])
         names = tuple(sorted({*trace.names, *state.shown, *state.last}))
-        missing, state = self._missing(names, trace, state, written)
+        missing, state = self._missing(names, trace, state, sample_places)
         missing[0][:first] = -1
         scale = state.scale or _UNSCALED
-        violations = first_violations(results, trace, written)
-        rows = _rows_of(names, trace, trace.rows[written])
+        violations = first_violations(results, trace, sample_places)
+        rows = _rows_of(names, trace, trace.rows[sample_places])
         presence = Presence(times_ns, names, _class_codes(trace, rows), trace.classes)
         objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
         objects[missing[0] >= 0] = np.nan
@@ -243,8 +243,8 @@ class SceneEncoder:
         regions_by_name = {region.name: np.concatenate(region.rings) for region in self._drawn}
         content = _content(trace, names, rows, state, violations, arrows, labels, missing, regions_by_name)
         shades = colours(objects, scales), colours(regions, scales)
-        shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
-        columns = SceneNumbers(times_ns, shades[1], shown, content, scale)
+        object_shades = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
+        columns = SceneNumbers(times_ns, shades[1], object_shades, content, scale)
         templates = dict(state.templates)
         encoded = []
         for layout, samples in _by_layout(content):
@@ -256,12 +256,14 @@ class SceneEncoder:
         after = replace(
             state,
             written_ns=int(times_ns[-1]),
-            shown=tuple(name for name, own in zip(content.names, is_shown.tolist(), strict=True) if own),
+            shown=tuple(
+                name for name, is_drawn in zip(content.names, is_shown.tolist(), strict=True) if is_drawn
+            ),
             is_pointing=bool(content.violations.is_shown[-1]),
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
-        find_arrows = partial(_arrows_of, results, trace, written, state.zero_ns or 0, self.unit)
-        find_shades = partial(_shades_of, results, presence, [each.name for each in self._drawn], scales)
+        find_arrows = partial(_arrows_of, results, trace, sample_places, state.zero_ns or 0, self.unit)
+        find_shades = partial(_shades_of, results, presence, [region.name for region in self._drawn], scales)
         frames = SceneFrames(
             times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades
         )
@@ -276,30 +278,30 @@ class SceneEncoder:
     ) -> tuple[tuple[Integers, Dashes], SceneState]:
         """Return (S, names) which of some last outlines each object that is missing has, and -1 for others;
         these outlines; and the state after the samples."""
-        last, found = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
+        last, outline_numbers = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
         outlines = list[tuple[Floats, ...]]()
         for name in sorted(self.named & {*trace.names, *last}):
             column = trace.names.index(name) if name in trace.names else None
             rows = np.full(len(trace), -1) if column is None else trace.rows[:, column]
             seen = np.maximum.accumulate(np.where(rows >= 0, np.arange(len(rows)), -1))
-            here = np.where(rows[written] < 0, seen[written], len(rows))
-            for at in np.unique(here).tolist():
+            last_seen = np.where(rows[written] < 0, seen[written], len(rows))
+            for at in np.unique(last_seen).tolist():
                 if at < len(rows) and (at >= 0 or name in last):
                     batch, row = last[name] if at < 0 else (trace.footprints, int(rows[at]))
-                    found[here == at, names.index(name)] = len(outlines)
+                    outline_numbers[last_seen == at, names.index(name)] = len(outlines)
                     rings = rings_of(batch.select(np.array([row])), _POINT * (state.scale or _UNSCALED))
                     outlines.append(rings.rings_of(0))
             if len(seen) and seen[-1] >= 0:
                 last[name] = trace.footprints, int(rows[seen[-1]])
         places = [np.concatenate(rings) for rings in outlines]
         under = [
-            [[(each[:, 0].min() + each[:, 0].max()) / 2.0, each[:, 1].min() - 0.75 * state.line]]
-            for each in places
+            [[(ring[:, 0].min() + ring[:, 0].max()) / 2.0, ring[:, 1].min() - 0.75 * state.line]]
+            for ring in places
         ]
         rows_of = [
             np.concatenate([dashes_of(rings), name]) for rings, name in zip(outlines, under, strict=True)
         ]
-        return (found, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
+        return (outline_numbers, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale and upper edge, once an object is shown, the scale (S, 1) of each
@@ -311,11 +313,11 @@ class SceneEncoder:
         if not is_shown.any():
             return state, scales, len(rows)
         first = int(is_shown.argmax())
-        shown = trace.footprints.select(rows[first][rows[first] >= 0])
+        footprints = trace.footprints.select(rows[first][rows[first] >= 0])
         # the median size of the objects
-        scale = state.scale or float(np.median(extents(shown))) or _UNSCALED
+        scale = state.scale or float(np.median(extents(footprints))) or _UNSCALED
         scales[first:] = scale
-        top, line = self._edge(shown)
+        top, line = self._edge(footprints)
         return replace(state, scale=scale, top=top, line=line), scales, first
 
     def _edge(self, shown: FootprintBatch) -> tuple[float, float]:
@@ -339,8 +341,8 @@ def _arrows_of(
     """Return the arrows of each result in some messages, as if it were the only one."""
     arrows = []
     for number, result in enumerate(results):
-        found = first_violations([result], trace, written[chosen])
-        arrows.append(Arrows(number, found, arrow_texts([result], found, first_ns, unit)))
+        violations = first_violations([result], trace, written[chosen])
+        arrows.append(Arrows(number, violations, arrow_texts([result], violations, first_ns, unit)))
     return arrows
 
 
@@ -357,11 +359,11 @@ def _shades_of(
     """
     entities = len(presence.names) + len(regions)
     shaded = results if 1 < len(results) <= _MOST_SHADES // max(entities, 1) else ()
-    own = presence._replace(times_ns=presence.times_ns[chosen], class_code=presence.class_code[chosen])
+    part = presence._replace(times_ns=presence.times_ns[chosen], class_code=presence.class_code[chosen])
     of_objects = np.empty((len(chosen), len(presence.names), len(shaded)), np.uint8)
     of_regions = np.empty((len(chosen), len(regions), len(shaded)), np.uint8)
     for number, result in enumerate(shaded):
-        objects, places = worst_robustness([result], own, regions)
+        objects, places = worst_robustness([result], part, regions)
         of_objects[:, :, number] = shade_codes(objects, scales[chosen])
         of_regions[:, :, number] = shade_codes(places, scales[chosen])
     return of_objects, of_regions
@@ -378,12 +380,12 @@ def spaced(times_ns: Integers, written_ns: int | None) -> Integers:
     earliest = int(times_ns[0]) if written_ns is None else written_ns + PERIOD_NS
     if times_ns[0] >= earliest and (np.diff(times_ns) >= PERIOD_NS).all():
         return np.arange(len(times_ns))
-    chosen = []
+    indices = []
     at = bisect_left(times_ns, earliest)
     while at < len(times_ns):
-        chosen.append(at)
+        indices.append(at)
         at = bisect_left(times_ns, int(times_ns[at]) + PERIOD_NS, at + 1)
-    return np.array(chosen, np.int64)
+    return np.array(indices, np.int64)
 
 
 def _rows_of(names: Sequence[str], trace: Trace, rows: Integers) -> Integers:
@@ -416,7 +418,7 @@ def _content(
     styles = np.full(rows.shape, -1, np.int64)
     low, high = boxes(rings.points, rings.start)
     sizes = extents(footprints) if rings.has_round else np.maximum(*(high - low).T)
-    has_label, failed = (each[is_present] for each in labels)
+    has_label, failed = (flags[is_present] for flags in labels)
     styles[is_present] = 4 * _levels(sizes, before.scale or _UNSCALED) + 2 * failed + (has_label | failed)
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
@@ -462,13 +464,13 @@ def _deciding_boxes(
     regions: Mapping[str, Floats],
 ) -> _DecidingBoxes:
     """Return the boxes of what decides violations, and the boxes that the names must not cover."""
-    shown = np.flatnonzero(found.is_shown)
-    boxes_of = np.full((len(shown), 2, 2, 2), np.nan)
-    blocked = np.full((len(shown), 4, 2, 2), np.nan)
-    letters = np.zeros((len(shown), 2))
+    messages = np.flatnonzero(found.is_shown)
+    boxes_of = np.full((len(messages), 2, 2, 2), np.nan)
+    blocked = np.full((len(messages), 4, 2, 2), np.nan)
+    letters = np.zeros((len(messages), 2))
     lasts = [_box(np.concatenate(rings)) for rings in missing[1].rings]
-    for cause in np.unique(arrows.cause[shown]).tolist():
-        places = np.flatnonzero(arrows.cause[shown] == cause)
+    for cause in np.unique(arrows.cause[messages]).tolist():
+        places = np.flatnonzero(arrows.cause[messages] == cause)
         text = arrows.causes[cause]
         if text.dashes:
             blocked[places, 3] = _box(np.reshape(text.dashes, (-1, 2)))
@@ -481,15 +483,15 @@ def _deciding_boxes(
             if name.name not in names:
                 continue
             column = names.index(name.name)
-            rows, last = (each[shown[places], column] for each in (observations, missing[0]))
+            rows, last = (table[messages[places], column] for table in (observations, missing[0]))
             seen, gone = np.flatnonzero(rows >= 0), np.flatnonzero(last >= 0)
-            own = np.stack([corner[rows[seen]] for corner in boxes_of_objects], axis=1)
-            boxes_of[places[seen], side] = own
+            corners = np.stack([corner[rows[seen]] for corner in boxes_of_objects], axis=1)
+            boxes_of[places[seen], side] = corners
             for place in gone.tolist():
                 boxes_of[places[place], side] = lasts[last[place]]
                 letters[places[place], side] = len(missing_words(name.name))
             blocked[places, side] = boxes_of[places, side]
-    ends = found.points[shown]
+    ends = found.points[messages]
     blocked[:, 2] = np.stack([ends.min(axis=1), ends.max(axis=1)], axis=1)
     # an object that is gone has its name at the arrow
     at_end = np.stack([ends, ends], axis=2)
@@ -525,21 +527,21 @@ def _label_places(
         spots: (S, 2, 2), the middles of the names beside it.
     """
     label = np.full(len(observations), np.nan)
-    shown = np.flatnonzero(found.is_shown)
-    ends = found.points[shown]
-    of_names = spots[shown, :, 1]
+    messages = np.flatnonzero(found.is_shown)
+    ends = found.points[messages]
+    of_names = spots[messages, :, 1]
     low = np.minimum(ends[:, :, 1].min(axis=1), of_names.min(axis=1) - 0.5 * state.line)
     high = np.maximum(ends[:, :, 1].max(axis=1), of_names.max(axis=1) + 0.5 * state.line)
-    for own in observations[shown].T:
+    for rows in observations[messages].T:
         # an absent object has the last box, and counts for nothing
-        lower, upper = (box[own][:, None, :] for box in boxes) if len(boxes[0]) else (ends, ends)
+        lower, upper = (box[rows][:, None, :] for box in boxes) if len(boxes[0]) else (ends, ends)
         near = state.line * 0.1
         is_near = np.all((lower - near <= ends) & (ends <= upper + near), axis=2)
-        touches = is_near.any(axis=1) & (own >= 0)
+        touches = is_near.any(axis=1) & (rows >= 0)
         low = np.where(touches, np.minimum(low, lower[:, 0, 1]), low)
         high = np.where(touches, np.maximum(high, upper[:, 0, 1]), high)
     has_room = high + 0.5 * state.line < (state.top or 0.0)
-    label[shown] = np.where(has_room, high + 1.25 * state.line, low - 1.75 * state.line)
+    label[messages] = np.where(has_room, high + 1.25 * state.line, low - 1.75 * state.line)
     return label
 
 
@@ -569,30 +571,30 @@ def _layout(content: SceneContent, message: int) -> SceneLayout:
     arrow = int(content.arrow[message])
     is_pointing = arrow >= FIRST_FORM
     of_objects = content.forms[message].tolist(), content.styles[message].tolist()
-    listed: list[tuple[str, int, int]] = list(zip(content.names, *of_objects, strict=True))
-    shown = tuple(
+    entries: list[tuple[str, int, int]] = list(zip(content.names, *of_objects, strict=True))
+    figures = tuple(
         DrawnObject(
             name,
             content.rings.forms[form - FIRST_FORM],
             style >> 2,
             "" if is_pointing else _label(name, style),
         )
-        for name, form, style in listed
+        for name, form, style in entries
         if form >= FIRST_FORM
     )
-    deleted = tuple(name for name, form, _ in listed if form == DELETED)
+    deleted = tuple(name for name, form, _ in entries if form == DELETED)
     last = zip(content.names, content.missing[message].tolist(), strict=True)
     missing = tuple((name, len(content.last.rows[row])) for name, row in last if row >= 0)
     cause: CauseText | Literal["deleted"] | None = None
     if arrow != ABSENT:
         cause = "deleted" if arrow == DELETED else content.causes[arrow - FIRST_FORM]
-    words = {name: _label(name, style | 1) for name, _, style in listed if style >= 0}
+    words = {name: _label(name, style | 1) for name, _, style in entries if style >= 0}
     words |= {name: missing_words(name) for name, _ in missing}
     beside = cause.names if isinstance(cause, CauseText) else ()
     names = [
         base.name if isinstance(base, RegionName) else words.get(base.name, base.name) for base in beside
     ]
-    return SceneLayout(deleted, shown, missing, cause, tuple(names))
+    return SceneLayout(deleted, figures, missing, cause, tuple(names))
 
 
 def _label(name: str, style: int) -> str:
