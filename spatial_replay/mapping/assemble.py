@@ -167,8 +167,8 @@ class _Assembling:
         for reader in self._readers.values():
             reader.finish()
             for signal, texts in reader.unnamed.items():
-                listed = ", ".join(map(repr, texts))
-                what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
+                unnamed = ", ".join(map(repr, texts))
+                what = f"`names` of the signal {signal!r} lacks {unnamed}; it is unknown there"
                 self._remarks.add(f"{reader.name}: {what}")
             if (step := reader.pending.first_step) is not None:
                 how = "are sorted by time, as if of two senders; if a clock was set back, cut the log there"
@@ -200,14 +200,16 @@ class _Assembling:
         if mapping.fixed_frame is None or not is_whole or self._plan.lost:
             return
         extractors = (reader.extractor for reader in self._readers.values())
-        noted = (each.noted_frames for each in extractors if each is not None)
+        noted = (extractor.noted_frames for extractor in extractors if extractor is not None)
         frames = sorted(self._tree.names.union(*noted) - {""})
         if frames and mapping.fixed_frame not in frames:
             hint = nearest_hint(mapping.fixed_frame, frames)
-            listed = ", ".join(frames[:20]) + (f" and {len(frames) - 20} more" if len(frames) > 20 else "")
+            first_frames = ", ".join(frames[:20]) + (
+                f" and {len(frames) - 20} more" if len(frames) > 20 else ""
+            )
             raise UsageError(
                 f"{mapping.name}: fixed_frame: the log has no frame {mapping.fixed_frame!r};"
-                f" {f'{hint} ' if hint else ''}its frames are {listed}"
+                f" {f'{hint} ' if hint else ''}its frames are {first_frames}"
             )
 
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
@@ -251,8 +253,8 @@ class _Assembling:
             if len(places):
                 stamped.append(self._stamp(reader, places, arrived))
         end = self._advance_time(stamped, arrived)
-        for each in stamped:
-            self._put(each.before(end), arrived)
+        for batch in stamped:
+            self._put(batch.before(end), arrived)
 
     def _of_publisher(self, planned: PlannedTopic, places: Integers, arrived: MessageColumns) -> Integers:
         """Return the places of messages whose publisher the mapping takes.
@@ -298,11 +300,11 @@ class _Assembling:
         Raises:
             LogError: time jumps back, and jumps do not split the log.
         """
-        moving = [each for each in stamped if each.reader.advances_time]
+        moving = [batch for batch in stamped if batch.reader.advances_time]
         none = np.empty(0, np.int64)
-        places = np.concatenate([none, *(each.places for each in moving)])
+        places = np.concatenate([none, *(batch.places for batch in moving)])
         order = np.argsort(places, kind="stable")
-        times_ns = np.concatenate([none, *(each.times_ns for each in moving)])[order]
+        times_ns = np.concatenate([none, *(batch.times_ns for batch in moving)])[order]
         if self._begin_ns is None and len(times_ns):
             self._begin_ns = int(times_ns[0])
         newest = np.maximum.accumulate(np.append(self._newest_ns, times_ns))
@@ -397,7 +399,7 @@ class _Assembling:
         if not messages:
             return MessageColumns()
         topics, *numbers, payloads = zip(*messages, strict=True)
-        log_ns, publish_ns, sequence = (np.array(each, np.int64) for each in numbers)
+        log_ns, publish_ns, sequence = (np.array(column, np.int64) for column in numbers)
         place = self._recorded + np.arange(len(messages))
         self._recorded += len(messages)
         # a topic keeps its number, since another one is another publisher
@@ -661,8 +663,8 @@ class _Silences:
         start_ns, end_ns = self._window_ns
         is_inside = is_sampled & (others_ns >= start_ns) & (others_ns < end_ns)
         self._note(others_ns[is_inside], place[is_inside])
-        chosen: Integers = others_ns[is_sampled]
-        return chosen
+        sampled_ns: Integers = others_ns[is_sampled]
+        return sampled_ns
 
     def _note(self, others_ns: Integers, place: Integers) -> None:
         """Note samples at other topics, with the place of the message of the sampled topic before each."""
@@ -730,7 +732,7 @@ def rehearse() -> None:
     contents: dict[str, Any] = {
         "/boxes": {
             "frame_id": "map",
-            "of": [{"id": each, "x": each, "y": 0, "yaw": each} for each in (1, 2)],
+            "of": [{"id": number, "x": number, "y": 0, "yaw": number} for number in (1, 2)],
         },
         "/discs": {"x": 0, "y": 0},
         "/rings": {"corners": [{"x": x, "y": y} for x, y in ring]},
@@ -795,18 +797,18 @@ class LiveAssembler(_Assembling):
         super().__init__(plan, decoder, name=name, on_time_jump="split", concave=concave)
         self._max_delay_s = max_delay_s
         self._is_in_order = in_order and plan.by_log_time
-        moving = (each.name for each in plan.planned if each.is_transforms and not each.is_static)
+        moving = (planned.name for planned in plan.planned if planned.is_transforms and not planned.is_static)
         self._moving = frozenset(moving)
         # a log has the static transforms of all its time
         self._in_step = [
-            each.name
-            for each in plan.planned
-            if not each.is_static and (each.mapping is not None or each.name == plan.sampled_topic)
+            planned.name
+            for planned in plan.planned
+            if not planned.is_static and (planned.mapping is not None or planned.name == plan.sampled_topic)
         ]
         self._follows_frames = bool(self._moving) and any(
-            each.is_static and each.mapping is not None for each in plan.planned
+            planned.is_static and planned.mapping is not None for planned in plan.planned
         )
-        self._latest_of = dict.fromkeys((each.name for each in plan.planned), -1)
+        self._latest_of = dict.fromkeys((planned.name for planned in plan.planned), -1)
         self._back_ns = {name: int(reader.repeats_times) for name, reader in self._readers.items()}
         self._silent: deque[tuple[float, int]] = deque()
         self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_HELD)
@@ -822,7 +824,9 @@ class LiveAssembler(_Assembling):
     @property
     def topics(self) -> tuple[str, ...]:
         """The topics that samples depend on, but those that are sent once and stay."""
-        passing = (each.topic for each in self._plan.planned if not (each.is_lasting or each.is_latched))
+        passing = (
+            planned.topic for planned in self._plan.planned if not (planned.is_lasting or planned.is_latched)
+        )
         return tuple(dict.fromkeys(passing))
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
@@ -858,7 +862,7 @@ class LiveAssembler(_Assembling):
 
     def due_s(self) -> float | None:
         """Return when to `add` again, even without messages; None if nothing waits."""
-        times = [each.until_s for each in self._held]
+        times = [waiting.until_s for waiting in self._held]
         is_settled = self._settled_ns >= self._newest_ns
         if self._silent and self._silent[-1][1] > self._patient_ns and not is_settled:
             times.append(self._silent[0][0])
@@ -880,7 +884,7 @@ class LiveAssembler(_Assembling):
             return Trace.empty()
         self._now_s = now_s
         self._lost |= gone
-        self._held = [each for each in self._held if each.topic not in gone]
+        self._held = [waiting for waiting in self._held if waiting.topic not in gone]
         gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in gone))
         so_far = self._settle(max(self._upto_ns(now_s), gone_ns), is_last=True)
         lost_ns = self._settled_ns + 1
@@ -931,7 +935,9 @@ class LiveAssembler(_Assembling):
             return
         until_s = self._now_s + self._max_delay_s
         if self._follows_frames and name == self._plan.sampled_topic:
-            self._held += [_Held(name, "", int(each), int(each), False, until_s) for each in times_ns]
+            self._held += [
+                _Held(name, "", int(time_ns), int(time_ns), False, until_s) for time_ns in times_ns
+            ]
         if reader.extractor is None or reader.planned.is_static:
             return
         for time_ns, message in zip(times_ns.tolist(), contents, strict=True):
@@ -961,40 +967,40 @@ class LiveAssembler(_Assembling):
             self._patient_ns = self._silent.popleft()[1]
         upto_ns = min(max(upto_ns, self._patient_ns), newest_ns)
         self._release(now_s)
-        return min([upto_ns, *(each.time_ns - 1 for each in self._held)])
+        return min([upto_ns, *(waiting.time_ns - 1 for waiting in self._held)])
 
     def _release(self, now_s: float) -> None:
         """Let go of the observations that can be placed, and of those that have waited for long enough."""
         if self._held and self._are_transforms_new:
             self._are_transforms_new = False
             self._held = [
-                each for each, known in zip(self._held, self._placeable(), strict=True) if not known
+                waiting for waiting, can_be in zip(self._held, self._placeable(), strict=True) if not can_be
             ]
-        late = [each for each in self._held if each.until_s <= now_s]
+        late = [waiting for waiting in self._held if waiting.until_s <= now_s]
         if late:
-            self._held = [each for each in self._held if each.until_s > now_s]
+            self._held = [waiting for waiting in self._held if waiting.until_s > now_s]
             self.overdue += len(late)
             self.overdue_frame = late[-1].topic, late[-1].frame
 
     def _placeable(self) -> list[bool]:
         """Return whether the transforms of each observation that waits have come."""
         fixed, tree = self._plan.mapping.fixed_frame or "", self._tree
-        known = [False] * len(self._held)
+        are_placeable = [False] * len(self._held)
         reached_ns = min((self._latest_of[topic] for topic in self._moving), default=-1)
         kinds: dict[tuple[str, bool], list[int]] = {}
-        for place, each in enumerate(self._held):
-            if each.frame:
-                kinds.setdefault((each.frame, each.by_stamp), []).append(place)
+        for place, waiting in enumerate(self._held):
+            if waiting.frame:
+                kinds.setdefault((waiting.frame, waiting.by_stamp), []).append(place)
             else:
-                known[place] = reached_ns >= each.at_ns
+                are_placeable[place] = reached_ns >= waiting.at_ns
         for (frame, by_stamp), places in kinds.items():
             at_ns = np.array([self._held[place].at_ns for place in places], np.int64)
             time_ns = np.array([self._held[place].time_ns for place in places], np.int64)
             log_ns = time_ns if self._plan.by_log_time else None
-            found = tree.between(fixed, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
+            is_found = tree.between(fixed, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
             if by_stamp:
                 # the next transform shows whether the clock has stepped back before such a stamp
-                found = found & ((at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns))
-            for place, is_known in zip(places, found.tolist(), strict=True):
-                known[place] = is_known
-        return known
+                is_found = is_found & ((at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns))
+            for place, is_known in zip(places, is_found.tolist(), strict=True):
+                are_placeable[place] = is_known
+        return are_placeable

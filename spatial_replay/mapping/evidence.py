@@ -660,8 +660,8 @@ class TopicEvidence:
     def _measure_numbers(self, detections: Sequence[Detections], message: Integers) -> Floats | None:
         """Measure the numbers as messages have them, and return them."""
         binding = self._binding
-        listed = [detected.numbers for detected in detections if detected.numbers is not None]
-        numbers = np.concatenate(listed) if binding is not None and len(listed) == len(detections) else None
+        pieces = [detected.numbers for detected in detections if detected.numbers is not None]
+        numbers = np.concatenate(pieces) if binding is not None and len(pieces) == len(detections) else None
         places = np.concatenate([detected.poses.position for detected in detections])
         if binding is not None and numbers is not None:
             if binding.orientation:

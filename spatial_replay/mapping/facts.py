@@ -28,7 +28,7 @@ def facts_of(evidence: TopicEvidence) -> TopicFacts:
         names=tuple(sorted(evidence.object_names)),
         classes=tuple(sorted(classes, key=lambda name: name or "")),
         class_changes=motions.change_count,
-        signals=() if planned.mapping is None else tuple(each.name for each in planned.mapping.signals),
+        signals=() if planned.mapping is None else tuple(signal.name for signal in planned.mapping.signals),
         size=_distribution(evidence.size),
         shorter_side=_distribution(evidence.shorter),
         low=tuple(filter(math.isfinite, evidence.low.tolist())),

@@ -183,9 +183,9 @@ class ReadingPlan:
 
     def _lookback_ns(self, planned: PlannedTopic) -> int | None:
         ages_ns = [
-            other.max_age_ns
-            for other in self.planned
-            if other.layout is not None and not other.is_lasting and not other.is_transforms
+            topic.max_age_ns
+            for topic in self.planned
+            if topic.layout is not None and not topic.is_lasting and not topic.is_transforms
         ]
         lookback_ns = planned.max_age_ns if planned.mapping is not None else 0
         if planned.name == self.sampled_topic:
@@ -195,7 +195,7 @@ class ReadingPlan:
         if planned.is_transforms and not planned.is_static:
             # an observation of the window may be that old, and is placed by a transform of its time
             lookback_ns = max(lookback_ns, HISTORY_NS + max(ages_ns, default=0))
-            if any(other.is_lasting and other.layout is not None for other in self.planned):
+            if any(topic.is_lasting and topic.layout is not None for topic in self.planned):
                 return None
         lookback_ns += self.late_ns
         return None if planned.is_lasting or lookback_ns >= FOREVER_NS else lookback_ns

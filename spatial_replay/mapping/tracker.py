@@ -170,9 +170,9 @@ def _named_deletions(detections: Detections, alive: Events) -> list[tuple[int, i
         return detections.deleted
     every_name = np.unique(np.concatenate([alive.name, detections.name])).tolist()
     return [
-        (message, each)
+        (message, deleted)
         for message, name in detections.deleted
-        for each in (every_name if name == EVERY_OBJECT else [name])
+        for deleted in (every_name if name == EVERY_OBJECT else [name])
     ]
 
 
@@ -254,11 +254,11 @@ def rows_from_detections(
     uncertainty = uncertainty * axes.scale
     shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
     # each is checked as a sample of its own, so that an invalid one does not affect others
-    each = np.arange(count, dtype=np.int64)
+    indices = np.arange(count, dtype=np.int64)
     readable, checked, faults = check_observations(
         Observations(
-            times_ns=each,
-            sample=each,
+            times_ns=indices,
+            sample=indices,
             name=np.zeros(count, np.int64),
             names=("",),
             class_code=detections.class_code,
@@ -278,7 +278,7 @@ def rows_from_detections(
         return rows
     unknown[list(faults)] = True
     both = concatenated([rows, ObservationRows.blank(detections.class_code)])
-    return replace(select(both, np.where(unknown, count + each, each)), is_valid=readable & ~unknown)
+    return replace(select(both, np.where(unknown, count + indices, indices)), is_valid=readable & ~unknown)
 
 
 def _moved(solids: Solids, transforms: Transforms) -> Solids:
@@ -520,15 +520,15 @@ class Tracker:
             last = select(last, np.flatnonzero(last.expires_ns > upto_ns))
             self._events[name] = last
             used.append(last.row)
-        chosen = np.concatenate(used)
+        last_rows = np.concatenate(used)
         number = np.zeros(len(self._rows), np.int64)
-        number[chosen] = np.arange(len(chosen))
-        self._rows = select(self._rows, chosen)
+        number[last_rows] = np.arange(len(last_rows))
+        self._rows = select(self._rows, last_rows)
         for name, last in self._events.items():
             self._events[name] = replace(last, row=number[last.row])
         self._signals = {key: (times[-1:], values[-1:]) for key, (times, values) in self._signals.items()}
-        kept = set(chosen.tolist())
-        self._following = {int(number[row]): e for row, e in self._following.items() if row in kept}
+        rows_left = set(last_rows.tolist())
+        self._following = {int(number[row]): e for row, e in self._following.items() if row in rows_left}
 
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
         """Make unknown, from a time on, what some topics have reported: objects stay, without a place."""
@@ -610,14 +610,14 @@ class Tracker:
         mapping, (frame, detections, index) = self.plan.mapping, following
         fixed, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
         log_ns = times_ns if self.plan.by_log_time else None
-        found = self.tree.between(
+        poses_of_frame = self.tree.between(
             fixed, frame, times_ns, by_stamp=False, log_ns=log_ns, longest_ns=longest_ns, holds=True
         )
-        self._count_missing(topic, frame, times_ns[~found.known])
-        self._unplaced_at[topic].append(times_ns[~found.known])
+        self._count_missing(topic, frame, times_ns[~poses_of_frame.known])
+        self._unplaced_at[topic].append(times_ns[~poses_of_frame.known])
         # while nothing moves, one observation is enough
-        changed = _changes(found)
-        repeated, moved = detections.repeat(index, len(changed)), found.select(changed)
+        changed = _changes(poses_of_frame)
+        repeated, moved = detections.repeat(index, len(changed)), poses_of_frame.select(changed)
         # faults were reported when it arrived
         rows = rows_from_detections(repeated, moved, mapping.axes, self.concave, lambda index, what: None)
         return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]
@@ -681,15 +681,15 @@ class Tracker:
         stays[follows] = False
         for frame, code in codes.items():
             for by_stamp in (False, True):
-                chosen = np.flatnonzero(stays & (of_frame == code) & (stamped == by_stamp))
-                if not len(chosen):
+                objects = np.flatnonzero(stays & (of_frame == code) & (stamped == by_stamp))
+                if not len(objects):
                     continue
-                at, log = (stamp_ns if by_stamp else clock_ns)[chosen], log_ns[chosen]
+                at, log = (stamp_ns if by_stamp else clock_ns)[objects], log_ns[objects]
                 between = self.tree.between(
                     fixed, frame, at, by_stamp=by_stamp, log_ns=log, longest_ns=reader.planned.between_ns
                 )
-                result.put(chosen, between)
-                missing = clock_ns[chosen[~between.known]]
+                result.put(objects, between)
+                missing = clock_ns[objects[~between.known]]
                 if by_stamp and len(missing):
                     first = int((~between.known).argmax())
                     self.remarks.stamps.setdefault(reader.name, (int(at[first]), int(log[first])))
@@ -709,16 +709,16 @@ class Tracker:
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
         """Return at which times a topic pauses for longer than `max_gap`."""
-        most_ns, known = self.plan.mapping.max_gap_ns, self._reported.get(topic)
+        most_ns, reported_ns = self.plan.mapping.max_gap_ns, self._reported.get(topic)
         planned = self.readers[topic].planned
-        if most_ns is None or known is None or planned.is_lasting or planned.is_latched:
+        if most_ns is None or reported_ns is None or planned.is_lasting or planned.is_latched:
             return np.zeros(len(times_ns), np.bool_)
         first = self.readers[topic].pending.first_ns
         # where no message follows, the time up to now shows whether this is a pause
         following = newest_ns if first is None else first
-        after = np.searchsorted(known, times_ns, "right")
-        before_ns = known[np.maximum(after - 1, 0)]
-        next_ns = np.append(known, following)[after]
+        after = np.searchsorted(reported_ns, times_ns, "right")
+        before_ns = reported_ns[np.maximum(after - 1, 0)]
+        next_ns = np.append(reported_ns, following)[after]
         return np.asarray((after > 0) & (next_ns - before_ns > most_ns) & (times_ns > before_ns))
 
     def _states(self, times_ns: Integers, newest_ns: int) -> States:
@@ -807,9 +807,9 @@ class Remarks:
     ) -> None:
         """Count the samples in which an object or a signal is unknown since its topic was silent."""
         for is_gap in (False, True):
-            own = times_ns[stale & (in_gap == is_gap)]
-            if len(own):
-                self.stale.add((topic, is_gap, name), own)
+            stale_ns = times_ns[stale & (in_gap == is_gap)]
+            if len(stale_ns):
+                self.stale.add((topic, is_gap, name), stale_ns)
 
     def add_pauses(self) -> None:
         """Remark pauses of topics, but for those in which there are no samples either."""
@@ -817,9 +817,10 @@ class Remarks:
         for topic, messages in sorted(self.messages.items()):
             if topic in self.lasting:
                 continue
-            own = messages.found()
+            topic_pauses = messages.found()
             is_common = all(
-                any(at < start + length and start < at + long for at, long in pauses) for start, length in own
+                any(at < start + length and start < at + long for at, long in pauses)
+                for start, length in topic_pauses
             )
             remark = messages.remark(f"{topic}: messages", self._mapping.max_gap_ns)
             if not is_common and remark is not None:
@@ -938,12 +939,12 @@ def _replaced(detections: Detections, times_ns: Integers, *, is_complete: bool) 
 
 def _changes(transforms: Transforms) -> Integers:
     """Return the indices of transforms that differ from the one before, and the first."""
-    rotation, translation, known = transforms
-    changed = np.ones(len(known), np.bool_)
+    rotation, translation, is_known = transforms
+    changed = np.ones(len(is_known), np.bool_)
     changed[1:] = (
         (rotation[1:] != rotation[:-1]).any(axis=(1, 2))
         | (translation[1:] != translation[:-1]).any(axis=1)
-        | (known[1:] != known[:-1])
+        | (is_known[1:] != is_known[:-1])
     )
     return np.flatnonzero(changed)
 
