@@ -103,7 +103,7 @@ def explanations_of(request: ExplanationTask) -> dict[ResultName, Explanation] |
         keys = [row_key(identity, task.conditions, meaning_hash(file)) for file in files]
     except SpatialReplayError as error:
         return str(error)
-    if any(wanted not in (None, key) for wanted, key in zip(request.keys, keys, strict=True)):
+    if any(expected_key not in (None, key) for expected_key, key in zip(request.keys, keys, strict=True)):
         return "the log, the mapping or the version has changed since; run the batch again"
     rows = {
         (number, row.spec, row.object): row

@@ -86,7 +86,7 @@ def _lines(
         f'time="{_time(row for rows in suites.values() for row in rows)}">\n'
     )
     for (case, file, spec), rows in suites.items():
-        written = rows if keeps else [row for row in rows if row["failure"] is not None]
+        listed_rows = rows if keeps else [row for row in rows if row["failure"] is not None]
         failures, errors = _counts(rows)
         title = f"{case}.{spec or file}"
         yield (
@@ -106,10 +106,10 @@ def _lines(
         yield "</properties>\n"
         # two files may have a spec of one name
         class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
-        for row in written:
+        for row in listed_rows:
             yield from _case(row, class_name, reports, limit)
-        if len(written) < len(rows):
-            left_out = counted(len(rows) - len(written), "test case")
+        if len(listed_rows) < len(rows):
+            left_out = counted(len(rows) - len(listed_rows), "test case")
             yield f"<system-out>{left_out} that passed left out, to keep this report small</system-out>\n"
         yield "</testsuite>\n"
     yield "</testsuites>\n"

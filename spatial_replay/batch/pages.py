@@ -41,7 +41,7 @@ def write_pages(
         OutputError: a page cannot be written.
     """
     failing = _failing(result)
-    pages = {key: folder / _FOLDER / _file_name(key[1], wanted) for key, wanted in failing.items()}
+    pages = {key: folder / _FOLDER / _file_name(key[1], requests) for key, requests in failing.items()}
     try:
         (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -71,11 +71,11 @@ def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:
     wanted_by_log: dict[tuple[str, str], list[Wanted]] = {
         (case, log): [] for case, log, failure, error in rows if failure and not error
     }
-    for wanted in result.wanted:
-        if (wanted.case.name, wanted.log.name) in wanted_by_log:
-            wanted_by_log[wanted.case.name, wanted.log.name].append(wanted)
+    for request in result.wanted:
+        if (request.case.name, request.log.name) in wanted_by_log:
+            wanted_by_log[request.case.name, request.log.name].append(request)
     # a result that is gone may have no log any more
-    return {key: wanted for key, wanted in wanted_by_log.items() if wanted}
+    return {key: requests for key, requests in wanted_by_log.items() if requests}
 
 
 def _task(wanted: list[Wanted]) -> Task:

@@ -272,10 +272,10 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
     conditions = task.conditions
     source = open_source(task.log, mapping=conditions.mapping, **dict(conditions.reading))
     parameters = {spec.parameter for file in files for spec in file.results}
-    each = {name: objects for name, objects in conditions.each if name in parameters}
+    choices = {name: objects for name, objects in conditions.each if name in parameters}
     window = _window(source, conditions)
     # no other messages are read than those that samples are made of
-    return source, ReplayOptions(window, each, conditions.semantics, conditions.strict_names, (MAPPED,))
+    return source, ReplayOptions(window, choices, conditions.semantics, conditions.strict_names, (MAPPED,))
 
 
 def _window(source: Source, conditions: Conditions) -> Window:

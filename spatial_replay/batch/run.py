@@ -141,8 +141,8 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
     """Yield what is wrong with the objects that a case chooses for the parameters of its templates."""
     templates = [spec for file in files for spec in file.results if spec.parameter is not None]
     parameters = {spec.parameter for spec in templates}
-    chosen = dict(case.conditions.each)
-    for parameter, objects in chosen.items():
+    choices = dict(case.conditions.each)
+    for parameter, objects in choices.items():
         try:
             Choice.parse(parameter, objects)
         except UsageError as error:
@@ -151,7 +151,7 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
             yield f"no template has a parameter {parameter!r}; templates here: {names}"
     for spec in templates:
-        if spec.parameter not in chosen:
+        if spec.parameter not in choices:
             yield (
                 f"{spec.name} is a template; say which objects {spec.parameter} stands for: "
                 f"--each {spec.parameter}=class:NAME or each: {{{spec.parameter}: all}}"
@@ -507,19 +507,19 @@ def run_batch(
     """
     folder = ResultsFolder.create(results)
     with folder.locked():
-        known, remarks = folder.identities()
+        known_identities, remarks = folder.identities()
         paths = list(dict.fromkeys(log.path for case in cases for log in case.logs))
-        identities, states = identify(paths, known, workers, progress)
-        wanted = _wanted(cases, identities)
+        identities, states = identify(paths, known_identities, workers, progress)
+        requests = _wanted(cases, identities)
         by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
         folder.write_identities(by_state)
         lasting = {
-            request.key for request in wanted if request.key is not None and not request.file.has_plugins
+            request.key for request in requests if request.key is not None and not request.file.has_plugins
         }
         stored, damaged = folder.rows(lasting)
-        tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
+        tasks = _tasks(requests, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
             for group, rows_of_group in _evaluated_groups(workers, list(tasks)) if tasks else ():
@@ -534,15 +534,17 @@ def run_batch(
                         else:
                             unstored[key] = rows
                 advance(len(group))
-        table = _table(wanted, [stored, *new_rows.tables], unstored, fail_on)
+        table = _table(requests, [stored, *new_rows.tables], unstored, fail_on)
         explanations = folder.read_explanations()
         names = zip(*(table.column(name).to_pylist() for name in ("key", "spec", "object")), strict=True)
         places = {place: explanations[name] for place, name in enumerate(names) if name in explanations}
-        table = with_record(with_explanations(table, places), wanted)
+        table = with_record(with_explanations(table, places), requests)
         folder.write_run(table)
     # a log that cannot be read was tried, and is not known
-    evaluated = {task.log for task in tasks} | {request.log.path for request in wanted if request.key is None}
-    return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
+    evaluated = {task.log for task in tasks} | {
+        request.log.path for request in requests if request.key is None
+    }
+    return BatchResult(table, len(paths), len(evaluated), tuple(requests), (*remarks, *damaged))
 
 
 _GROUP_S: Final = 0.5
@@ -591,12 +593,12 @@ class _Groups:
             if rows_of_log[0] and rows_of_log[0][0].error is None
         ]
         if seconds:
-            wanted = int(_GROUP_S / max(sum(seconds) / len(seconds), 1e-6))
-            self._size = max(1, min(wanted, _GROWTH * len(seconds), _MOST_IN_GROUP))
+            size = int(_GROUP_S / max(sum(seconds) / len(seconds), 1e-6))
+            self._size = max(1, min(size, _GROWTH * len(seconds), _MOST_IN_GROUP))
 
 
 def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
-    wanted = []
+    requests = []
     for prepared in cases:
         case = prepared.case
         conditions = _key_of(case.conditions)
@@ -604,8 +606,8 @@ def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None])
             identity = identities[log.path]
             for file in prepared.files:
                 key = _key(identity, conditions, file.hash)
-                wanted.append(Wanted(case, log, file, None if identity is None else key))
-    return wanted
+                requests.append(Wanted(case, log, file, None if identity is None else key))
+    return requests
 
 
 def row_key(identity: str, conditions: Conditions, meaning: str) -> str:
@@ -671,8 +673,8 @@ def _table(
         for place in places[request.key or f"{request.log.path}\0{request.file.hash}"]:
             indices.append(place)
             asked.append(request)
-    chosen = rows.take(pa.array(indices, pa.int64()))
-    return _judged(_named(chosen, asked), asked, fail_on)
+    asked_rows = rows.take(pa.array(indices, pa.int64()))
+    return _judged(_named(asked_rows, asked), asked, fail_on)
 
 
 def _named(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
@@ -720,25 +722,27 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
     names = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
     judged = rows.select(_JUDGED).to_pylist()
-    lines = {id(wanted.file): dict(wanted.file.lines) for wanted in asked}
-    meanings = {id(wanted.file): dict(wanted.file.meanings) for wanted in asked}
+    lines = {id(request.file): dict(request.file.lines) for request in asked}
+    meanings = {id(request.file): dict(request.file.meanings) for request in asked}
     requirements = zip(columns["requirement"].to_pylist(), asked, strict=True)
     columns |= {
         "verdict": [
-            wanted.case.expectation.verdict_of(row["verdict"], _lower(row))
-            for row, wanted in zip(judged, asked, strict=True)
+            request.case.expectation.verdict_of(row["verdict"], _lower(row))
+            for row, request in zip(judged, asked, strict=True)
         ],
-        "case": [wanted.case.name for wanted in asked],
-        "log": [wanted.log.name for wanted in asked],
-        "file": [wanted.file.name for wanted in asked],
-        "meaning": [meanings[id(wanted.file)].get(name) for wanted, name in zip(asked, names, strict=True)],
-        "expected": [wanted.case.expectation.text for wanted in asked],
+        "case": [request.case.name for request in asked],
+        "log": [request.log.name for request in asked],
+        "file": [request.file.name for request in asked],
+        "meaning": [meanings[id(request.file)].get(name) for request, name in zip(asked, names, strict=True)],
+        "expected": [request.case.expectation.text for request in asked],
         "failure": [
-            _failure(row, wanted.case.expectation, fail_on) for row, wanted in zip(judged, asked, strict=True)
+            _failure(row, request.case.expectation, fail_on)
+            for row, request in zip(judged, asked, strict=True)
         ],
-        "line": [lines[id(wanted.file)].get(name, 1) for wanted, name in zip(asked, names, strict=True)],
+        "line": [lines[id(request.file)].get(name, 1) for request, name in zip(asked, names, strict=True)],
         "requirement": [
-            requirement or ", ".join(wanted.case.requirements) or None for requirement, wanted in requirements
+            requirement or ", ".join(request.case.requirements) or None
+            for requirement, request in requirements
         ],
     }
     schema = run_columns()

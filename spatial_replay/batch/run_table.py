@@ -246,14 +246,14 @@ def worst_rows(table: pa.Table, count: int) -> list[Values]:
     import pyarrow.compute as pc
 
     units = pc.fill_null(table.column("unit"), "")
-    found: list[tuple[tuple[bool, int, int], Values]] = []
+    ranked_rows: list[tuple[tuple[bool, int, int], Values]] = []
     for unit in units.unique():
         places = Counter[tuple[bool, int]]()
         for row in _worst_of_unit(table.filter(pc.equal(units, unit)), count):
             rank = (row["failure"] is None, RANKS[row["verdict"]])
-            found.append(((*rank, places[rank]), row))
+            ranked_rows.append(((*rank, places[rank]), row))
             places[rank] += 1
-    return [row for _, row in sorted(found, key=itemgetter(0))[:count]]
+    return [row for _, row in sorted(ranked_rows, key=itemgetter(0))[:count]]
 
 
 def _worst_of_unit(table: pa.Table, count: int) -> list[Values]:
@@ -268,8 +268,8 @@ def _worst_of_unit(table: pa.Table, count: int) -> list[Values]:
         {"passes": passes, "rank": rank, "number": table.column("robustness"), "place": range(len(table))}
     )
     keys = [(name, "ascending") for name in order.column_names]
-    chosen = table.take(pc.sort_indices(order, sort_keys=keys).slice(0, count))
-    return cast("list[Values]", chosen.to_pylist())
+    worst = table.take(pc.sort_indices(order, sort_keys=keys).slice(0, count))
+    return cast("list[Values]", worst.to_pylist())
 
 
 def rows_where(table: pa.Table, condition: str) -> pa.Table:
@@ -360,8 +360,10 @@ class _Condition:
         match node:
             case ast.BoolOp(op=op, values=[first, *rest]):
                 joined = self.of(first)
-                for each in rest:
-                    joined = joined & self.of(each) if isinstance(op, ast.And) else joined | self.of(each)
+                for operand in rest:
+                    joined = (
+                        joined & self.of(operand) if isinstance(op, ast.And) else joined | self.of(operand)
+                    )
                 return joined
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return ~self.of(operand)
@@ -634,11 +636,11 @@ _LISTS: Final = (
 
 def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     """Return the row of a result that only the baseline has, given its row there."""
-    kept = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
+    copied_columns = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
     nothing: dict[str, Any] = {name: [] for name in _LISTS}
     return {
         **nothing,
-        **{name: row.get(name) for name in kept},
+        **{name: row.get(name) for name in copied_columns},
         "failure": f"{difference.failure} in the baseline",
         "reason": "",
         "seconds": 0.0,
@@ -668,16 +670,16 @@ def _differences(
     present = {key[:-1] for key in now}
     for key, (old, old_number) in before.items():
         # an error in place of all objects of a template stands for each
-        found = now.get(key) or now.get((*key[:-1], None))
-        if found is None and old is None and key[:-1] in present:
+        result_now = now.get(key) or now.get((*key[:-1], None))
+        if result_now is None and old is None and key[:-1] in present:
             # an error in place of all objects of a template, which has results now
             continue
-        if found is None:
+        if result_now is None:
             yield Difference(
                 "gone", *key, before=old, now=None, before_robustness=old_number, robustness=None
             )
             continue
-        new, number = found
+        new, number = result_now
         change: Change | None = None
         if new != old:
             change = "verdict" if _ORDER[new] > _ORDER[old] else "better"

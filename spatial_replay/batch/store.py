@@ -199,12 +199,12 @@ def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
     """Return rows, by their keys, as a table; an unknown number is null."""
     pa, schema = _pyarrow(), columns()
     key, *values = schema
-    listed = [row for several in rows.values() for row in several]
+    all_rows = [row for several in rows.values() for row in several]
     arrays = [pa.array([key for key, several in rows.items() for _ in several], key.type)]
     # column by column: three times as fast as row by row
     arrays += [
         # DuckDB and polars hold a NaN for greater than every number
-        pa.array([getattr(row, column.name) for row in listed], column.type, from_pandas=True)
+        pa.array([getattr(row, column.name) for row in all_rows], column.type, from_pandas=True)
         for column in values
     ]
     return pa.Table.from_arrays(arrays, schema=schema)
@@ -235,11 +235,11 @@ def _decoded(data: bytes) -> pa.Table:
 
     footer = _footer(data)
     begin = max(0, footer - _DIGEST_BYTES)
-    digest, own = data[begin:footer], data[:begin] + data[footer:]
-    if hashlib.sha256(own).digest() != digest:
+    digest, content = data[begin:footer], data[:begin] + data[footer:]
+    if hashlib.sha256(content).digest() != digest:
         raise ValueError("it is damaged: its digest does not fit")
     # not `read_table`, which takes twice as long
-    with parquet.ParquetFile(_pyarrow().BufferReader(own)) as opened:
+    with parquet.ParquetFile(_pyarrow().BufferReader(content)) as opened:
         return opened.read(use_threads=False)
 
 
@@ -351,7 +351,7 @@ class ResultsFolder:
         Raises:
             OutputError: that cannot be done.
         """
-        found, remarks, taken, small = [columns().empty_table()], [], set[str](), {}
+        tables, remarks, taken_keys, small = [columns().empty_table()], [], set[str](), {}
         names = self._files.names(_ROWS)
         for name, data in zip(names, self._files.read(names), strict=True):
             try:
@@ -361,14 +361,14 @@ class ResultsFolder:
                 self._files.remove([name])
                 continue
             keys = table.column("key").to_pylist()
-            own = set(keys) - taken
-            taken |= own
-            if len(own) < _MOST_TOGETHER:
-                small[name] = table.filter([key in own for key in keys])
-            found.append(table.filter([key in own and key in wanted for key in keys]))
+            new_keys = set(keys) - taken_keys
+            taken_keys |= new_keys
+            if len(new_keys) < _MOST_TOGETHER:
+                small[name] = table.filter([key in new_keys for key in keys])
+            tables.append(table.filter([key in new_keys and key in wanted for key in keys]))
         if len(small) > _MOST_SMALL:
             self._join(small)
-        return _pyarrow().concat_tables(found), remarks
+        return _pyarrow().concat_tables(tables), remarks
 
     def _join(self, tables: Mapping[str, pa.Table]) -> None:
         """Write tables of rows as one, in place of those that have their names."""
@@ -411,10 +411,10 @@ class ResultsFolder:
         """
         if self._files.is_on_this_machine:
             pa = _pyarrow()
-            listed = sorted(identities.items())
+            pairs = sorted(identities.items())
             names = ("state", "identity")
             columns = {
-                name: pa.array([each[n] for each in listed], pa.string()) for n, name in enumerate(names)
+                name: pa.array([pair[n] for pair in pairs], pa.string()) for n, name in enumerate(names)
             }
             self._files.write(_IDENTITIES, _encoded(pa.table(columns)))
 

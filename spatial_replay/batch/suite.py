@@ -80,11 +80,11 @@ class Conditions:
             reading: keyword arguments of `open_source`, the mapping among them.
             others: further attributes.
         """
-        own = dict(reading)
-        mapping = own.pop("mapping", None)
+        options = dict(reading)
+        mapping = options.pop("mapping", None)
         return cls(
             mapping=None if mapping is None else sendable(mapping),
-            reading=_pairs(own),
+            reading=_pairs(options),
             each=_pairs(each or {}),
             constants=_pairs(constants or {}),
             **others,
@@ -242,8 +242,8 @@ class Suite:
     def allowing(self, kinds: AbstractSet[str]) -> Suite:
         """Return the suite with what passes in every case, too."""
         cases = [
-            replace(each, expectation=replace(each.expectation, allow=each.expectation.allow | kinds))
-            for each in self.cases
+            replace(case, expectation=replace(case.expectation, allow=case.expectation.allow | kinds))
+            for case in self.cases
         ]
         return replace(self, cases=tuple(cases))
 
@@ -288,12 +288,12 @@ def _cases(document: Document, faults: Mapping[Place, str], path: Path) -> Itera
     value = document.value if isinstance(document.value, dict) else {}
     entries = value.get("cases")
     wrong = {place[:end] for place in faults for end in range(1, len(place) + 1)}
-    for number, own in enumerate(entries if isinstance(entries, list) else ()):
-        if isinstance(own, dict):
+    for number, entry in enumerate(entries if isinstance(entries, list) else ()):
+        if isinstance(entry, dict):
             at: Place = ("cases", number)
             places: dict[str, Place] = {key: (key,) for key in value if key != "cases"}
-            places |= {key: (*at, key) for key in own}
-            yield _case({**value, **own}, {"": at, **places}, wrong, document, path)
+            places |= {key: (*at, key) for key in entry}
+            yield _case({**value, **entry}, {"": at, **places}, wrong, document, path)
 
 
 def _case(
@@ -313,16 +313,16 @@ def _case(
     lines = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
 
     def listed(key: str) -> Iterator[tuple[Place, str]]:
-        for number, each in enumerate(_listed(entry.get(key))):
+        for number, value in enumerate(_listed(entry.get(key))):
             place = (*places[key], number)
-            if isinstance(each, str) and place not in wrong:
-                yield place, each
+            if isinstance(value, str) and place not in wrong:
+                yield place, value
 
     logs = [LogPattern(log, f"{path.name}:{document.line_of(place)}") for place, log in listed("logs")]
     specs = dict.fromkeys(spec for _, spec in listed("specs"))
     is_whole = bool(specs) and not any(places.get(key) in wrong for key in ("specs", "each", "constants"))
     name = str(entry.get("name", ""))
-    entry = {key: each for key, each in entry.items() if places.get(key) not in wrong}
+    entry = {key: value for key, value in entry.items() if places.get(key) not in wrong}
     mapping = entry.get("mapping")
     start, end = entry.get("from"), entry.get("to")
     return Case(

@@ -208,14 +208,14 @@ class DaskCluster:
             pool = client.get_executor(pure=False)
             try:
                 while self._hand_out(client, pool, work, rest, waiting):
-                    done = wait(waiting, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED).done
-                    if not done and not is_reported and not client.nthreads():
+                    finished = wait(waiting, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED).done
+                    if not finished and not is_reported and not client.nthreads():
                         self._report(
                             f"--dask {self._address}: the scheduler has no workers, so nothing is evaluated; "
                             f"start some with `dask worker {self._address}`, or stop with Ctrl-C"
                         )
                         is_reported = True
-                    for future in done:
+                    for future in finished:
                         task = waiting.pop(future)
                         yield task, self._result(future)
             finally:
@@ -286,12 +286,12 @@ class DaskCluster:
 @contextmanager
 def _silent(*loggers: str) -> Iterator[None]:
     """Keep loggers from writing tracebacks about what is raised as an error of ours."""
-    found = [logging.getLogger(name) for name in loggers]
-    before = [each.disabled for each in found]
+    named_loggers = [logging.getLogger(name) for name in loggers]
+    before = [logger.disabled for logger in named_loggers]
     try:
-        for each in found:
-            each.disabled = True
+        for logger in named_loggers:
+            logger.disabled = True
         yield
     finally:
-        for each, was in zip(found, before, strict=True):
-            each.disabled = was
+        for logger, was in zip(named_loggers, before, strict=True):
+            logger.disabled = was
