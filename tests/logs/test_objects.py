@@ -60,7 +60,7 @@ def test_bytes_appended_to_one_message_affect_only_that_message(motley, extra, r
         Sample(i, {"a": Footprint.box(i, 0, i + 1, 1)}, {"u": 1.0, "v": 2.0, "w": 3.0}) for i in range(200)
     )
     for trace in (motley, uniform):
-        payloads = encode_objects(trace)
+        payloads = list(encode_objects(trace))
         payloads[150] += extra if isinstance(extra, bytes) else extra.SerializeToString()
         decoded, faults = decode_objects(payloads, trace.times_ns)
         if reported is None:
@@ -73,7 +73,7 @@ def test_bytes_appended_to_one_message_affect_only_that_message(motley, extra, r
 
 
 def test_a_message_without_time_among_many_is_a_fault(motley):
-    payloads = encode_objects(motley)
+    payloads = list(encode_objects(motley))
     message = ObjectStates.FromString(payloads[42])
     message.ClearField("time_ns")
     payloads[42] = message.SerializeToString()
