@@ -168,8 +168,10 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     is_sure = (scene.is_sure or not spreads.any()) and (closest[:, :2] == closest[:, 2:]).all()
     channels = 4 if not is_sure else 1 if is_known else 2
     result = np.empty((channels, len(outputs), count))
-    columns = (of_kind.reshape(-1) for of_kind in (values, spreads, signals, closest, members))
-    arguments = rows.reshape(-1), constants, *columns, outputs, result
+    arguments = (
+        rows.reshape(-1), constants, values.reshape(-1), spreads.reshape(-1), signals.reshape(-1),
+        closest.reshape(-1), members.reshape(-1), outputs, result,
+    )  # fmt: skip
     over_cores(
         run_instructions,
         lambda begin, end: run_instructions(*arguments, begin, end),
