@@ -85,7 +85,8 @@ class ThresholdRange:
     def objects(self) -> str | None:
         """Its variables and their groups, as `d in drinks`; None without any."""
         over = [
-            f"{', '.join(each.variables)} in {format_term(each.group).strip('()')}" for each in self.bound
+            f"{', '.join(quantifier.variables)} in {format_term(quantifier.group).strip('()')}"
+            for quantifier in self.bound
         ]
         return ", ".join(over) or None
 
@@ -148,9 +149,9 @@ class LogNumbers:
             dict.fromkeys(part for spec in specification.results for part in named_parts(spec.formula))
         )
         self._ranges = {
-            _key(each, bound): ThresholdRange(each, bound)
-            for each, bound in bound_nodes(specification)
-            if isinstance(each, Atom) and _compared(each) is not None
+            _key(node, bound): ThresholdRange(node, bound)
+            for node, bound in bound_nodes(specification)
+            if isinstance(node, Atom) and _compared(node) is not None
         }
 
     def add(self, trace: Trace) -> None:
@@ -193,27 +194,29 @@ class LogNumbers:
             )
             # low and high ends differ where something is unknown; without any object they are infinite
             is_text = isinstance(seen.atom.parameters[-1], str)
-            known = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
+            is_sure = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
             for ends in (all_hold, any_holds) if is_text else (least, greatest):
-                known &= ends[0] == ends[min(1, len(ends) - 1)]
+                is_sure &= ends[0] == ends[min(1, len(ends) - 1)]
             # `forall` of nothing is +inf, `exists` -inf
             is_empty = (all_hold == np.inf).all(axis=0) & (any_holds == -np.inf).all(axis=0)
-            known &= ~is_empty
-            numbers = known & (not is_text)
+            is_sure &= ~is_empty
+            numbers = is_sure & (not is_text)
             self._ranges[key] = replace(
                 seen,
                 least=min(seen.least, float(least[0, numbers].min(initial=inf))),
                 greatest=max(seen.greatest, float(greatest[0, numbers].max(initial=-inf))),
-                known=seen.known + int(known.sum()),
-                holding=seen.holding + int((all_hold[0, known] >= 0.0).sum()),
-                failing=seen.failing + int((any_holds[0, known] < 0.0).sum()),
+                known=seen.known + int(is_sure.sum()),
+                holding=seen.holding + int((all_hold[0, is_sure] >= 0.0).sum()),
+                failing=seen.failing + int((any_holds[0, is_sure] < 0.0).sum()),
                 empty=seen.empty + int(is_empty.sum()),
             )
 
     @property
     def ranges(self) -> Sequence[ThresholdRange]:
         """Quantity of each atom with a threshold."""
-        return tuple(replace(each, samples=self.samples) for each in self._ranges.values())
+        return tuple(
+            replace(threshold_range, samples=self.samples) for threshold_range in self._ranges.values()
+        )
 
     def range_of(self, atom: Atom, bound: tuple[Quantified, ...]) -> ThresholdRange | None:
         """Return what an atom compares with its threshold; None if that is not one number."""
@@ -260,14 +263,16 @@ _Windows: TypeAlias = tuple[tuple[Temporal, Bound], ...]
 
 def _reach(formula: Formula, rate: float) -> tuple[float, _Windows]:
     """Return how far a formula looks ahead, in seconds, and the windows within each other that do."""
-    found = max((_reach(each, rate) for each in operands_of(formula)), key=itemgetter(0), default=(0.0, ()))
+    farthest = max(
+        (_reach(operand, rate) for operand in operands_of(formula)), key=itemgetter(0), default=(0.0, ())
+    )
     bound = formula.bound if isinstance(formula, Temporal) else None
     if not isinstance(formula, Temporal) or bound is None or formula.operator not in FUTURE_OPERATORS:
-        return found
+        return farthest
     if bound.upper is None:
-        return found
+        return farthest
     own_s = bound.upper / rate if bound.unit == "samples" else bound.upper / 1e9
-    return own_s + found[0], ((formula, bound), *found[1])
+    return own_s + farthest[0], ((formula, bound), *farthest[1])
 
 
 def _nested(windows: _Windows) -> str:
@@ -283,7 +288,7 @@ def plausibility_warnings(
         zero_ns: the time that texts count from.
     """
     source = SourceText.of(specification.source, specification.filename)
-    found: dict[str, Diagnostic] = {}
+    warnings: dict[str, Diagnostic] = {}
     for name, outline in specification.regions.items():
         apart = _distance(outline, log.box)
         if 0.0 < log.extent < apart:
@@ -291,10 +296,10 @@ def plausibility_warnings(
             message = f"the region {name!r} is {apart:.4g} away from all that the log ever has"
             hint = f"objects lie in x {log.box[0]:.4g} to {log.box[2]:.4g}, y {log.box[1]:.4g} to "
             span = Span(start, start + len(f"region {name}"))
-            found[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
+            warnings[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
     for part, (count, first_ns) in log.missing.items():
-        named = (each for spec in specification.results for each in iter_atoms(spec.formula))
-        span = next(each.span for each in named if part in named_parts(each))
+        named = (atom for spec in specification.results for atom in iter_atoms(spec.formula))
+        span = next(atom.span for atom in named if part in named_parts(atom))
         # one that the log never has is an error of names
         if count < log.samples:
             at = time_text(first_ns, zero_ns)
@@ -302,36 +307,36 @@ def plausibility_warnings(
                 f"{part.shown} is missing in {count:,} of {counted(log.samples, 'sample')}, first at {at}"
             )
             hint = "atoms about it are unknown there, and so may be a verdict"
-            found[part.shown] = source.diagnostic("warning", span, message, hint)
+            warnings[part.shown] = source.diagnostic("warning", span, message, hint)
     for node, bound in bound_nodes(specification):
         doubts: Iterator[tuple[str, str]] = iter(())
         key = ""
         if isinstance(node, Atom):
-            taken = log.range_of(node, bound)
-            key, doubts = taken.text if taken else node.text, _doubts(node, log, taken)
+            measured = log.range_of(node, bound)
+            key, doubts = measured.text if measured else node.text, _doubts(node, log, measured)
         elif isinstance(node, Temporal) and node.bound is not None:
             key = f"{node.operator}{format_bound(node.bound)}"
             doubts = _doubts_of_window(key, node.bound, log)
         for message, hint in doubts:
-            found.setdefault(key, source.diagnostic("warning", node.span, message, hint))
+            warnings.setdefault(key, source.diagnostic("warning", node.span, message, hint))
     for node, _ in bound_nodes(specification):
         empty_class = _empty_class(node.group, log) if isinstance(node, Quantified) else None
         if empty_class is not None:
-            listed = ", ".join(sorted(filter(None, log.classes))) or "none"
-            hint = f"its classes are {listed}; over no object, forall is +inf and exists -inf"
+            class_names = ", ".join(sorted(filter(None, log.classes))) or "none"
+            hint = f"its classes are {class_names}; over no object, forall is +inf and exists -inf"
             message = f"no object of class {empty_class!r} is ever in this log"
-            found.setdefault(empty_class, source.diagnostic("warning", node.span, message, hint))
+            warnings.setdefault(empty_class, source.diagnostic("warning", node.span, message, hint))
     for spec in specification.results:
         reach_s, windows = _reach(spec.formula, log.rate or inf)
         name = _nested(windows)
-        if len(windows) > 1 and reach_s > log.seconds and name not in found:
+        if len(windows) > 1 and reach_s > log.seconds and name not in warnings:
             message = f"the windows {name} together are longer than this log"
             hint = (
                 f"they reach {reach_s:.3g} s ahead, and the log has {log.seconds:.3f} s, so its end decides"
             )
-            if not any(f"{node.operator}{format_bound(bound)}" in found for node, bound in windows):
-                found[name] = source.diagnostic("warning", windows[0][0].span, message, hint)
-    return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
+            if not any(f"{node.operator}{format_bound(bound)}" in warnings for node, bound in windows):
+                warnings[name] = source.diagnostic("warning", windows[0][0].span, message, hint)
+    return tuple(sorted(warnings.values(), key=lambda each: (each.line, each.column)))
 
 
 def _empty_class(group: Group | Earlier, log: LogNumbers) -> str | None:
@@ -343,7 +348,7 @@ def _empty_class(group: Group | Earlier, log: LogNumbers) -> str | None:
 
 
 def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterator[tuple[str, str]]:
-    limits = [each for each in atom.parameters if isinstance(each, float)]
+    limits = [parameter for parameter in atom.parameters if isinstance(parameter, float)]
     lengths = limits if atom.relation in _LENGTH_RELATIONS else []
     for length in lengths:
         if length < 0.0 and atom.relation != "dist":
@@ -410,14 +415,16 @@ def _compared(atom: Atom) -> Expression | None:
     """Return the signal or distance that an atom compares with numbers; None if it is computed or not one."""
     if atom.relation == "sum":
         return None
-    parts = {each for each in iter_expressions(atom.expression) if isinstance(each, (Signal, Measurement))}
+    parts = {part for part in iter_expressions(atom.expression) if isinstance(part, (Signal, Measurement))}
     part = parts.pop() if len(parts) == 1 else None
-    has_limit = atom.relation == "signal" or any(isinstance(each, float) for each in atom.parameters)
+    has_limit = atom.relation == "signal" or any(
+        isinstance(parameter, float) for parameter in atom.parameters
+    )
     return part if isinstance(part, (Signal, SignedDistance)) and has_limit else None
 
 
 def _key(atom: Atom, bound: tuple[Quantified, ...]) -> tuple[str, ...]:
-    return (atom.text, *(f"{each.variables} {each.group}" for each in bound))
+    return (atom.text, *(f"{quantifier.variables} {quantifier.group}" for quantifier in bound))
 
 
 def over_bindings(
@@ -425,8 +432,8 @@ def over_bindings(
 ) -> Atom | Quantified:
     """Return an atom for all objects that its variables may stand for, or for some."""
     formula: Atom | Quantified = atom
-    for each in reversed(bound):
-        formula = Quantified(quantifier, each.variables, each.group, formula)
+    for binding in reversed(bound):
+        formula = Quantified(quantifier, binding.variables, binding.group, formula)
     return formula
 
 
@@ -442,13 +449,13 @@ def _binding(atom: Atom, around: tuple[Quantified, ...], parameter: str | None) 
 
     The objects of a template are all but those that the atom names: no distance to itself is meant.
     """
-    wanted = _variables([*terms_of(atom.expression), *atom.terms])
+    variables = _variables([*terms_of(atom.expression), *atom.terms])
     bound: list[Quantified] = []
-    for each in reversed(around):
-        if wanted.intersection(each.variables):
-            bound.insert(0, each)
-            wanted = wanted.difference(each.variables) | _variables([each.group])
-    if parameter is not None and parameter in wanted:
+    for quantifier in reversed(around):
+        if variables.intersection(quantifier.variables):
+            bound.insert(0, quantifier)
+            variables = variables.difference(quantifier.variables) | _variables([quantifier.group])
+    if parameter is not None and parameter in variables:
         named = tuple(t for t in map(base_of, terms_of(atom.expression)) if isinstance(t, TrackedName))
         everything = Group("", class_name=ANY_CLASS, excluded=named)
         bound.insert(0, Quantified("forall", (parameter,), everything, atom))
@@ -457,5 +464,5 @@ def _binding(atom: Atom, around: tuple[Quantified, ...], parameter: str | None) 
 
 def _variables(terms: Iterable[Term]) -> frozenset[str]:
     bases = [base_of(term) for term in terms]
-    left_out = [each for base in bases if isinstance(base, Group) for each in base.excluded]
-    return frozenset(each.name for each in [*bases, *left_out] if isinstance(each, Variable))
+    left_out = [term for base in bases if isinstance(base, Group) for term in base.excluded]
+    return frozenset(term.name for term in [*bases, *left_out] if isinstance(term, Variable))

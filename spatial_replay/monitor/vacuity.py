@@ -117,18 +117,18 @@ def idle_templates(
         each: the objects that parameters stand for, such as "class:person".
         classes: of the log.
     """
-    found, done = [], {id(formula) for formula in evaluated}
+    untested, evaluated_ids = [], {id(formula) for formula in evaluated}
     for spec in specs:
-        if spec.parameter is None or id(spec.formula) in done:
+        if spec.parameter is None or id(spec.formula) in evaluated_ids:
             continue
         text = f"{spec.name}({spec.parameter})"
         message = f"`{text}` was never evaluated: no object stands for {spec.parameter}."
-        kind, _, wanted = each.get(spec.parameter, "").partition(":")
+        kind, _, class_name = each.get(spec.parameter, "").partition(":")
         if kind == "class":
-            hint = nearest_hint(wanted, sorted(classes))
-            message += f" The log never has the class {printable(wanted)!r}{f'; {hint}' if hint else '.'}"
-        found.append(UntestedPart(None, text, "no instances", Sentence(message)))
-    return tuple(found)
+            hint = nearest_hint(class_name, sorted(classes))
+            message += f" The log never has the class {printable(class_name)!r}{f'; {hint}' if hint else '.'}"
+        untested.append(UntestedPart(None, text, "no instances", Sentence(message)))
+    return tuple(untested)
 
 
 def find_vacuous(
@@ -151,25 +151,25 @@ def find_vacuous(
     windows, held = _Windows(times_ns), _Holding(instance, leaves, times_ns)
     scopes = _scopes(instance.formula, windows, held)
     active = _scopes(implications.formula, windows, held, is_conditional=True)
-    found = [
+    idle_parts = [
         *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), windows, evidence),
         *_idle_implications(implications, active, held, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
     if infinite is not None:
-        done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
-        path = deciding_path(done, 0, infinite)
+        offline = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
+        path = deciding_path(offline, 0, infinite)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         # -inf is the number of a missed goal, too
         is_idle = infinite is End.LOW or (
-            _leaves_all_out(done, path, evidence)
+            _leaves_all_out(offline, path, evidence)
             and is_tested_by_nothing(evidence, leaves, times_ns, Verdict.VIOLATED)
         )
-        if is_idle and node not in {part.node for part in found}:
-            found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
+        if is_idle and node not in {part.node for part in idle_parts}:
+            idle_parts += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
     return tuple(
-        _part(each, nodes[each.node], evidence) for each in sorted(found, key=lambda each: each.node)
+        _part(each, nodes[each.node], evidence) for each in sorted(idle_parts, key=lambda each: each.node)
     )
 
 
@@ -254,9 +254,9 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
             [
                 _implications_of(*_without_negation(*part), 0 if is_condition else 1)
                 for part, is_condition in zip(parts, are_conditions, strict=True)
-                if is_condition is wanted
+                if is_condition is is_chosen_side
             ]
-            for wanted in (True, False)
+            for is_chosen_side in (True, False)
         ]
         if all(sides):
             return _joined("->", (_joined("and", sides[0], node), _joined("or", sides[1], node)), node)
@@ -267,7 +267,7 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
     if not isinstance(formula, Boolean | Temporal):
         return _Implications(formula, (node,))
     signs = [_sign_below(operator, place, sign) for place in range(len(operands))]
-    below = [_implications_of(*part, own) for part, own in zip(operands, signs, strict=True)]
+    below = [_implications_of(*part, sign_below) for part, sign_below in zip(operands, signs, strict=True)]
     whole = replace(formula, operands=tuple(part.formula for part in below))
     return _Implications(whole, (node, *(identifier for part in below for identifier in part.nodes)))
 
@@ -372,19 +372,19 @@ def _scopes(
 def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) -> _Samples:
     """Return the samples at which an operand counts, if its operator does so in the samples of `scope`."""
     begin, end = windows(formula)
-    here = np.flatnonzero(scope & (begin < end))
-    begin, end = begin[here], end[here]
+    counting = np.flatnonzero(scope & (begin < end))
+    begin, end = begin[counting], end[counting]
     if place < len(formula.operands) - 1:
         # the left operand holds from each sample to the one before the right one's
         if formula.operator == "S":
-            begin, end = begin + 1, here + 1
+            begin, end = begin + 1, counting + 1
         else:
-            begin = here
+            begin = counting
             end = end - (formula.operator != "W")
     edges = np.zeros(len(scope) + 1, np.int64)
-    there = begin < end
-    np.add.at(edges, begin[there], 1)
-    np.add.at(edges, end[there], -1)
+    is_open = begin < end
+    np.add.at(edges, begin[is_open], 1)
+    np.add.at(edges, end[is_open], -1)
     covered: _Samples = np.cumsum(edges[:-1]) > 0
     return covered
 
@@ -405,11 +405,11 @@ def _empty_windows(
         scopes: the samples at which the number depends on a node.
         active: the samples at which the verdict does, where conditions hold.
     """
-    for identifier, (node, scope, own) in enumerate(zip(nodes, scopes, active, strict=True)):
+    for identifier, (node, scope, active_scope) in enumerate(zip(nodes, scopes, active, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
             continue
         (begin, end), times_ns = windows(node), windows.times_ns
-        counts = own if own.any() else scope
+        counts = active_scope if active_scope.any() else scope
         if not (begin < end)[counts].any():
             where = " where it counts" if (begin < end)[scope].any() else ""
             what: tuple[str | Instant, ...] = (f"no sample of the log lies in its window{where}",)
@@ -464,16 +464,20 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
     """
     stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
     while stack:
-        current, given = stack.pop()
+        current, conditions = stack.pop()
         if isinstance(current, Quantified):
             for implication, held, is_nested in _implications(current):
-                body = _all((*given, held))
-                yield implication, replace(node, quantifier="exists", body=body), is_nested or bool(given)
+                body = _all((*conditions, held))
+                yield (
+                    implication,
+                    replace(node, quantifier="exists", body=body),
+                    is_nested or bool(conditions),
+                )
             continue
-        operands = [(each, given) for each in operands_of(current)]
+        operands = [(operand, conditions) for operand in operands_of(current)]
         if isinstance(current, Boolean) and current.operator == "->":
-            holding = (*given, current.operands[0])
-            yield current, replace(node, quantifier="exists", body=_all(holding)), bool(given)
+            holding = (*conditions, current.operands[0])
+            yield current, replace(node, quantifier="exists", body=_all(holding)), bool(conditions)
             operands[1] = (current.operands[1], holding)
         stack.extend(reversed(operands))
 
@@ -490,10 +494,13 @@ def _empty_groups(
         for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True))
         if isinstance(node, Atom | Quantified) and scope.any()
     }
-    wanted = list(dict.fromkeys(group for each in open_groups.values() for group in each))
-    groups = {group: bool(own.any()) for group, own in zip(wanted, evidence.members(wanted), strict=True)}
-    for identifier, own in open_groups.items():
-        empty = [group for group in own if not groups[group]]
+    all_groups = list(dict.fromkeys(group for of_node in open_groups.values() for group in of_node))
+    groups = {
+        group: bool(members.any())
+        for group, members in zip(all_groups, evidence.members(all_groups), strict=True)
+    }
+    for identifier, node_groups in open_groups.items():
+        empty = [group for group in node_groups if not groups[group]]
         if empty:
             names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty))
             what = f"decided nothing: no object was ever in {names}."
@@ -505,7 +512,9 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
     for term in map(standing, iter_terms([formula])):
         group = term.term if isinstance(term, Earlier) else term
         if isinstance(group, Group) and group.members is None:
-            excluded = tuple(each for each in group.excluded if isinstance(each, TrackedName))
+            excluded = tuple(
+                excluded_term for excluded_term in group.excluded if isinstance(excluded_term, TrackedName)
+            )
             whole = replace(group, excluded=excluded)
             yield replace(term, term=whole) if isinstance(term, Earlier) else whole
 
@@ -547,7 +556,7 @@ def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
 def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Sentence, ...]:
     """Return remarks on the goals of a formula (`F`) that hold in its first sample already."""
     order = evidence.instance.program.leaves
-    found: list[Sentence] = []
+    sentences: list[Sentence] = []
     waiting = [evidence.instance.formula]
     while waiting:
         node = waiting.pop()
@@ -562,8 +571,10 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
             if is_spatial(goal):
                 low, _ = evaluate_offline(goal, order, leaves[..., :1], times_ns[:1]).interval(0)
                 name = node.name or shortened_formula(format_formula(node))
-                found += [Sentence(f"`{name}` is already true at the first sample.")] if low >= 0.0 else []
-    return tuple(found)
+                sentences += (
+                    [Sentence(f"`{name}` is already true at the first sample.")] if low >= 0.0 else []
+                )
+    return tuple(sentences)
 
 
 # ------------------------------------------------------------------------------------- tested by nothing
@@ -585,7 +596,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     instance = evidence.instance
     order = instance.program.leaves
     unknown = _with_unknown_leaves(order, leaves, evidence)
-    known = leaves if verdict is Verdict.SATISFIED else unknown
+    known_leaves = leaves if verdict is Verdict.SATISFIED else unknown
     stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
 
     def tested(formula: Formula, *, in_antecedent: bool = False) -> Formula:
@@ -597,13 +608,13 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
                 return replace(formula, operands=(condition, tested(body, in_antecedent=in_antecedent)))
             case Boolean() | Temporal():
                 read = judged(formula).operands if isinstance(formula, Temporal) else formula.operands
-                operands = [tested(each, in_antecedent=in_antecedent) for each in read]
+                operands = [tested(operand, in_antecedent=in_antecedent) for operand in read]
                 return replace(formula, operands=tuple(operands))
             case Atom() | Quantified() if in_antecedent:
                 return stand_ins[leaf_key(formula)]
         return formula
 
-    both = joined_channels([unknown, known], axis=1)
+    both = joined_channels([unknown, known_leaves], axis=1)
     formula = tested(_implications_of(instance.formula).formula)
     done = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
     return final_verdict(*done.interval(0)) is verdict
@@ -663,12 +674,12 @@ def find_cut_window(
     if not any(isinstance(node, Temporal) and is_cut(node, times_ns)[-1] for node in nodes):
         return None
     order = instance.program.leaves
-    done = evaluate_offline(instance.formula, order, leaves, times_ns)
+    cut_nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
     whole = evaluate_with_whole_windows(instance.formula, order, leaves, times_ns)
-    own, other = (final_verdict(*each.interval(0)) for each in (done, whole))
-    if own is not verdict or other is verdict:
+    cut_verdict, whole_verdict = (final_verdict(*nodes.interval(0)) for nodes in (cut_nodes, whole))
+    if cut_verdict is not verdict or whole_verdict is verdict:
         return None
-    ranks = _ranked(done, whole, is_violated=verdict is Verdict.VIOLATED)
+    ranks = _ranked(cut_nodes, whole, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
     # 1 and -1 are where a cut window decides
@@ -713,6 +724,6 @@ def _ranked(done: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> Of
     Ranks go through minima, maxima and negations as numbers do, so that a path by them leads to a cut window.
     """
     holds = np.greater if is_violated else np.greater_equal
-    both = [each.columns[[*low_and_high(len(each.columns), wide=True)]] for each in (done, whole)]
+    both = [nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (done, whole)]
     low = sum(holds(low, 0.0) * 1.0 for low, _ in both)
     return replace(done, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in both)]))

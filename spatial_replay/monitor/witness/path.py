@@ -128,7 +128,7 @@ def extremum_of(operator: BooleanOperator, operands: Sequence[int]) -> SignedOpe
     """Return a Boolean operator over operands of the given numbers, as minima and maxima."""
     # stand-ins, because equal operands may be one object and still are two places in the text
     stand_ins = tuple(Truth(True) for _ in operands)
-    numbers = {id(each): number for each, number in zip(stand_ins, operands, strict=True)}
+    numbers = {id(stand_in): number for stand_in, number in zip(stand_ins, operands, strict=True)}
     formula = Boolean(operator, stand_ins)
     return _normal_form(formula.expansion or formula, numbers, negated=False)
 
@@ -139,7 +139,7 @@ def _normal_form(formula: Formula, numbers: Mapping[int, int], *, negated: bool)
     operator = operator_of(formula)
     if operator == "not":
         return _normal_form(operands_of(formula)[0], numbers, negated=not negated)
-    operands = tuple(_normal_form(each, numbers, negated=negated) for each in operands_of(formula))
+    operands = tuple(_normal_form(operand, numbers, negated=negated) for operand in operands_of(formula))
     return Extremum((operator == "and") != negated, operands)
 
 
@@ -154,17 +154,17 @@ def chosen(
     if isinstance(part, SignedOperand):
         return [part]
     choose = end.of_minimum if part.is_minimum else end.of_maximum
-    keys = [choose(*_interval(each, interval)) for each in part.operands]
+    keys = [choose(*_interval(operand, interval)) for operand in part.operands]
     best = min(keys) if part.is_minimum else max(keys)
-    taken = [each for each, key in zip(part.operands, keys, strict=True) if key == best]
-    return [operand for each in taken for operand in chosen(each, end, interval)]
+    best_parts = [operand for operand, key in zip(part.operands, keys, strict=True) if key == best]
+    return [operand for best_part in best_parts for operand in chosen(best_part, end, interval)]
 
 
 def _interval(part: SignedOperand | Extremum, interval: Callable[[int], Interval]) -> Interval:
     if isinstance(part, SignedOperand):
         low, high = interval(part.index)
         return (-high, -low) if part.negated else (low, high)
-    lows, highs = zip(*(_interval(each, interval) for each in part.operands), strict=True)
+    lows, highs = zip(*(_interval(operand, interval) for operand in part.operands), strict=True)
     return (min(lows), min(highs)) if part.is_minimum else (max(lows), max(highs))
 
 
@@ -210,7 +210,7 @@ class _Walk:
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
         """Return the path from a node at a sample."""
-        here, (formula, operands) = PathNode(node, sample), self._done.tree[node]
+        step, (formula, operands) = PathNode(node, sample), self._done.tree[node]
         match formula:
             case Boolean():
                 extremum = extremum_of(formula.operator, operands)
@@ -221,16 +221,16 @@ class _Walk:
                 below = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal():
                 lasting = self._lasting(node, sample, end) if self._done.goes_on else None
-                taken = lasting or self._taken(formula, operands, sample, end)
-                if taken is None or self._done.is_left_out(taken.node, taken.sample):
-                    return DecidingPath((here,), end)
-                below = self.follow(taken.node, taken.sample, end)
+                next_step = lasting or self._taken(formula, operands, sample, end)
+                if next_step is None or self._done.is_left_out(next_step.node, next_step.sample):
+                    return DecidingPath((step,), end)
+                below = self.follow(next_step.node, next_step.sample, end)
                 if end is End.OPEN and not self._is_open(below.steps[-1]):
                     # the operand is certain there, but not whether its rates have values
-                    below = next(self._unknown_rates(taken.node, taken.sample), below)
+                    below = next(self._unknown_rates(next_step.node, next_step.sample), below)
             case _:
-                return DecidingPath((here,), end)
-        return DecidingPath((here, *below.steps), below.end)
+                return DecidingPath((step,), end)
+        return DecidingPath((step, *below.steps), below.end)
 
     def _is_open(self, step: PathNode) -> bool:
         low, high = self._done.interval(step.node, step.sample)
@@ -238,10 +238,10 @@ class _Walk:
 
     def _unknown_rates(self, node: int, sample: int) -> Iterator[DecidingPath]:
         """Iterate over the paths to rates that an operator asks of its operand and that are unknown."""
-        here, (formula, operands) = PathNode(node, sample), self._done.tree[node]
+        step, (formula, operands) = PathNode(node, sample), self._done.tree[node]
         match formula:
-            case Atom() if rate_conditions(formula) and self._is_open(here):
-                yield DecidingPath((here,), End.OPEN)
+            case Atom() if rate_conditions(formula) and self._is_open(step):
+                yield DecidingPath((step,), End.OPEN)
                 return
             case Temporal(operator="X" | "WX"):
                 sample += 1
@@ -252,7 +252,7 @@ class _Walk:
         if 0 <= sample < len(self._done.times_ns):
             for operand in operands:
                 for below in self._unknown_rates(operand, sample):
-                    yield DecidingPath((here, *below.steps), End.OPEN)
+                    yield DecidingPath((step, *below.steps), End.OPEN)
 
     def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
         low, high = (column[samples] for column in self._done.judged_ends(operand.index))
@@ -320,9 +320,12 @@ class _Walk:
         """Return what decides an until or, looking back, a since."""
         span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
         lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
-        kept = [_least_between(each, is_ahead=is_ahead) for each in lefts]
+        left_so_far = [_least_between(numbers, is_ahead=is_ahead) for numbers in lefts]
         inside = slice(window.start - span.start, window.stop - span.start)
-        low, high = (np.minimum(each, then[inside]) for each, then in zip(rights, kept, strict=True))
+        low, high = (
+            np.minimum(right_numbers, then[inside])
+            for right_numbers, then in zip(rights, left_so_far, strict=True)
+        )
         at = window[int(np.argmax(end.of_maximum(low, high)))]
         right_key = float(end.of_minimum(*rights)[at - window.start])
         between = range(sample, at) if is_ahead else range(at + 1, sample + 1)
@@ -338,9 +341,9 @@ class _Walk:
         left, right = map(SignedOperand, operands)
         inside = slice(window.start, window.stop)
         lefts, rights = self._ends(left, slice(sample, window.stop)), self._ends(right, inside)
-        kept = [_least_between(each, is_ahead=True)[window.start - sample :] for each in lefts]
-        until = [float(np.max(np.minimum(*pair))) for pair in zip(rights, kept, strict=True)]
-        always = [float(np.min(each)) for each in self._ends(left, inside)]
+        left_so_far = [_least_between(numbers, is_ahead=True)[window.start - sample :] for numbers in lefts]
+        until = [float(np.max(np.minimum(*pair))) for pair in zip(rights, left_so_far, strict=True)]
+        always = [float(np.min(numbers)) for numbers in self._ends(left, inside)]
         keys = [float(end.of_maximum(np.array(low), np.array(high))) for low, high in (until, always)]
         if keys[0] >= keys[1]:
             return self._until(left, right, sample, window, end)
@@ -388,7 +391,9 @@ def missed_response(
     for step, below in pairwise(path.steps):
         node, operands = done.tree[step.node]
         if operator_of(node) == "->" and done.ends(step.node)[1][step.sample] < 0.0:
-            condition, response = (short_title(substitute(each, bindings)) for each in operands_of(node))
+            condition, response = (
+                short_title(substitute(operand, bindings)) for operand in operands_of(node)
+            )
             time_ns, is_condition = int(done.times_ns[step.sample]), below.node == operands[0]
             closest = deciding_path(done, operands[1], End.HIGH, sample=step.sample) if is_condition else None
             return MissedResponse(condition, response, time_ns, is_condition), closest
@@ -406,18 +411,18 @@ def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
 def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
         case Rate():
-            known = scene.compared_ns(part) is not None
+            is_explained = scene.compared_ns(part) is not None
             for inner in (part.signal,) if part.signal else map(_position, part.terms):
                 reasons = tuple(_reasons(scene, inner))
-                known = known or bool(reasons)
+                is_explained = is_explained or bool(reasons)
                 yield from reasons
-            if not known:
+            if not is_explained:
                 of = part.signal.name if part.signal else " and ".join(map(format_term, part.terms))
                 yield f"{of} has no report to compare with, or none of an earlier time"
         case Signal() | Equality():
             signal, compared = (part, 0.0) if isinstance(part, Signal) else (part.signal, part.value)
             name, value = signal.name, scene.signal(signal)[0]
-            if any(each not in scene.trace.signals for each in logged_signals(signal)):
+            if any(name_of_part not in scene.trace.signals for name_of_part in logged_signals(signal)):
                 yield f"there is no signal {name!r}"
             elif not np.isfinite(value):
                 yield f"signal {name!r} has no finite value in the sample"
@@ -439,13 +444,13 @@ def _position(term: Term) -> Projection:
 
 
 def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterator[str]:
-    found = scene.resolve(term)
-    if found.unknown[0]:
+    resolved = scene.resolve(term)
+    if resolved.unknown[0]:
         yield from _missing(scene, term)
-    elif isinstance(part, Misalignment) and np.isnan(found.yaw[0]):
+    elif isinstance(part, Misalignment) and np.isnan(resolved.yaw[0]):
         yield f"{format_term(term)} has no orientation"
     elif isinstance(part, Projection) and part.axis == "z":
-        rows = found.operand.rows[0]
+        rows = resolved.operand.rows[0]
         bottoms = scene.batch.bottom[rows[rows >= 0]]
         if np.isnan(bottoms).any():
             yield f"{format_term(term)} has no height"
@@ -553,8 +558,8 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
     value = nominal[0] if nominal[0] == nominal[1] else float("nan")
     unknown = unknowns_of(scene, leaf)
     branch = () if unknown else tuple(_branch(scene, leaf.expression, end, 1))
-    found = tuple(_measured(scene, part) for _, part in branch if not isinstance(part, Number))
-    return DecidingAtom(leaf, end, value, lower, upper, branch, found, unknown)
+    measurements = tuple(_measured(scene, part) for _, part in branch if not isinstance(part, Number))
+    return DecidingAtom(leaf, end, value, lower, upper, branch, measurements, unknown)
 
 
 def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, Formula, bool] | None:
@@ -603,7 +608,7 @@ def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
     bodies = list(_bodies(scene, formula))
     if not rate_conditions(formula.body):
         return bodies
-    ends = _intervals(scene, [Boolean("and", tuple(rate_conditions(each))) for each in bodies])
+    ends = _intervals(scene, [Boolean("and", tuple(rate_conditions(body))) for body in bodies])
     return [body for body, (_, high) in zip(bodies, ends, strict=True) if high > -np.inf]
 
 
@@ -624,8 +629,8 @@ def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) 
     rows = np.array([scene.resolve(TrackedName(name)).operand.rows[0, 0] for name in present])
     if (rows < 0).any():
         return everyone
-    found = candidate_pairs(scene.batch, rows, scene.trace.uncertainty, pair.enlargement)
-    return [(present[a], present[b]) for a, b in found.tolist()]
+    pairs = candidate_pairs(scene.batch, rows, scene.trace.uncertainty, pair.enlargement)
+    return [(present[a], present[b]) for a, b in pairs.tolist()]
 
 
 # ------------------------------------------------------------------------------------------ expressions
@@ -649,7 +654,7 @@ def _branch(
             yield weight, expression.signal
         case Minimum() | Maximum():
             operands = expression.operands
-            intervals = _intervals(scene, [_as_atom(each) for each in operands])
+            intervals = _intervals(scene, [_as_atom(operand) for operand in operands])
             extremum = Extremum(
                 isinstance(expression, Minimum), tuple(map(SignedOperand, range(len(operands))))
             )
@@ -704,8 +709,8 @@ def _measured(scene: TraceScene, part: Expression) -> Measured:
 
 def _attaining(pick: Callable[[Floats], Any], scene: TraceScene, candidates: Iterable[Any]) -> Any:
     """Return the measurement of some that has the least or greatest number (`np.argmin`, `np.argmax`)."""
-    listed = list(candidates)
-    return listed[int(pick(measured(scene, listed)[0][:, 0]))]
+    measurements = list(candidates)
+    return measurements[int(pick(measured(scene, measurements)[0][:, 0]))]
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:

@@ -146,7 +146,7 @@ class Dial:
             case Scaled(operand, divisor):
                 return {slope / divisor for slope in self.slopes(operand)}
             case Minimum() | Maximum():
-                return {slope for each in expression.operands for slope in self.slopes(each)}
+                return {slope for operand in expression.operands for slope in self.slopes(operand)}
             case SignedDistance():
                 return {-self._radii_in(expression.first) - self._radii_in(expression.second)}
             case Protrusion():
@@ -156,7 +156,7 @@ class Dial:
         return {0}
 
     def _radii_in(self, term: Term) -> int:
-        return sum(self.is_at("radius", each) for each in _radii_of(term))
+        return sum(self.is_at("radius", radius) for radius in _radii_of(term))
 
 
 def _radii(expression: Expression) -> list[float]:
@@ -197,7 +197,7 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
             yield from _signed_atoms(formula.body, signs)
         case Boolean() | Temporal():
             for place, operand in enumerate(formula.operands):
-                below = {sign * own for sign in signs for own in operand_signs(formula, place)}
+                below = {sign * sign_below for sign in signs for sign_below in operand_signs(formula, place)}
                 yield from _signed_atoms(operand, frozenset(below))
 
 
@@ -277,12 +277,12 @@ def threshold_of(
     def search_of(dial: Dial) -> _Search:
         return _Search(evidence, leaves, times_ns, node, verdict, deciding, dial, goes_on=goes_on)
 
-    own = Dial.of(deciding)
-    constant = own.with_constant(evidence.instance.formula)
-    found = None if constant is None else search_of(constant).threshold()
-    if found is not None:
-        return found
-    search = search_of(own)
+    dial = Dial.of(deciding)
+    constant = dial.with_constant(evidence.instance.formula)
+    threshold = None if constant is None else search_of(constant).threshold()
+    if threshold is not None:
+        return threshold
+    search = search_of(dial)
     return search.threshold() or search.obstacle()
 
 
@@ -306,22 +306,24 @@ class _Search:
         self._leaves, self._times, self._node = leaves, times_ns, node
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
-        slopes = {each.expression: dial.slopes(each.expression) for each in atoms}
+        slopes = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
         # from the formula: equal leaves share the place of the first, wherever it was written
         self._moving: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
         for index, leaf in enumerate(self._order):
             bare = _bare(leaf)
-            if bare is not None and (own := slopes.get(bare[0].expression)):
-                self._moving[index], self._slopes[index] = leaf, bare[1] * max(own)
-        bodies = [each for each in iter_formulas(self._formula) if isinstance(each, Quantified)]
+            if bare is not None and (atom_slopes := slopes.get(bare[0].expression)):
+                self._moving[index], self._slopes[index] = leaf, bare[1] * max(atom_slopes)
+        bodies = [part for part in iter_formulas(self._formula) if isinstance(part, Quantified)]
         # a quantifier moves with the one atom of its body; a prism's height may decide, not a radius
         self._is_uniform = (
-            all(len(each) == 1 for each in slopes.values())
+            all(len(atom_slopes) == 1 for atom_slopes in slopes.values())
             and not any(
                 self._is_meant(atom) for body in bodies if not _bare(body) for atom in iter_atoms(body)
             )
-            and not any(dial.is_at("radius", radius) for each in slopes for radius in _radii_in(each))
+            and not any(
+                dial.is_at("radius", radius) for expression in slopes for radius in _radii_in(expression)
+            )
         )
         signs = {
             math.copysign(1.0, sign * slope)
@@ -333,7 +335,7 @@ class _Search:
         self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
         low, high = self._evaluate(self._formula, self._order, leaves, times_ns).interval(node)
         end = abs(high if verdict is Verdict.VIOLATED else low)
-        steepest = max((abs(slope) for each in slopes.values() for slope in each), default=0.0)
+        steepest = max((abs(slope) for atom_slopes in slopes.values() for slope in atom_slopes), default=0.0)
         # robustness changes by at most the slope
         self._least = end / steepest if steepest and math.isfinite(end) else 0.0
 
@@ -404,16 +406,16 @@ class _Search:
         ]
         sizes = np.sort(np.concatenate(moves))
         sizes = sizes[np.isfinite(sizes) & (sizes >= self._least * (1.0 - 1e-9))]
-        listed = np.concatenate([[self._least], sizes])
+        candidates = np.concatenate([[self._least], sizes])
 
         def flips(size: float) -> bool:
             return self._flips([size], direction)[0]
 
-        begin, stop = 0, len(listed)
+        begin, stop = 0, len(candidates)
         step = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
         for end in (0, *range(step, stop, step), stop - 1):
-            if flips(listed[end]):
-                return float(listed[bisect_left(listed, True, begin, end, key=flips)])
+            if flips(candidates[end]):
+                return float(candidates[bisect_left(candidates, True, begin, end, key=flips)])
             begin = end + 1
         return None
 
@@ -462,12 +464,12 @@ class _Search:
             columns = [every[:, begin:end] for begin, end in pairwise(ends)]
         else:
             columns = []
-        return [self._evaluated(*each) for each in zip(formulas, added, columns, strict=True)]
+        return [self._evaluated(*arguments) for arguments in zip(formulas, added, columns, strict=True)]
 
     def _is_meant(self, atom: Atom) -> bool:
         """Return whether the constant is in an atom or, of another number, it was written where that was."""
         if self._dial.constant:
-            return any(self._dial.is_at("number", each) for each in _numbers(atom.expression))
+            return any(self._dial.is_at("number", number) for number in _numbers(atom.expression))
         meant = self._deciding.atom
         if meant.span.start == meant.span.end:
             return atom.expression == meant.expression
@@ -488,9 +490,9 @@ class _Search:
             leaf_key(rewritten(leaf, lambda atom: self._turned_atom(atom, number))): index
             for index, leaf in self._moving.items()
         }
-        found = [indices[leaf_key(leaf)] for leaf in added]
-        shifts = [self._slopes[index] * (number - self._dial.value) for index in found]
-        shifted: Floats = self._leaves[:, found] + np.array(shifts).reshape(1, -1, 1)
+        places = [indices[leaf_key(leaf)] for leaf in added]
+        shifts = [self._slopes[index] * (number - self._dial.value) for index in places]
+        shifted: Floats = self._leaves[:, places] + np.array(shifts).reshape(1, -1, 1)
         return shifted
 
     def _columns(self, formulas: Sequence[Formula]) -> Floats:
@@ -498,8 +500,8 @@ class _Search:
 
     def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
         leaves = joined_channels([self._leaves, columns], axis=1)
-        done = self._evaluate(formula, (*self._order, *added), leaves, self._times)
-        return self._verdict_of(*done.interval(self._node))
+        nodes = self._evaluate(formula, (*self._order, *added), leaves, self._times)
+        return self._verdict_of(*nodes.interval(self._node))
 
 
 def _bare(formula: Formula) -> tuple[Atom, int] | None:
