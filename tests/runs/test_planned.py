@@ -76,14 +76,6 @@ def test_names_that_the_world_does_not_have_are_refused(tmp_path: Path) -> None:
         record_plan("push", tmp_path / "run.mcap", too_large)
 
 
-def test_a_bun_is_placed_on_a_plate(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
-    bun = sr.parse_specification("F (kanelbulle enclosedin plate)")
-    planned = record_plan("pick-place", tmp_path / "run.mcap", bun)
-    assert (planned.ended, planned.verdict) == ("hold", "satisfied")
-    assert planned.steps == 1
-
-
 def test_a_push_stops_before_the_sample_that_would_violate() -> None:
     pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
     text = "spec apart = G (red dist green >= 0.03)\nspec s = (F (red dist blue <= 0.08)) and apart"
