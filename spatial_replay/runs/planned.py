@@ -57,8 +57,8 @@ _PRESETS: Final[Mapping[Skill, Mapping[str, float]]] = MappingProxyType(
 
 
 def _yaws_text(yaws: Sequence[float]) -> str:
-    listed = ", ".join(f"{math.degrees(yaw):.0f}" for yaw in yaws)
-    return f"objects may be turned to {listed} degrees, since orientations are compared" if yaws else ""
+    degrees = ", ".join(f"{math.degrees(yaw):.0f}" for yaw in yaws)
+    return f"objects may be turned to {degrees} degrees, since orientations are compared" if yaws else ""
 
 
 _SAME_YAW: Final = math.radians(1.0)
@@ -71,8 +71,8 @@ def settings_for(world: Tabletop) -> Settings:
         "supports": [body.name for body in world.bodies if body.support],
         "movable": [body.name for body in world.bodies if body.movable],
     }
-    given = {"skill": world.skill, **world.workspace, **bodies, **_PRESETS[world.skill]}
-    return changed_settings(None, given)
+    values = {"skill": world.skill, **world.workspace, **bodies, **_PRESETS[world.skill]}
+    return changed_settings(None, values)
 
 
 def _settings(world: Tabletop, formula: Formula, changes: Mapping[str, Any]) -> Settings:
@@ -92,16 +92,16 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
     These are the ones that the compared objects have, for `a oriented[k] b`, and quarter turns from
     the first of them.
     """
-    atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
+    atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
     parts = [part for atom in atoms for part in iter_expressions(atom.expression)]
     compared = [
         term for part in parts if isinstance(part, Misalignment) for term in (part.first, part.second)
     ]
     tracked = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared]
-    known = [each.yaw for each in tracked if each is not None and each.yaw is not None]
+    present_yaws = [thing.yaw for thing in tracked if thing is not None and thing.yaw is not None]
     yaws: list[float] = []
-    for yaw in (*known, *(turn * math.pi / 2 + yaw for yaw in known[:1] for turn in (1, 2, 3))):
-        if all(abs(math.remainder(yaw - each, math.tau)) > _SAME_YAW for each in yaws):
+    for yaw in (*present_yaws, *(turn * math.pi / 2 + yaw for yaw in present_yaws[:1] for turn in (1, 2, 3))):
+        if all(abs(math.remainder(yaw - before, math.tau)) > _SAME_YAW for before in yaws):
             yaws.append(math.remainder(yaw, math.tau))
     return tuple(sorted(yaws))
 
@@ -197,26 +197,30 @@ def record_plan(
         OutputError: the output cannot be written.
     """
     files = [default_specification(scenario) if file is None else file, *also]
-    kept, *others = logged_specifications(files, {})
-    results = [spec.name for spec in kept.results]
+    main_file, *further_files = logged_specifications(files, {})
+    results = [spec.name for spec in main_file.results]
     if name is not None and name not in results:
-        raise UsageError(f"{kept.filename} has no result {name!r}; its results are: {', '.join(results)}")
-    spec = chosen_spec(kept, name)
-    refuse_unsatisfiable(kept, spec.name)
+        raise UsageError(
+            f"{main_file.filename} has no result {name!r}; its results are: {', '.join(results)}"
+        )
+    spec = chosen_spec(main_file, name)
+    refuse_unsatisfiable(main_file, spec.name)
     about = {**about_run(scenario, **conditions), "planned": "true"}
     # an error in the world or the planner leaves the output untouched
     with closing(make_world(scenario, **conditions)) as world:
-        refuse_unknown_names([kept, *others], world.sample())
+        refuse_unknown_names([main_file, *further_files], world.sample())
         settings = _settings(world, spec.formula, changes)
-        planner = Planner(kept, settings, name=name, rate_hz=SAMPLES_PER_S)
+        planner = Planner(main_file, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
         # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
-        known = [SpecAutomaton(spec.name, kept, spec, planner.automaton)] if planner.rate_hz is None else []
+        automata = (
+            [SpecAutomaton(spec.name, main_file, spec, planner.automaton)] if planner.rate_hz is None else []
+        )
         with (
             open_film(world, cameras, seed=conditions.get("seed", 0)) as film,
-            run_log(output, [kept, *others], about, inputs, known, durability) as log,
+            run_log(output, [main_file, *further_files], about, inputs, automata, durability) as log,
         ):
-            log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
+            log.add_metadata(PLAN_METADATA, plan_metadata(planner, main_file.filename))
             box = BlackBox(planner, log.write_messages, timings=timings)
 
             def observe(sample: Sample) -> str:
@@ -241,7 +245,7 @@ def record_plan(
             planning_s=box.planning_s,
             bounds=planner.bounds,
             yaws="" if "yaws" in {*world.workspace, *changes} else _yaws_text(settings.workspace.yaws),
-            others={name: each for name, each in log.verdicts.items() if name not in results},
+            others={name: verdict for name, verdict in log.verdicts.items() if name not in results},
         )
 
 

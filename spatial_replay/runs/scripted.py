@@ -263,10 +263,10 @@ def simulate_script(scenario: str, **conditions: Unpack[Conditions]) -> list[Sam
 def about_run(scenario: str, **conditions: Unpack[Conditions]) -> dict[str, str]:
     """Return the metadata about how a run was made."""
     seed, starts = conditions.get("seed", 0), conditions.get("starts", ())
-    injected = [str(each) for each in conditions.get("injections", ())]
-    options = {"seed": seed, "noise_m": conditions.get("noise_m", 0.0), "inject": injected}
+    injections = [str(injection) for injection in conditions.get("injections", ())]
+    options = {"seed": seed, "noise_m": conditions.get("noise_m", 0.0), "inject": injections}
     if starts:
-        options["start"] = [str(each) for each in starts]
+        options["start"] = [str(start) for start in starts]
     # worlds are simulated in metres
     axes = Axes(unit="m").metadata()
     return {"source": scenario, "seed": str(seed), "options": json.dumps(options), **axes}
