@@ -32,13 +32,17 @@ from spatial_replay.planning.settings import Settings, Skill
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.trace import Sample, Trace
 
-AHEAD: Final = 30
+AHEAD: Final = 90
 """How many samples ahead the motion of other objects is expected to go on."""
+_NUMBERS: Final = (*range(1, 31), *range(33, AHEAD + 1, 3))
+"""The samples ahead that are looked at: all of the first, and every third after them."""
 _UNSURE: Final = 2
 """By how many of its steps an object may be elsewhere than expected; it may have turned back."""
+_JITTER: Final = 1.0 / 30.0
+"""Motion of standing objects between two samples, in cells."""
 _DIRECTIONS: Final = 16
-_LENGTHS: Final = (0.25, 0.5, 1.0)
-"""How far an object goes aside, as shares of its way in `AHEAD` samples."""
+_LENGTHS: Final = (8, 15, 30)
+"""How far an object goes aside, in samples."""
 
 
 def motions_between(before: Sample, sample: Sample) -> dict[str, Pose]:
@@ -204,7 +208,7 @@ class Lookout:
             pace: by how much the object is moved between two samples.
         """
         # standing objects jitter
-        least = self._settings.workspace.grid.cell_size / AHEAD
+        least = self._settings.workspace.grid.cell_size * _JITTER
         others = {
             name: motion
             for name, motion in motions.items()
@@ -262,11 +266,11 @@ class Lookout:
         """
         certain = {who: replace(tracked, uncertainty=0.0) for who, tracked in sample.objects.items()}
         others = self._others_ahead(certain, motions)
-        points = [_point_at(way, number * pace) for way in ways for number in range(1, AHEAD + 1)]
+        points = [_point_at(way, number * pace) for way in ways for number in _NUMBERS]
         samples = [
             Sample(
                 sample.time_ns + 1 + number,
-                {**certain, **others[number % AHEAD], name: tracked},
+                {**certain, **others[number % len(_NUMBERS)], name: tracked},
                 sample.signals,
                 sample.unknown,
             )
@@ -279,35 +283,39 @@ class Lookout:
         return [
             Prospect(
                 *(
-                    self._until_loss(states, [ends[:, begin : begin + AHEAD] for ends in bounds])
+                    self._until_loss(states, [ends[:, begin : begin + len(_NUMBERS)] for ends in bounds])
                     for bounds in (perhaps, surely)
                 )
             )
-            for begin in range(0, len(samples), AHEAD)
+            for begin in range(0, len(samples), len(_NUMBERS))
         ]
 
     def _others_ahead(
         self, objects: Mapping[str, TrackedObject], motions: Mapping[str, Pose]
     ) -> list[dict[str, TrackedObject]]:
         """Return the objects that move by themselves in each of the next samples."""
-        ahead: list[dict[str, TrackedObject]] = [{} for _ in range(AHEAD)]
+        ahead: list[dict[str, TrackedObject]] = [{} for _ in _NUMBERS]
         for name, (x, y, turn) in motions.items():
             u, v = centre_of(objects[name].footprint)
-            numbers = range(1, AHEAD + 1)
-            places = [(u + number * x, v + number * y) for number in numbers]
-            for number, moved in zip(numbers, _copies_at(objects[name], places, turn), strict=True):
+            places = [(u + number * x, v + number * y) for number in _NUMBERS]
+            copies = _copies_at(objects[name], places, turn)
+            for number, moved, objects_then in zip(_NUMBERS, copies, ahead, strict=True):
                 unsure = min(number, _UNSURE) * math.hypot(x, y)
-                ahead[number - 1][name] = replace(moved, uncertainty=unsure)
+                objects_then[name] = replace(moved, uncertainty=unsure)
         return ahead
 
     def _until_loss(self, states: frozenset[int], bounds: Sequence[Floats]) -> float:
         """Return after how many samples acceptance may be lost, by bounds (P, N) of the propositions."""
         can_accept = self._automaton.can_accept
         is_sure = states <= can_accept
-        for number, (lower, upper) in enumerate(zip(*(ends.T.tolist() for ends in bounds), strict=True)):
+        passed = 0
+        for number, lower, upper in zip(_NUMBERS, *(ends.T.tolist() for ends in bounds), strict=True):
             values = zip(lower, upper, strict=True)
             symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
-            states = self._automaton.step_set(states, symbol)
+            # samples in between are taken to be the same
+            for _ in range(number - passed):
+                states = self._automaton.step_set(states, symbol)
+            passed = number
             if not states <= can_accept if is_sure else states.isdisjoint(can_accept):
                 return number
         return math.inf
@@ -316,9 +324,13 @@ class Lookout:
 def _copies_at(
     tracked: TrackedObject, points: Sequence[tuple[float, float]], turn: float = 0.0
 ) -> list[TrackedObject]:
-    """Return an object at some places, turned by an angle from each one to the next."""
+    """Return an object at some places; with an angle, at those of `_NUMBERS`, turned by it at each sample."""
     if turn or not points:
-        return [moved_object(tracked, *point, number * turn) for number, point in enumerate(points, start=1)]
+        numbers = _NUMBERS[: len(points)]
+        return [
+            moved_object(tracked, *point, number * turn)
+            for number, point in zip(numbers, points, strict=True)
+        ]
     batch = with_poses(FootprintBatch.unknown(0), tracked, np.array(points), np.zeros(1))
     return [replace(tracked, footprint=footprint) for footprint in batch.footprints(range(len(points)))]
 
@@ -333,6 +345,6 @@ def _ways_aside(start: tuple[float, float], pace: float) -> list[tuple[tuple[flo
             (start[0] + length / 2.0 * math.cos(angle), start[1] + length / 2.0 * math.sin(angle)),
             (start[0] + length * math.cos(angle), start[1] + length * math.sin(angle)),
         )
-        for length in (share * AHEAD * pace for share in _LENGTHS)
+        for length in (samples * pace for samples in _LENGTHS)
         for angle in angles
     ]

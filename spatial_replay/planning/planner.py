@@ -168,6 +168,8 @@ class Planner:
         self._is_evaded = False
         # the motion that is put off until others have passed
         self._delayed: Target | None = None
+        # whether no sample came during the last motion aside
+        self._is_idle = False
         self._yielded = 0
         self._waiting: Step | None = None
         self._ahead: tuple[int, ...] = ()
@@ -359,6 +361,7 @@ class Planner:
         if self._delayed is not None:
             # a motion aside is for no edge
             self._attempts.motions += 1
+            self._is_idle = self._decided is self._newest()
         elif is_stopped and self._is_evaded and self._yielded < MOST_YIELDED:
             # another object is in the way: the motion did not fail
             self._attempts.motions += 1
@@ -376,7 +379,9 @@ class Planner:
         self._attempts.withdraw(step.aim.edge, target.name)
         self._delayed = target
         self._yielded += 1
-        aside = evasion.aside
+        # the robot takes it to be there already: time has to pass
+        aside = None if self._is_idle else evasion.aside
+        self._is_idle = False
         if aside is None:
             return replace(step, kind="wait", target=None, reason=f"wait: {evasion.reason}")
         place = f"({aside.x:.4g}, {aside.y:.4g})"
@@ -653,8 +658,9 @@ def run_plan(
             waited, reached = 0, {planner.states}
         elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
             look()
-            # samples count only while the automaton reaches no new state
-            waited += not step.ahead or planner.states in reached
+            # samples count only while the automaton reaches no new state; waits for others are bounded
+            is_for_others = step.aim is not None and not step.ahead
+            waited += not is_for_others and (not step.ahead or planner.states in reached)
             reached.add(planner.states)
         elif step.kind != "hold" or _holds(planner, look):
             return step

@@ -102,6 +102,24 @@ def test_an_object_keeps_away_from_a_person_who_walks_to_and_fro(speed, phase, s
     assert act(*past_a_person(skill, speed, phase)) == ("hold", "satisfied")
 
 
+def test_a_motion_aside_during_which_no_sample_comes_becomes_a_wait():
+    planner, robot = past_a_person("push", 0.3, 3)
+    # straight towards the cup
+    robot.person = lambda number: sr.TrackedObject(sr.Footprint.disc(0.6 - number * 0.02, 0.4, 0.08))
+    move, times_ns = robot.execute, []
+
+    def execute(step):
+        if "goes aside" not in step.reason:
+            return move(step)
+        times_ns.append(step.time_ns)
+        return Outcome(True)
+
+    robot.execute = execute
+    act(planner, robot)
+    assert times_ns
+    assert len(set(times_ns)) == len(times_ns)
+
+
 def test_a_wait_for_others_is_logged_with_its_reason_and_counts_no_attempt(tmp_path):
     path = tmp_path / "run.mcap"
     planner, robot = past_a_person("place", 0.3, 8)
