@@ -266,7 +266,7 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
         assert "`turtle1 ovlp turtle2` failed by 1.514 m" in end[-1].value
         drawn = [SceneUpdate.FromString(data) for topic, data in messages if topic == SCENE]
         [arrow] = [each for each in drawn[-1].entities if each.id == "witness"]
-        assert arrow.texts[0].text.strip() == "turtle1 ovlp turtle2 now: -1.53 m"
+        assert arrow.texts[-1].text.strip() == "turtle1 ovlp turtle2 now: -1.53 m"
         [found] = [Specification.FromString(data) for topic, data in messages if topic == described]
         assert {node.unit for result in found.results for node in result.nodes} == {"m"}
     capsys.readouterr()

@@ -358,7 +358,7 @@ def test_the_arrow_of_an_annotated_log_points_at_the_result_that_is_chosen(
             SceneUpdate.FromString(each[-1]) for each in content_of(folder / log).messages if each[0] == SCENE
         ]
         [entity] = [entity for entity in drawn[1].entities if entity.id == "witness"]
-        return entity.texts[0].text.partition(":")[0]
+        return entity.texts[-1].text.partition(":")[0]
 
     assert run_in_process([*command, "-o", "first.mcap"]) == 1
     assert run_in_process([*command, "-o", "chosen.mcap", "--arrow", "apart"]) == 1

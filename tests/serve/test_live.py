@@ -330,7 +330,7 @@ def test_a_viewer_chooses_the_result_that_the_arrow_is_about() -> None:
 
     def arrow(message: Message) -> list[str]:
         drawn = SceneUpdate.FromString(message.data).entities
-        return [each.text.strip() for entity in drawn if entity.id == "witness" for each in entity.texts]
+        return [entity.texts[-1].text.strip() for entity in drawn if entity.id == "witness"]
 
     async def looking(own: Viewer) -> None:
         await own.subscribe([SCENE])
