@@ -137,7 +137,7 @@ class Budget:
 
     @property
     def search(self) -> Search:
-        """What was spent."""
+        """The effort so far."""
         return Search(self._maps - self.left, self.arrangements, self.parking_places)
 
     def spend(self, maps: float = 1.0) -> bool:

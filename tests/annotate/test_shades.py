@@ -14,15 +14,17 @@ MAPS = arrays(np.float64, (3, 4), elements=st.floats())
 
 
 @given(MAPS)
-def test_a_better_cell_is_lighter_and_a_blocked_one_shows_nothing(robustness):
+def test_a_better_cell_is_less_red_and_more_blue_and_a_blocked_one_shows_nothing(robustness):
     cells = cell_colours(robustness).astype(int)
     assert np.array_equal(cells[..., 3] == 0, np.isnan(robustness))
-    greens = cells[..., 1].ravel()[np.argsort(robustness, axis=None)]
+    redness = (cells[..., 0] - cells[..., 2]).ravel()[np.argsort(robustness, axis=None)]
     known = np.count_nonzero(~np.isnan(robustness))
-    assert (np.diff(greens[:known]) >= 0).all()
+    assert (np.diff(redness[:known]) <= 0).all()
 
 
-def test_a_map_has_no_colour_of_a_verdict():
-    cells = cell_colours(np.linspace(-1.0, 1.0, 201)[None])[0, :, :3] / 255.0
-    for colour in (POSITIVE, NEGATIVE):
-        assert np.abs(cells - colour).max(axis=1).min() > 0.2
+def test_a_map_is_white_at_zero_and_ends_in_the_colours_of_verdicts():
+    worst, zero, best = cell_colours(np.array([[-1.0, 0.0, 1.0]]))[0, :, :3] / 255.0
+    np.testing.assert_allclose(worst, NEGATIVE, atol=0.005)
+    np.testing.assert_allclose(best, POSITIVE, atol=0.005)
+    assert len(set(zero)) == 1
+    assert zero[0] > 0.9

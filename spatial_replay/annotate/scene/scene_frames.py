@@ -192,7 +192,7 @@ def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
 
 
 def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
-    """Return the colours (..., 4) of cells (...), the lighter the better, transparent where NaN."""
+    """Return the colours (..., 4) of cells (...) on a map that is white at 0, transparent where NaN."""
     largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0)) or 1.0
     places = np.clip(np.nan_to_num(robustness) / largest, -1.0, 1.0)
     shares = [np.interp(places, _MAP_PLACES, column) for column in _MAP_COLOURS]
