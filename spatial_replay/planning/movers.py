@@ -309,7 +309,8 @@ class Lookout:
         can_accept = self._automaton.can_accept
         is_sure = states <= can_accept
         passed = 0
-        for number, lower, upper in zip(_NUMBERS, *(ends.T.tolist() for ends in bounds), strict=True):
+        rows = zip(*(ends.T.tolist() for ends in bounds), strict=True)
+        for number, (lower, upper) in zip(_NUMBERS, rows, strict=True):
             values = zip(lower, upper, strict=True)
             symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
             # samples in between are taken to be the same
