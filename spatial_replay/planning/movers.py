@@ -34,7 +34,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 AHEAD: Final = 90
 """How many samples ahead the motion of other objects is expected to go on."""
-_NUMBERS: Final = (*range(1, 31), *range(33, AHEAD + 1, 3))
+_NUMBERS: Final[tuple[int, ...]] = (*range(1, 31), *range(33, AHEAD + 1, 3))
 """The samples ahead that are looked at: all of the first, and every third after them."""
 _UNSURE: Final = 2
 """By how many of its steps an object may be elsewhere than expected; it may have turned back."""
