@@ -15,7 +15,7 @@ from typing import Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from spatial_replay.errors import LogError, SpatialReplayError, UsageError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated, select
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
@@ -316,7 +316,8 @@ def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
     columns_by_place: dict[int, EpisodeColumns] = {}
     frames = 0
     for place, source in enumerate(sources if sources[0].mapped_by is not None else ()):
-        with suppress(SpatialReplayError):
+        # any error: one episode must not end the reading of the others
+        with suppress(Exception):
             columns = source.columns()
             frames += len(columns.times_ns)
             if frames > _MOST_FRAMES:
@@ -330,7 +331,7 @@ def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
     }
     episodes: dict[int, ReadEpisode] = {}
     if shape is not None and len(together) > 1:
-        with suppress(SpatialReplayError):
+        with suppress(Exception):
             parts = [(sources[place], columns) for place, columns in together.items()]
             episodes = dict(zip(together, _read_parts(parts), strict=True))
     for place, source in enumerate(sources):

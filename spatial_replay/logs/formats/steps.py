@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -108,7 +109,7 @@ def open_npz(path: Path) -> DataSet | None:
     """Open a data set of OGBench; None if the file is no archive of arrays with `terminals`."""
     if path.suffix != ".npz" or not path.is_file():
         return None
-    with zipfile.ZipFile(path) as archive:
+    with _raising_log_errors(path), zipfile.ZipFile(path) as archive:
         is_ours = "terminals.npy" in archive.namelist()
     return _Npz(path) if is_ours else None
 
@@ -121,7 +122,8 @@ class _Npz(_Steps):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._arrays: dict[str, Floats] = {}
-        self._shapes = dict(self._read_shapes())
+        with _raising_log_errors(path):
+            self._shapes = dict(self._read_shapes())
         is_end = self._array("terminals").reshape(-1) > 0
         self.divide(is_end, "does not end with a terminal")
         self.features = tuple(
@@ -156,10 +158,19 @@ class _Npz(_Steps):
 
     def _array(self, name: str) -> Floats:
         if name not in self._arrays:
-            with np.load(self.path, allow_pickle=False) as arrays:
+            with _raising_log_errors(self.path), np.load(self.path, allow_pickle=False) as arrays:
                 values = np.asarray(arrays[name], np.float64)
             self._arrays[name] = values.reshape(len(values), -1) if values.ndim > 1 else values
         return self._arrays[name]
+
+
+@contextmanager
+def _raising_log_errors(path: Path) -> Iterator[None]:
+    """Raise LogError for what the readers of a damaged archive raise."""
+    try:
+        yield
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise LogError(f"{path.name} cannot be read: {error}; copy the file again") from None
 
 
 def _npy_header(stream: BinaryIO, what: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
