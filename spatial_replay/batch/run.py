@@ -40,7 +40,7 @@ from spatial_replay.batch.workers import (
     Workers,
     no_progress,
 )
-from spatial_replay.errors import Diagnosis, SpatialReplayError, SpecificationError, UsageError
+from spatial_replay.errors import Diagnosis, LogError, SpatialReplayError, SpecificationError, UsageError
 from spatial_replay.logs.formats.datasets import DATA_SET_ENDINGS, data_set_address, open_data_set
 from spatial_replay.logs.remote import (
     BAG_METADATA,
@@ -257,15 +257,17 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
 
 
 def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
-    """Return the episodes of a data set; none for anything else, and for one that cannot be opened.
+    """Return the episodes of a data set, a damaged one as a whole; none for anything else.
 
-    To open that one is the error of its row.
+    To open a damaged one is the error of its row: a batch does not pass over logs in silence.
     """
+    whole = _found(path, folder)
     try:
         data_set = open_data_set(path)
+    except LogError:
+        return [whole]
     except SpatialReplayError:
         return []
-    whole = _found(path, folder)
     episodes = () if data_set is None else data_set.episodes
     return [
         FoundLog(f"{whole.name}#{episode.number}", f"{whole.path}#{episode.number}") for episode in episodes

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import spatial_replay as sr
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
 
@@ -75,6 +76,37 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
     data_set = open_data_set(file)
     assert data_set is not None and "a pickle" in data_set.remarks[0]
     assert [feature.name for feature in data_set.features] == ["qpos"]
+
+
+def test_a_damaged_archive_ends_no_batch(tmp_path: Path) -> None:
+    (tmp_path / "m.yaml").write_text('fps: 10\nfeatures: {qpos: [{name: cube, position: "[0:3]"}]}\n')
+    (tmp_path / "gate.spatial").write_text("spec near = G (cube dist cube <= 1)\n")
+    for name in ("damaged", "good"):
+        np.savez(tmp_path / f"{name}.npz", terminals=[False, True] * 2, qpos=np.full((4, 3_000), 0.5))
+    damaged = tmp_path / "damaged.npz"
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 255
+    damaged.write_bytes(content)
+    logs = [f"{tmp_path / name}.npz#{number}" for name in ("damaged", "good") for number in (0, 1)]
+    mapping = str(tmp_path / "m.yaml")
+    rows = sr.evaluate_logs(
+        logs, tmp_path / "gate.spatial", output=tmp_path / "results", mapping=mapping
+    ).table
+    assert rows["verdict"].to_pylist() == [None, None, "satisfied", "satisfied"]
+    assert rows["error_kind"].to_pylist() == ["log", "log", None, None]
+    assert "damaged.npz cannot be read" in rows["error"][0].as_py()
+    damaged.write_bytes(b"PK")
+    with pytest.raises(LogError, match=r"damaged.npz cannot be read.*; copy the file again"):
+        open_data_set(damaged)
+    # a folder does not hide it
+    names = sr.evaluate_logs(
+        tmp_path, tmp_path / "gate.spatial", output=tmp_path / "results", mapping=mapping
+    ).table
+    assert {Path(name).name for name in names["log"].to_pylist()} == {
+        "damaged.npz",
+        "good.npz#0",
+        "good.npz#1",
+    }
 
 
 def test_an_address_names_an_episode(tmp_path: Path) -> None:
