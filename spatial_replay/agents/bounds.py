@@ -126,20 +126,44 @@ class Bounds:
         return None
 
     def _check_links(self, folder: Path, argument: str) -> None:
-        """Refuse a folder with a link to the outside."""
-        count = 0
-        for parent, folders, names in os.walk(folder):
-            for name in (*folders, *names):
-                count += 1
-                path = Path(parent, name)
+        """Refuse a folder with a link to the outside, or with a pipe, which would block its reader."""
+        count, pending, visited = 0, [str(folder)], {str(folder)}
+        while pending:
+            for parent, folders, names in os.walk(pending.pop()):
+                count += len(folders) + len(names)
                 if count > _MOST_ENTRIES:
                     raise UsageError(
                         f"{argument}: {folder.name} has over {_MOST_ENTRIES:,} entries; give a folder in it"
                     )
-                if path.is_symlink() and not any(map(path.resolve().is_relative_to, self.folders)):
-                    raise UsageError(
-                        f"{argument}: {_quote(path.name)} is a link to outside the roots; remove the link"
-                    )
+                for path in map(Path(parent).joinpath, (*folders, *names)):
+                    target = self._inside(path, argument)
+                    # a folder that a link leads to may have links, too
+                    if target is not None and target not in visited and os.path.isdir(target):  # noqa: PTH112
+                        visited.add(target)
+                        pending.append(target)
+
+    def _inside(self, path: Path, argument: str) -> str | None:
+        """Return where a link leads; None for a file or a folder.
+
+        Raises:
+            UsageError: it leads to the outside, or is neither of the three.
+        """
+        target = None
+        try:
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode):
+                target = os.path.realpath(path)
+                mode = os.stat(target).st_mode  # noqa: PTH116
+        except OSError:
+            # removed by now, or a link to nothing or to itself
+            mode = stat.S_IFREG
+        if target is not None and not any(map(Path(target).is_relative_to, self.folders)):
+            raise UsageError(
+                f"{argument}: {_quote(path.name)} is a link to outside the roots; remove the link"
+            )
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise UsageError(f"{argument}: {_quote(path.name)} is neither a file nor a folder; remove it")
+        return target
 
     def relative(self, path: str) -> str:
         """Return a path as tools take it: relative to the only root, or else absolute."""

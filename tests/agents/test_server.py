@@ -183,6 +183,11 @@ def test_a_path_outside_the_roots_is_refused_in_one_sentence(
     outside = logs / "linked"
     outside.mkdir()
     (outside / "run.jsonl").symlink_to(secret)
+    for name, target in (("chain", outside), ("loop", "data")):
+        (logs / f"{name}_set").mkdir()
+        (logs / f"{name}_set" / "data").symlink_to(target)
+    (logs / "piped").mkdir()
+    os.mkfifo(logs / "piped" / "run.parquet")
     mapping = f"model: {secret}\nfps: 10\n"
     try:
         for path, reason in {
@@ -190,6 +195,9 @@ def test_a_path_outside_the_roots_is_refused_in_one_sentence(
             str(secret): "is outside the roots",
             "link.jsonl": "is outside the roots",
             "linked": "is a link to outside the roots",
+            "chain_set": "is a link to outside the roots",
+            "loop_set": "too many levels of symbolic links",
+            "piped": "is neither a file nor a folder",
             "pipe.jsonl": "is neither a file nor a folder",
             "s3://bucket/run.mcap": "is outside the roots",
             "absent.jsonl": "is not a file below the roots",
@@ -206,7 +214,8 @@ def test_a_path_outside_the_roots_is_refused_in_one_sentence(
         assert str(tmp_path) not in error
         assert "link.jsonl" not in newest.call("list_logs").text
     finally:
-        shutil.rmtree(outside)
+        for folder in (outside, logs / "chain_set", logs / "loop_set", logs / "piped"):
+            shutil.rmtree(folder)
         (logs / "link.jsonl").unlink()
         (logs / "pipe.jsonl").unlink()
 
