@@ -120,9 +120,9 @@ class Tools:
 
     async def list_logs(self, ctx: Context, next: _Next = "") -> CallToolResult:
         """List the logs and data sets below the roots: size, length, objects, label."""
-        first = int(next or 0) if next.isascii() and next.isdecimal() else -1 if next else 0
-        if first < 0:
+        if next and not (next.isascii() and next.isdecimal() and len(next) < 20):
             raise UsageError(f"next: {next!r:.80} is not a place in the list; give that of the answer before")
+        first = int(next or 0)
         listing = await self._run(ctx, [["list", *map(str, self._bounds.folders)]])
         if not listing.outcomes:
             return _failure(listing.reason)

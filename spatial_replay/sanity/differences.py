@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from math import inf
 from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias
 
@@ -127,8 +126,8 @@ def distinguish(first: Specification, second: Specification, *, rate_hz: float |
     specifications = first, second
     for specification in specifications:
         require_specification(specification)
-    if rate_hz is not None and not 0.0 < rate_hz < inf:
-        raise UsageError(f"a rate of {rate_hz!r} Hz; give samples a second, above 0")
+    if rate_hz is not None and not 1e-6 <= rate_hz <= 1e9:
+        raise UsageError(f"a rate of {rate_hz!r} Hz; give samples a second, from 1e-6 to 1e9")
     together = _together(first, second)
     names = _names(specifications)
     formulas = tuple(spec.formula for spec in together.specs)

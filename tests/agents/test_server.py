@@ -234,6 +234,9 @@ def test_odd_arguments_are_errors_with_a_remedy(newest: Agent, logs: Path) -> No
         answer = newest.call("check", **arguments)
         assert reason in answer.text
         assert answer.size < 5_000
+    assert "is not a place in the list" in newest.call("list_logs", next="9" * 5_000).error
+    seconds = {"first": "F[0s, 5s] (cup ovlp plate)", "second": "F[0, 5] (cup ovlp plate)"}
+    assert "give samples a second" in newest.call("distinguish", hz=1e308, **seconds).error
     both = {"log": "table.jsonl", "specification": NEAR}
     assert "give other_specification" in newest.call("diff", **both).error
     assert "is not the name of a file" in newest.call("report", name="../x", **both).error
