@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
+from typing import Final
 
 from lark import Token
 
@@ -202,13 +203,16 @@ def last_sample_warnings(specification: Specification) -> Iterator[Diagnostic]:
                 continue
             warned.add(outer.span)
             message = f"`{pair} p` asks for the last sample of a log alone"
-            yield source.diagnostic("warning", outer.span, message, _LASTING)
+            yield source.diagnostic("warning", outer.span, message, _LASTING[pair])
 
 
-_LASTING = (
-    "write F ((G[0s, 2s] p) and (F[2s, inf] true)) for two seconds on end, or"
-    " F ((G p) and (F[2s, inf] true)) for at least the last two"
-)
+_LASTING: Final = {
+    "F G": "write F ((G[0s, 2s] p) and (F[2s, inf] true)) for two seconds on end, or"
+    " F ((G p) and (F[2s, inf] true)) for at least the last two",
+    "G F": "write G ((F[0s, 9s] p) or not (F[9s, inf] true)) for again and again, at least every"
+    " nine seconds",
+}
+"""Remedies by pairs of operators."""
 
 
 def _is_unbounded(formula: Formula) -> bool:

@@ -423,6 +423,7 @@ def test_a_formula_stands_in_place_of_a_file_and_a_mapping_does_not(
         ("F ((G load >= 1) and (F[2s, inf] true))", ""),
         ("F[0s, 9s] G load >= 1", ""),
         ("G F[0s, 9s] load >= 1", ""),
+        ("G ((F[0s, 9s] load >= 1) or not (F[9s, inf] true))", ""),
     ],
 )
 def test_formulas_about_the_last_sample_alone_are_warned_of(
@@ -432,4 +433,5 @@ def test_formulas_about_the_last_sample_alone_are_warned_of(
     said = capsys.readouterr().err
     assert ("asks for the last sample of a log alone" in said) == bool(pair)
     if pair:
-        assert f"`{pair} p` asks" in said and "write F ((G[0s, 2s] p) and (F[2s, inf] true))" in said
+        remedy = {"F G": "F ((G[0s, 2s] p) and (F[2s, inf] true))", "G F": "for again and again"}[pair]
+        assert f"`{pair} p` asks" in said and remedy in said
