@@ -11,7 +11,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "agents.md"
 ATOMS = {
     "p": "cup enclosedin bowl",
     "a": "cup leftof plate",
-    "b": "cup rightof plate",
+    "b": "cup below plate",
     "open": "(door >= 1)",
     "warning": "alarm",
 }
