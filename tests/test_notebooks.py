@@ -79,7 +79,7 @@ EXPECTED = {
             "state 0  execute red: pushed red straight to its place",
             "state 3  hold",
             "push: satisfied",
-            "violated: red dist blue >= 0.08 fails by 0.0146 m",
+            "violated: red dist blue >= 0.08 fails by 0.0148 m",
         ),
     ),
 }

@@ -154,7 +154,7 @@ def test_the_cells_of_every_grid_match_its_strides(log):
         assert grid.cell_size.y > 0
 
 
-def test_blocked_cells_are_transparent_and_others_the_lighter_the_better(log):
+def test_blocked_cells_are_transparent_and_better_ones_less_red_and_more_blue(log):
     for _, _, _, grid in log.of("foxglove.Grid"):
         cell = np.dtype(
             {
@@ -167,9 +167,9 @@ def test_blocked_cells_are_transparent_and_others_the_lighter_the_better(log):
         cells = np.frombuffer(grid.data, cell)
         assert np.array_equal(cells["alpha"] == 0, np.isnan(cells["robustness"]))
         open_cells = np.sort(cells[cells["alpha"] > 0], order="robustness")
-        lightness = 0.2126 * open_cells["red"] + 0.7152 * open_cells["green"] + 0.0722 * open_cells["blue"]
-        assert (np.diff(lightness) >= -1.0).all()  # each colour is rounded to a whole number
-        assert lightness[-1] > lightness[0] or open_cells["robustness"][-1] == open_cells["robustness"][0]
+        redness = open_cells["red"].astype(int) - open_cells["blue"]
+        assert (np.diff(redness) <= 1).all()  # each colour is rounded to a whole number
+        assert redness[-1] < redness[0] or open_cells["robustness"][-1] == open_cells["robustness"][0]
 
 
 def test_what_the_layout_shows_is_at_most_60_hz_and_robustness_has_every_sample(log):

@@ -553,7 +553,8 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     states = ", ".join(map(str, decision.states))
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
     yield f"  {decision.reason}"
-    yield f"  {effort_text(decision)}"
+    if decision.considered:
+        yield f"  {effort_text(decision)}"
     if decision.HasField("target"):
         yield f"  {_target_text(decision.target)}{joint_suffix(decision.considered[-1])}"
     said: dict[tuple[str, ...], str] = {}

@@ -19,7 +19,7 @@ def test_a_better_cell_is_less_red_and_more_blue_and_a_blocked_one_shows_nothing
     assert np.array_equal(cells[..., 3] == 0, np.isnan(robustness))
     redness = (cells[..., 0] - cells[..., 2]).ravel()[np.argsort(robustness, axis=None)]
     known = np.count_nonzero(~np.isnan(robustness))
-    assert (np.diff(redness[:known]) <= 0).all()
+    assert (np.diff(redness[:known]) <= 1).all()  # each colour is rounded to a whole number
 
 
 def test_a_map_is_white_at_zero_and_ends_in_the_colours_of_verdicts():

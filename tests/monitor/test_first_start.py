@@ -50,7 +50,7 @@ def _copy_cache(cache: Path) -> None:
     # all of it takes two minutes of processor time
     folder = cache_folder()
     if folder is not None:
-        missing = shutil.ignore_patterns("*.compiled", "*.lock", "live.measure_sample-*")
+        missing = shutil.ignore_patterns("*.compiled", "*.lock", "step.run_sample-*")
         shutil.copytree(folder, cache / folder.name, ignore=missing)
 
 
@@ -70,7 +70,7 @@ def test_a_first_monitor_loads_the_code_of_a_child_process_also_after_a_fork(tmp
     # later ones begin with it; without the note that all is there, only those that wait do
     with _loop(tmp_path, "1") as later:
         assert later.communicate()[1] == ""
-    assert [*tmp_path.rglob("live.measure_sample-*.nbi")]
+    assert [*tmp_path.rglob("step.run_sample-*.nbi")]
     for note in tmp_path.rglob("*.compiled"):
         note.unlink()
     with _loop(tmp_path, "1", wait="wait") as waiting:
