@@ -200,8 +200,8 @@ class Tools:
     ) -> CallToolResult:
         """Find the shortest run that one of two specifications accepts and the other one rejects, in words.
 
-        Or that they mean the same. Use it to see which of two spellings a sentence means. It does not decide
-        `Y`, `O`, `H` and `S`: write `(not b) W (a and not b)` for "b only after a".
+        The answer also says whether both mean the same, so it shows which spelling a sentence means. The
+        operators `Y`, `O`, `H` and `S` are not decided: write `(not b) W (a and not b)` for "b only after a".
         """
         with self._texts(first=first, second=second) as files:
             command = ["distinguish", files.path("first"), files.path("second")]

@@ -359,19 +359,21 @@ def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
     return within[-1] if within else None
 
 
-def _point_at_settled(result: EvaluatedResult, times_ns: Integers, here: Integers, found: Violations) -> None:
+def _point_at_settled(
+    result: EvaluatedResult, times_ns: Integers, here: Integers, violations: Violations
+) -> None:
     """Name the leaf that settled the violation, where that is what is pointed at."""
     if result.settled is None:
         return
-    found.leaf[here[times_ns[here] == result.settled.time_ns]] = -1
+    violations.leaf[here[times_ns[here] == result.settled.time_ns]] = -1
     leaf = result.settled.shown
     places = here[_shows_settled(result, times_ns[here])]
     if leaf is None or not len(places):
         return
-    found.leaf[places], found.node[places] = leaf.leaf, leaf.node
-    found.robustness[places] = -abs(leaf.number)
-    found.holds[places] = leaf.number > 0.0
-    found.moment_ns[places] = np.where(times_ns[places] == leaf.time_ns, -1, leaf.time_ns)
+    violations.leaf[places], violations.node[places] = leaf.leaf, leaf.node
+    violations.robustness[places] = -abs(leaf.number)
+    violations.holds[places] = leaf.number > 0.0
+    violations.moment_ns[places] = np.where(times_ns[places] == leaf.time_ns, -1, leaf.time_ns)
 
 
 def _robustness(
