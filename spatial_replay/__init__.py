@@ -20,6 +20,7 @@ from spatial_replay.errors import (
     UsageError,
 )
 from spatial_replay.lazy import loaded_when_used
+from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
     from spatial_replay.api import (
@@ -53,8 +54,6 @@ if TYPE_CHECKING:
     from spatial_replay.spec.formula import Specification
     from spatial_replay.spec.load import load_specification, parse_specification
     from spatial_replay.trace.trace import Sample, Trace
-
-__version__ = "0.2.0"
 
 __all__ = [
     "ClusterError",

@@ -21,12 +21,12 @@ from mcp.server.mcpserver.tools import Tool
 from mcp_types import CallToolResult, InputRequiredResult, TextContent, ToolAnnotations
 from pydantic import Field, ValidationError
 
-from spatial_replay import __version__
 from spatial_replay.agents.bounds import Bounds, Files, page_of
 from spatial_replay.agents.calls import Call, Outcome, Outcomes, Processes, Work
 from spatial_replay.agents.pages import PAGES, page_text, relation_picture
 from spatial_replay.errors import UsageError
 from spatial_replay.text import escaped, nearest_hint
+from spatial_replay.version import __version__
 
 _Log = Annotated[
     str, Field(description="Path of a log, as list_logs names it; `push_v3#17` is an episode of a data set.")

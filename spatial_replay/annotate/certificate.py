@@ -14,13 +14,13 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay import __version__
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.logs.messages import Messages
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
+from spatial_replay.version import __version__
 
 
 class SampleHash:

@@ -10,7 +10,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from spatial_replay import __version__
 from spatial_replay.batch.curves import Curve, draw_curves
 from spatial_replay.batch.run_table import (
     BASELINE_ROBUSTNESS,
@@ -33,6 +32,7 @@ from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.page import asset, html_page, text
 from spatial_replay.report.panels import sentence_parts
 from spatial_replay.text import counted, first_lines, with_unit
+from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
     import pyarrow as pa

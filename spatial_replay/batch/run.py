@@ -16,7 +16,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from spatial_replay import __version__
 from spatial_replay.batch.identities import identify, states_of
 from spatial_replay.batch.record import with_explanations, with_record
 from spatial_replay.batch.rows import (
@@ -60,6 +59,7 @@ from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import SpecificationText
 from spatial_replay.spec.walks import other_names
 from spatial_replay.text import counted, encodable, first_lines
+from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -21,7 +21,6 @@ from typing import Any, NoReturn
 
 import click
 
-from spatial_replay import __version__
 from spatial_replay.cli.terminal import PROGRAM, show, show_diagnostics, show_message
 from spatial_replay.errors import (
     GeometryError,
@@ -33,6 +32,7 @@ from spatial_replay.errors import (
     UsageError,
 )
 from spatial_replay.text import counted, nearest_hint
+from spatial_replay.version import __version__
 
 COMPLETION_VARIABLE = "_SPATIAL_REPLAY_COMPLETE"
 DEBUG_VARIABLE = "SPATIAL_REPLAY_DEBUG"

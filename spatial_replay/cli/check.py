@@ -13,7 +13,6 @@ from urllib.parse import quote
 
 import click
 
-from spatial_replay import __version__
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     OTHER_READING,
@@ -46,6 +45,7 @@ from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.spec.walks import nodes_of
 from spatial_replay.text import Sentence, counted, counted_from, json_fields
+from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
     from spatial_replay.logs.messages import Source

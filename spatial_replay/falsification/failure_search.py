@@ -20,7 +20,6 @@ from typing import Any, Final, Generic, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay import __version__
 from spatial_replay.batch.run import meaning_hash, workers_of
 from spatial_replay.batch.store import LocalFolder
 from spatial_replay.batch.workers import Progress, WorkerLost, Workers, no_progress
@@ -49,6 +48,7 @@ from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import counted, json_fields, json_number, json_value, named_arguments, with_unit
 from spatial_replay.trace.trace import Sample
+from spatial_replay.version import __version__
 
 _MOST_FAILURES: Final = 20
 """The most failures in the text; JSON has all."""

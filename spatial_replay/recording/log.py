@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay import __version__, compiled
+from spatial_replay import compiled
 from spatial_replay.annotate.automaton_state import SpecAutomaton, automata_attachments
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
@@ -64,6 +64,7 @@ from spatial_replay.text import requirement_text
 from spatial_replay.trace.doubts import Doubt, metadata_from_doubts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Sample, Trace
 from spatial_replay.trace.units import Axes
+from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
     from spatial_replay.planning.planner import Planner

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spatial_replay import __version__
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.specification import (
@@ -75,6 +74,7 @@ from spatial_replay.spec.load import SpecificationText, load_specifications, par
 from spatial_replay.text import Instant, Sentence, counted, counted_from
 from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
+from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay import __version__
 from spatial_replay.annotate.certificate import PLAN_SHA256, plan_sha256
 from spatial_replay.bags.open import McapLog
 from spatial_replay.bags.reader import Message
@@ -46,6 +45,7 @@ from spatial_replay.replay.engine import Replay, load_files, run_replay
 from spatial_replay.replay.selection import CLIP_METADATA, KEEP_ALL, ReplayOptions, Window, clipped_source
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import Instant, Sentence, counted_from, printable
+from spatial_replay.version import __version__
 
 NAMESPACE = "spatial-replay"
 LARGEST_SIGNATURE = 2**16

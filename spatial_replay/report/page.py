@@ -14,7 +14,6 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Final
 
-from spatial_replay import __version__
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import settled_time
 from spatial_replay.monitor.verdict import Verdict, counts_text
@@ -25,6 +24,7 @@ from spatial_replay.report.panels import final_text, json_text, sentence_parts
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import declared_unit, units_of, units_text
 from spatial_replay.text import CALENDAR_NS, Instant, Sentence, counted, printable, time_text
+from spatial_replay.version import __version__
 
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 

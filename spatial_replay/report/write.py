@@ -14,7 +14,6 @@ from typing import Any, Final, TypeAlias
 
 from foxglove_schemas_protobuf.Event_pb2 import Event
 
-from spatial_replay import __version__
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
@@ -41,6 +40,7 @@ from spatial_replay.report.panels import (
 )
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import Instant, Sentence
+from spatial_replay.version import __version__
 
 _COLLECTED: Final = frozenset(
     (
