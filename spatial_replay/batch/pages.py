@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from spatial_replay.batch.curves import Curve, read_curves
 from spatial_replay.batch.overview import INDEX, overview_page
 from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
 from spatial_replay.batch.run import BatchResult, Wanted
+from spatial_replay.batch.run_table import worst_rows
 from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import output_error, replacing
+from spatial_replay.notebook.figures import element
+from spatial_replay.report.page import HEADER, text
 from spatial_replay.report.write import write_report
 
 _FOLDER: Final = "reports"
 _LONGEST: Final = 80
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
+_HEAD: Final = re.compile(rb'(?:<nav class="neighbours".*?</nav>)?' + re.escape(HEADER.encode()), re.DOTALL)
+"""Where the header of a report begins, with the links that an earlier batch has written before it."""
 
 
 def write_pages(
@@ -26,7 +33,8 @@ def write_pages(
 ) -> dict[tuple[str, str], Path]:
     """Write the page over all logs, and one about each log with a verdict that fails.
 
-    A page that an earlier run has written of the same log and specifications stays.
+    A page that an earlier run has written of the same log and specifications stays, but for its links to the
+    page over all and to those before and after it. The worst log comes first.
 
     Args:
         folder: made if need be; the page over all is its `index.html`.
@@ -54,7 +62,9 @@ def write_pages(
     with progress("reports", len(missing)) as advance:
         for _ in workers.results(_write_page, missing.values()) if missing else ():
             advance(1)
-    pages = {key: path for key, path in pages.items() if path.exists()}
+    order = dict.fromkeys((row["case"], row["log"]) for row in worst_rows(result.table, len(result.table)))
+    pages = {key: pages[key] for key in order if key in pages and pages[key].exists()}
+    _link_pages(pages)
     links = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
     curves: dict[str, list[Curve]] = {}
     for (case, log), path in pages.items():
@@ -62,6 +72,26 @@ def write_pages(
     with replacing(folder / INDEX) as stream:
         stream.write(overview_page(result.table, name, links, curves))
     return pages
+
+
+def _link_pages(pages: Mapping[tuple[str, str], Path]) -> None:
+    """Write into each page about a log the links to the page over all, and to those before and after it."""
+    neighbours = [(log, path.name) for (_, log), path in pages.items()]
+    for place, path in enumerate(pages.values()):
+        links = [element("a", "All logs", href=f"../{INDEX}")]
+        links.append(element("span", f"{place + 1} of {len(pages)} that fail"))
+        for words, step in (("Previous", place - 1), ("Next", place + 1)):
+            if 0 <= step < len(pages):
+                log, address = neighbours[step]
+                relation = "prev" if step < place else "next"
+                links.append(element("a", f"{words}: ", text(log), href=quote(address), rel=relation))
+        nav = element("nav", *links, **{"class": "neighbours", "aria-label": "Logs that fail"})
+        content, begin = path.read_bytes(), (nav + HEADER).encode()
+        # a backslash in the name of a log is no escape
+        linked = _HEAD.sub(begin.replace(b"\\", rb"\\"), content, count=1)
+        if linked != content:
+            with replacing(path) as stream:
+                stream.write(linked)
 
 
 def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:

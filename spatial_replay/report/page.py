@@ -26,6 +26,8 @@ from spatial_replay.spec.walks import declared_unit, units_of, units_text
 from spatial_replay.text import CALENDAR_NS, Instant, Sentence, counted, printable, time_text
 from spatial_replay.version import __version__
 
+HEADER: Final = '<header class="top">'
+"""Begins the header of a report."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 

@@ -58,5 +58,15 @@ def test_logs_are_sorted_by_what_is_pressed_and_lead_to_their_reports(
     page.keyboard.press("Enter")
     expect(page.locator("html[data-ready]")).to_have_count(1)
     expect(page.locator("#verdicts-body")).to_contain_text("cart and person are 0.1 apart")
+    # the report leads on to the others that fail, and back
+    neighbours = page.get_by_role("navigation", name="Logs that fail")
+    expect(neighbours).to_have_text("All logs1 of 2 that failNext: logs/run-1.jsonl")
+    neighbours.get_by_role("link", name="Next").click()
+    expect(page.locator("h1")).to_have_text("run-1.jsonl")
+    expect(neighbours).to_have_text("All logs2 of 2 that failPrevious: logs/run-10.jsonl")
+    for link in neighbours.get_by_role("link").all():
+        assert (link.bounding_box() or {})["height"] >= 24
+    neighbours.get_by_role("link", name="All logs").click()
+    assert logs_of(page) == worst_first
     context.close()
     assert not errors
