@@ -44,9 +44,10 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.result import Evaluation, evaluate
     from spatial_replay.monitor.verdict import Verdict
     from spatial_replay.planning.decisions import Outcome
-    from spatial_replay.planning.planner import Planner, plan
+    from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
     from spatial_replay.recording.clips import Trigger
+    from spatial_replay.recording.plan_loop import plan
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.sanity.differences import distinguish
     from spatial_replay.sanity.examine import doctor

@@ -1,15 +1,12 @@
-"""The planner (Algorithm 1 of the paper): takes one edge of the automaton at a time by moving one object.
-
-`plan` lets it and a robot act in a loop: observe, decide, execute, until there is nothing more to do.
-"""
+"""The planner (Algorithm 1 of the paper): takes one edge of the automaton at a time by moving one object."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
@@ -20,7 +17,6 @@ from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.decisions import (
     Consideration,
     Edge,
-    Executor,
     Kind,
     Loss,
     Outcome,
@@ -63,10 +59,6 @@ from spatial_replay.spec.formula import Group, Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import counted, named_arguments, times_apart
 from spatial_replay.trace.trace import Sample, require_sample
-
-if TYPE_CHECKING:
-    from spatial_replay.planning.decision_log import BlackBox
-    from spatial_replay.recording.recorder import Recorder
 
 _LONGEST_WANTED: Final = 60
 """The most characters of a proposition that a reason shows if it has a spec to name instead."""
@@ -596,79 +588,3 @@ def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
 
 MOST_YIELDED: Final = 300
 """The most samples for which motions wait for others to pass, until one succeeds."""
-HOLDING_SAMPLES: Final = 30
-"""How many samples the specification has to stay satisfied before a run ends."""
-MOST_WAITING_SAMPLES: Final = 150
-"""The most samples without progress between two motions, before a run ends."""
-
-
-class Robot(Executor, Protocol):
-    """A robot that `plan` lets act. It writes every sample to the recorder, also during a motion."""
-
-    def look(self) -> None:
-        """Write one more sample to the recorder, while nothing moves."""
-
-
-@named_arguments
-def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = False) -> Step:
-    """Let a planner decide and a robot act until there is nothing more to do, and record all of it.
-
-    The log has the samples, every decision with its maps and outcome, and the settings, so that
-    `verify --decisions` recomputes it. The loop ends: motions are bounded by the attempts at the automaton's
-    edges, waiting by the samples in which the automaton reaches no new state.
-
-    Args:
-        planner: that has observed nothing yet.
-        robot: moves things, and writes samples with `recorder.write`.
-        recorder: that records the planner's specification, or was opened with `planner=`.
-        timings: also record how long each decision took; the recorder must have no planner yet.
-
-    Returns:
-        The last decision: "hold" if the specification is satisfied, as far as the planner can see.
-
-    Raises:
-        UsageError: the recorder does not record the planner's specification, or has another planner.
-        OutputError: the log cannot be written.
-    """
-    if recorder.planner is not planner:
-        recorder.attach(planner, timings=timings)
-    elif timings:
-        raise UsageError(
-            "a recorder with a planner was given its timings when that was attached; leave them out"
-        )
-    return run_plan(recorder, robot.execute, robot.look)
-
-
-def run_plan(
-    decider: BlackBox | Recorder, execute: Callable[[Step], Outcome], look: Callable[[], None]
-) -> Step:
-    """Look, decide and act until there is nothing more to do; return the last decision.
-
-    Args:
-        look: takes one more sample, which the planner observes, while nothing moves.
-    """
-    look()
-    planner = decider.planner
-    assert planner is not None
-    waited, reached = 0, {planner.states}
-    while True:
-        step = decider.next_step()
-        if step.kind == "execute":
-            decider.conclude(execute(step))
-            waited, reached = 0, {planner.states}
-        elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
-            look()
-            # samples count only while the automaton reaches no new state; waits for others are bounded
-            is_for_others = step.aim is not None and not step.ahead
-            waited += not is_for_others and (not step.ahead or planner.states in reached)
-            reached.add(planner.states)
-        elif step.kind != "hold" or _holds(planner, look):
-            return step
-
-
-def _holds(planner: Planner, look: Callable[[], None]) -> bool:
-    """Look for a while without a motion; return whether the specification stays satisfied."""
-    for _ in range(HOLDING_SAMPLES):
-        look()
-    # no motion can remove doubt about the past
-    return planner.is_accepting or planner.is_doubtful

@@ -1,6 +1,6 @@
 """A simulated world whose robot executes a planner's steps, recorded with every decision.
 
-`record_plan` sets up world, planner and log; `planning.planner.plan` lets them observe, decide and execute.
+`record_plan` sets up world, planner and log; `recording.plan_loop` lets them observe, decide and execute.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from spatial_replay.logs.output_file import Durability
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
 from spatial_replay.planning.decisions import Kind, Outcome, Step, sentence_of
-from spatial_replay.planning.planner import Planner, run_plan
+from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Grid, Settings, Skill, Workspace, changed_settings
+from spatial_replay.recording.plan_loop import run_plan
 from spatial_replay.runs.scripted import RunLog, about_run, refuse_unknown_names, run_log
 from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.sanity import refuse_unsatisfiable

@@ -12,7 +12,7 @@ from planning.kinematics import Table, block
 from spatial_replay import Planner, Settings
 from spatial_replay.planning import Grid, Workspace
 from spatial_replay.planning.decision_log import BlackBox
-from spatial_replay.planning.planner import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, run_plan
+from spatial_replay.recording.plan_loop import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, run_plan
 from spatial_replay.runs.scripted import RunLog, run_log
 
 TABLE = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), supports=frozenset({"plate"})))
