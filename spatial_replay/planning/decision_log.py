@@ -61,9 +61,10 @@ from spatial_replay.planning.decisions import (
     either,
     wait_outcome,
 )
-from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers, room_cost
+from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
+from spatial_replay.planning.targets import room_cost
 from spatial_replay.text import counted, json_number, time_text
 from spatial_replay.trace.trace import Sample
 

@@ -24,7 +24,6 @@ from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.planning.decisions import Candidate, Target
 from spatial_replay.planning.settings import Grid, Settings, Workspace, refuse_faults
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
@@ -435,13 +434,6 @@ class BlockedBy(NamedTuple):
     cells: int
 
 
-class RoomCost(NamedTuple):
-    """Cost of the room around a target: the robustness possible with less, and the room there."""
-
-    robustness: float
-    room: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MapLayers:
     """A gradient map taken apart.
@@ -648,17 +640,3 @@ def avoided_cells(
         away = distance_to(failed, gradient.grid)
         return np.asarray(away < away[holds.any(axis=0)].max() / 2.0)
     return avoided
-
-
-def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomCost | None:
-    """Return what the room around a target costs; None if no more robustness was possible with less."""
-    gradient = candidate.map
-    if settings.skill != "place" or settings.room <= 0.0:
-        return None
-    good = (gradient.blocked == FREE) & ~avoided_cells(gradient, settings, candidate.failed)
-    room = gradient.made_of.now.room(candidate.room_from)
-    tight = good & (room < settings.room) & (gradient.robustness > target.robustness)
-    if not tight.any():
-        return None
-    place = np.unravel_index(int(np.argmax(np.where(tight, gradient.robustness, -np.inf))), tight.shape)
-    return RoomCost(float(gradient.robustness[place]), float(room[place]))

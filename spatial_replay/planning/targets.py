@@ -9,14 +9,14 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, radius_of
 from spatial_replay.monitor.atoms.terms import seam_texts
-from spatial_replay.planning.decisions import Target, points_along
+from spatial_replay.planning.decisions import Candidate, Target, points_along
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
@@ -483,3 +483,24 @@ def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
         newest = np.maximum(ahead + rate * (missing - gram @ ahead), 0.0)
         weights, ahead = newest, newest + number / (number + 3.0) * (newest - weights)
     return np.asarray(point + normals.T @ weights)
+
+
+class RoomCost(NamedTuple):
+    """Cost of the room around a target: the robustness possible with less, and the room there."""
+
+    robustness: float
+    room: float
+
+
+def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomCost | None:
+    """Return what the room around a target costs; None if no more robustness was possible with less."""
+    gradient = candidate.map
+    if settings.skill != "place" or settings.room <= 0.0:
+        return None
+    good = (gradient.blocked == FREE) & ~avoided_cells(gradient, settings, candidate.failed)
+    room = gradient.made_of.now.room(candidate.room_from)
+    tight = good & (room < settings.room) & (gradient.robustness > target.robustness)
+    if not tight.any():
+        return None
+    place = np.unravel_index(int(np.argmax(np.where(tight, gradient.robustness, -np.inf))), tight.shape)
+    return RoomCost(float(gradient.robustness[place]), float(room[place]))
