@@ -12,7 +12,7 @@ from enum import Enum, auto
 from functools import partial
 from queue import SimpleQueue
 from threading import Condition, Lock
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -39,9 +39,6 @@ from spatial_replay.logs.messages import (
     messages_of,
 )
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
-
-if TYPE_CHECKING:
-    from spatial_replay.serve.server import LiveServer
 
 MOST_LATE_S: Final = 0.15
 """The most time that passes between two turns; viewers can take what is played in that time at once."""
@@ -651,10 +648,38 @@ _MOST_SAMPLES: Final = 4_096
 """The most samples of one turn, so that a slow log does not block other requests."""
 
 
+class Viewers(Protocol):
+    """The viewers of a playback, all at once."""
+
+    def wants(self, topic: str) -> bool:
+        """Return whether any of them has subscribed to a topic."""
+
+    def publish(self, messages: Messages) -> None:
+        """Send messages to all."""
+
+    def send_time(self, time_ns: int) -> None:
+        """Send the time of the log."""
+
+    def send_state(self, state: PlaybackState) -> None:
+        """Send the state of the playback."""
+
+    def send_playback(self) -> None:
+        """Send the parameters of the playback."""
+
+    def send_values(self, values: Values) -> None:
+        """Send the values of constants."""
+
+    def send_note(self, note: Note) -> None:
+        """Show a note until it is removed."""
+
+    def remove_note(self, about: str) -> None:
+        """Remove the note on a subject."""
+
+
 class Player:
     """All the work of a session, on one thread: a playback needs no locks."""
 
-    def __init__(self, playback: Playback, session: Session, viewers: LiveServer) -> None:
+    def __init__(self, playback: Playback, session: Session, viewers: Viewers) -> None:
         self._playback = playback
         self._session = session
         self._viewers = viewers
