@@ -57,11 +57,11 @@ from spatial_replay.trace.trace import (
     FOREVER,
     Sample,
     Trace,
+    checked_units,
     duration_ns_from_text,
     require_sample,
     require_time,
 )
-from spatial_replay.trace.units import checked_units
 
 _MOST_KNOWN: Final = 1000
 """Names that a missing one is compared with, of each kind."""

@@ -57,8 +57,8 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted_from, listed, named_arguments, times_apart
 from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
-from spatial_replay.trace.trace import LATEST_NS, Sample, Trace, require_sample
-from spatial_replay.trace.units import Axes, checked_units
+from spatial_replay.trace.trace import LATEST_NS, Sample, Trace, checked_units, require_sample
+from spatial_replay.trace.units import Axes
 
 if TYPE_CHECKING:
     from spatial_replay.planning.decision_log import BlackBox

@@ -29,12 +29,12 @@ from spatial_replay.text import (
     counted,
     is_encodable,
     named_arguments,
+    names_from_unit,
     text_number,
     times_apart,
 )
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.spans import TopicSpan, join_spans
-from spatial_replay.trace.units import checked_units
 
 LATEST_NS = 2**63 - 1
 """The latest time of a sample."""
@@ -683,6 +683,29 @@ def _reported_of_samples(
         "reported_ns": objects[:, : len(names)] if columns.keys() & set(names) else None,
         "signals_reported_ns": {name: columns[name] for name in signals if name in columns},
     }
+
+
+_LONGEST_UNIT = 64
+"""Characters of a unit."""
+
+
+def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
+    """Return units that a caller declares, in the order of their names; none for None.
+
+    Raises:
+        UsageError: something else than short texts by names.
+    """
+    if units is None:
+        return {}
+    if not isinstance(units, Mapping) or not all(isinstance(name, str) for name in units):
+        remedy = 'give them by the names of signals, and that of lengths by "": {"": "m"}'
+        raise UsageError(f"units are {shortened(units)}; {remedy}")
+    for name, unit in units.items():
+        is_text = isinstance(unit, str) and is_encodable(unit)
+        if not is_text or not (0 < len(unit) <= _LONGEST_UNIT or names_from_unit(unit)):
+            what = f"of signal {name!r}" if name else "of lengths"
+            raise UsageError(f"the unit {what} is {shortened(unit)}; give a short text, such as 'm'")
+    return dict(sorted(units.items()))
 
 
 def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]:

@@ -9,18 +9,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from reprlib import repr as shortened
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.text import is_encodable, names_from_unit
-
-if TYPE_CHECKING:
-    from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
 """The entry of a log's metadata that says what the axes of its source were."""
@@ -115,28 +111,6 @@ class Axes:
 
 OUR_AXES = Axes()
 """Axes of samples: y up."""
-
-
-_LONGEST_UNIT = 64
-
-
-def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Return units that a caller declares, in the order of their names; none for None.
-
-    Raises:
-        UsageError: something else than short texts by names.
-    """
-    if units is None:
-        return {}
-    if not isinstance(units, Mapping) or not all(isinstance(name, str) for name in units):
-        remedy = 'give them by the names of signals, and that of lengths by "": {"": "m"}'
-        raise UsageError(f"units are {shortened(units)}; {remedy}")
-    for name, unit in units.items():
-        is_text = isinstance(unit, str) and is_encodable(unit)
-        if not is_text or not (0 < len(unit) <= _LONGEST_UNIT or names_from_unit(unit)):
-            what = f"of signal {name!r}" if name else "of lengths"
-            raise UsageError(f"the unit {what} is {shortened(unit)}; give a short text, such as 'm'")
-    return dict(sorted(units.items()))
 
 
 OTHER_UNITS: Final = 8.0
