@@ -16,7 +16,7 @@ from lark import Token
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.spec.checks import with_numbers
-from spatial_replay.spec.diagnostics import Faults, SourceText
+from spatial_replay.spec.diagnostics import Faults, SourceText, Span
 from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
@@ -28,7 +28,6 @@ from spatial_replay.spec.formula import (
     Outline,
     Quantified,
     RegionName,
-    Span,
     Specification,
     Temporal,
     Truth,

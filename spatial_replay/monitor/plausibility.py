@@ -13,7 +13,7 @@ import numpy as np
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene, look_back, tail
 from spatial_replay.monitor.witness.evidence import NamedPart, is_missing, named_parts
-from spatial_replay.spec.diagnostics import Diagnostic, SourceText
+from spatial_replay.spec.diagnostics import Diagnostic, SourceText, Span
 from spatial_replay.spec.format import format_bound, format_number, format_term
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -29,7 +29,6 @@ from spatial_replay.spec.formula import (
     Quantified,
     Signal,
     SignedDistance,
-    Span,
     Specification,
     Temporal,
     Term,

@@ -27,7 +27,7 @@ from spatial_replay.sanity.shortest_words import (
     loosen,
     reading_of,
 )
-from spatial_replay.spec.diagnostics import Diagnostic, SourceText
+from spatial_replay.spec.diagnostics import Diagnostic, SourceText, Span
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
@@ -35,7 +35,6 @@ from spatial_replay.spec.formula import (
     Formula,
     NamedSpec,
     Quantified,
-    Span,
     Specification,
     Temporal,
     iter_nodes,

@@ -10,7 +10,7 @@ from typing import Final
 
 from lark import Token
 
-from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
+from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, Span, nearest_hint
 from spatial_replay.spec.format import format_relation
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -23,7 +23,6 @@ from spatial_replay.spec.formula import (
     NamedSpec,
     Negative,
     Quantified,
-    Span,
     Specification,
     Temporal,
     Term,

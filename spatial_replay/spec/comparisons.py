@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from spatial_replay.spec.constants import names_in
+from spatial_replay.spec.diagnostics import Span
 from spatial_replay.spec.formula import (
     ComputedSignal,
     Equality,
@@ -24,7 +25,6 @@ from spatial_replay.spec.formula import (
     Scaled,
     Signal,
     SignedDistance,
-    Span,
     Sum,
     Term,
     TrackedName,

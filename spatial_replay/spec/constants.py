@@ -10,9 +10,9 @@ from fractions import Fraction
 from typing import TypeAlias
 
 from spatial_replay.errors import UsageError
-from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.diagnostics import Span, nearest_hint
 from spatial_replay.spec.format import format_duration, format_number
-from spatial_replay.spec.formula import Constant, NamedNumber, Span
+from spatial_replay.spec.formula import Constant, NamedNumber
 from spatial_replay.spec.parser import MAX_DURATION_NS, StatementError, read_number
 from spatial_replay.spec.syntax import Arithmetic, ConstStatement, Duration, Name, NumberSyntax, Quantity
 

@@ -6,10 +6,9 @@ import re
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from spatial_replay.errors import SpecificationError
-from spatial_replay.spec.formula import Span
 from spatial_replay.text import escaped
 from spatial_replay.text import nearest_hint as nearest_hint
 
@@ -19,6 +18,13 @@ MAX_FAULTS = 100
 _MAX_SUGGESTION_EFFORT = 10_000
 """Names compared for hints in one text; a text with a fault in every line would compare millions."""
 _LINE_END = re.compile(r"\r\n|\r|\n")
+
+
+class Span(NamedTuple):
+    """A place in a source text: characters `start` up to, not including, `end`."""
+
+    start: int
+    end: int
 
 
 @dataclass(frozen=True, slots=True)

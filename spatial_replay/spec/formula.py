@@ -15,13 +15,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self, TypeAlias
+from typing import Final, Literal, Self, TypeAlias
 
 from spatial_replay.lazy import Displayed
-
-if TYPE_CHECKING:
-    from spatial_replay.spec.diagnostics import Diagnostic
-
+from spatial_replay.spec.diagnostics import Diagnostic, Span
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 Side: TypeAlias = Literal["min", "max"]
@@ -364,13 +361,6 @@ def maximum(*operands: Expression | float) -> Maximum:
 
 
 # ------------------------------------------------------------------------------------------- formulas
-
-
-class Span(NamedTuple):
-    """A place in a source text: characters `start` up to, not including, `end`."""
-
-    start: int
-    end: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from spatial_replay.spec.checks import (
 )
 from spatial_replay.spec.comparisons import ComparisonBuilder
 from spatial_replay.spec.constants import replaced
-from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
+from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, Span, nearest_hint
 from spatial_replay.spec.format import format_atom, format_duration, format_number, title_text
 from spatial_replay.spec.formula import (
     Atom,
@@ -46,7 +46,6 @@ from spatial_replay.spec.formula import (
     NamedSpec,
     Quantified,
     RegionName,
-    Span,
     Specification,
     Temporal,
     Term,

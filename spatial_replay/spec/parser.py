@@ -19,8 +19,7 @@ from lark import Lark, Token
 from lark.exceptions import UnexpectedToken
 from lark.lexer import Lexer
 
-from spatial_replay.spec.diagnostics import Faults, nearest_hint
-from spatial_replay.spec.formula import Span
+from spatial_replay.spec.diagnostics import Faults, Span, nearest_hint
 from spatial_replay.spec.syntax import (
     Arithmetic,
     BooleanSyntax,

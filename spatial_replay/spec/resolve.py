@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from spatial_replay.spec.constants import constant_of, names_in, range_fault, value_of
-from spatial_replay.spec.diagnostics import Faults
+from spatial_replay.spec.diagnostics import Faults, Span
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -22,7 +22,6 @@ from spatial_replay.spec.formula import (
     Outline,
     RegionName,
     Scale,
-    Span,
     Term,
     TrackedName,
     Variable,

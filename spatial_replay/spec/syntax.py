@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from lark import Token
 
-from spatial_replay.spec.formula import Span
+from spatial_replay.spec.diagnostics import Span
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,7 @@ from types import MappingProxyType
 
 from lark import Token
 
-from spatial_replay.spec.diagnostics import Faults
-from spatial_replay.spec.formula import Span
+from spatial_replay.spec.diagnostics import Faults, Span
 
 _PREFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {

@@ -8,6 +8,7 @@ from spatial_replay import Specification
 from spatial_replay.annotate.specification import ReportedTree, encode_specification, unit_of
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.spec import format_specification
+from spatial_replay.spec.diagnostics import Span
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -18,7 +19,6 @@ from spatial_replay.spec.formula import (
     Quantified,
     Signal,
     SignedDistance,
-    Span,
     Temporal,
     TrackedName,
     Truth,
