@@ -62,7 +62,7 @@ class Operand:
 class MeasureRequest:
     """One quantity of one operand, or between two (indices into the operands)."""
 
-    quantity: Quantity
+    quantity: str
     first: int
     second: int = -1
 

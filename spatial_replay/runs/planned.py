@@ -35,7 +35,7 @@ from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop, default_specification, make_world
 from spatial_replay.simulation.world import Conditions
 from spatial_replay.spec import parse_specification
-from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
+from spatial_replay.spec.formula import Atom, Formula, Measurement, Specification
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas
 from spatial_replay.trace.trace import Sample
 
@@ -95,9 +95,8 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
     """
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
     parts = [part for atom in atoms for part in iter_expressions(atom.expression)]
-    compared = [
-        term for part in parts if isinstance(part, Misalignment) for term in (part.first, part.second)
-    ]
+    measurements = [part for part in parts if isinstance(part, Measurement) and part.needs_orientation]
+    compared = [term for measurement in measurements for term in measurement.terms]
     tracked = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared]
     present_yaws = [thing.yaw for thing in tracked if thing is not None and thing.yaw is not None]
     yaws: list[float] = []

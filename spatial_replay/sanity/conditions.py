@@ -59,7 +59,6 @@ from spatial_replay.spec.walks import (
     is_about_having_rates,
     iter_expressions,
     iter_formulas,
-    measured_terms,
     named_members,
     standing,
     terms_of,
@@ -174,13 +173,13 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
     """Return a measurement of unions as the least or greatest of measurements of their members."""
     kind: Literal["min", "max"]
     parts: list[Measurement]
-    if all(isinstance(without_radius(plain(term)), RegionName) for term in measured_terms(measurement)):
+    if all(isinstance(without_radius(plain(term)), RegionName) for term in measurement.terms):
         return _of_regions(measurement, regions)
     match measurement:
         case SignedDistance() | Misalignment():
-            kind, of = "min", type(measurement)
-            pairs = product(members(measurement.first), members(measurement.second))
-            parts = [of(*sorted(pair, key=repr)) for pair in pairs]
+            kind = "min"
+            pairs = product(*map(members, measurement.terms))
+            parts = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
         case Protrusion():
             # an outer union stays whole: its members may hold different parts of the inner term
             kind, outer = "max", plain(measurement.outer)
@@ -192,6 +191,8 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
             kind, axis = measurement.side, measurement.axis
             terms = map(without_radius, members(measurement.term))
             parts = [CentroidProjection(term, axis, kind) for term in terms]
+        case _:
+            return Linear(((measurement, Fraction(1)),))
     return _least_or_greatest(kind, tuple(_shift(part, regions) for part in parts))
 
 
@@ -312,12 +313,7 @@ def is_solid(term: Term) -> bool:
 
 def terms_in(quantities: Iterable[Quantity]) -> list[Term]:
     """Return the terms that quantities measure, each once, without enlargements."""
-    terms = (
-        term
-        for quantity in quantities
-        if not isinstance(quantity, Signal)
-        for term in measured_terms(quantity)
-    )
+    terms = (term for quantity in quantities if isinstance(quantity, Measurement) for term in quantity.terms)
     return list(dict.fromkeys(without_radius(term) for term in terms))
 
 

@@ -37,6 +37,7 @@ from spatial_replay.spec.formula import (
     CentroidProjection,
     Earlier,
     Formula,
+    Measurement,
     Misalignment,
     NamedSpec,
     Outline,
@@ -50,7 +51,7 @@ from spatial_replay.spec.formula import (
     Term,
     TrackedName,
 )
-from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, measured_terms, terms_of
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
 from spatial_replay.trace.trace import Sample, Trace
 
 # ------------------------------------------------------------------------------------------- regions as boxes
@@ -644,8 +645,8 @@ def _atoms(spec: NamedSpec) -> list[Atom]:
 def _turned_names(atoms: Iterable[Atom]) -> list[str]:
     """Return the objects whose orientations are compared."""
     parts = (part for atom in atoms for part in iter_expressions(atom.expression))
-    terms = (term for part in parts if isinstance(part, Misalignment) for term in measured_terms(part))
-    bases = map(base_of, terms)
+    measurements = (part for part in parts if isinstance(part, Measurement) and part.needs_orientation)
+    bases = (base_of(term) for measurement in measurements for term in measurement.terms)
     return [base.name for base in bases if isinstance(base, TrackedName)]
 
 

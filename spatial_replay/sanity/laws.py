@@ -34,7 +34,6 @@ from spatial_replay.spec.formula import (
     SignedDistance,
     Term,
 )
-from spatial_replay.spec.walks import measured_terms
 
 LEVEL: Final = -1
 """The label of laws about objects without a gap in height; labels of facts are at least 0."""
@@ -57,9 +56,7 @@ def laws(
     used = list(dict.fromkeys(quantities))
     present = set(terms_in(used))
     between = {
-        measurement: value
-        for measurement, value in between.items()
-        if present.issuperset(measured_terms(measurement))
+        measurement: value for measurement, value in between.items() if present.issuperset(measurement.terms)
     }
     used += [measurement for measurement in between if measurement not in used]
     terms = [term for term in terms_in(used) if is_solid(term)]

@@ -12,10 +12,11 @@ Three layers, each built of the one before:
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final, Literal, Self, TypeAlias
+from typing import ClassVar, Final, Literal, Self, TypeAlias
 
 from spatial_replay.lazy import Displayed
 from spatial_replay.spec.diagnostics import Diagnostic, Span
@@ -161,17 +162,79 @@ class Number(_Arithmetic):
     value: float
 
 
+class Measurement(_Arithmetic):
+    """A number that geometry computes of one or two terms.
+
+    A group is the union of its members: the measurement is that of the members that `extrema` picks.
+
+    Attributes:
+        unit: of its number.
+        needs_orientation: whether it compares the orientations of single objects, not footprints.
+    """
+
+    __slots__ = ()
+    unit: ClassVar[Literal["length", "orientation"]] = "length"
+    needs_orientation: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def quantity(self) -> str:
+        """Its name in explanations; if it measures footprints, a `Quantity` of `geometry.measure`, too."""
+
+    @property
+    @abstractmethod
+    def terms(self) -> tuple[Term, ...]:
+        """The one or two terms that it measures."""
+
+    @abstractmethod
+    def with_terms(self, *terms: Term) -> Self:
+        """Return the same measurement of other terms, as many as in `terms`."""
+
+    @property
+    @abstractmethod
+    def extrema(self) -> tuple[Side, ...]:
+        """Which member of a group decides, for each term; that of the first one is picked last."""
+
+    @property
+    def radius_effects(self) -> tuple[int, ...]:
+        """How much the number grows with the radius by which each term is enlarged: 1, 0 or -1."""
+        return (0,) * len(self.terms)
+
+
 @dataclass(frozen=True, slots=True)
-class _OfTwo(_Arithmetic):
+class _OfTwo(Measurement):
     first: Term
     second: Term
 
+    @property
+    def terms(self) -> tuple[Term, Term]:
+        return self.first, self.second
+
+    def with_terms(self, *terms: Term) -> Self:
+        return type(self)(*terms)
+
+    @property
+    def extrema(self) -> tuple[Side, Side]:
+        return "min", "min"
+
 
 @dataclass(frozen=True, slots=True)
-class _AlongAxis(_Arithmetic):
+class _AlongAxis(Measurement):
     term: Term
     axis: Axis
     side: Side
+
+    @property
+    def terms(self) -> tuple[Term]:
+        return (self.term,)
+
+    def with_terms(self, *terms: Term) -> Self:
+        (term,) = terms
+        return type(self)(term, self.axis, self.side)
+
+    @property
+    def extrema(self) -> tuple[Side]:
+        return (self.side,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,14 +246,26 @@ class SignedDistance(_OfTwo):
     """Distance of two footprints when apart, minus their penetration depth when not (Def. 2-4)."""
 
     __slots__ = ()
+    quantity = "signed_distance"
+    radius_effects = (-1, -1)
 
 
 @dataclass(frozen=True, slots=True)
-class Protrusion(_Arithmetic):
+class Protrusion(Measurement):
     """How far `inner` sticks out: max over hull(inner) of the signed distance to outer (Prop. 2)."""
 
     inner: Term
     outer: Term
+    quantity = "protrusion"
+    extrema = ("max", "min")
+    radius_effects = (1, -1)
+
+    @property
+    def terms(self) -> tuple[Term, Term]:
+        return self.inner, self.outer
+
+    def with_terms(self, *terms: Term) -> Self:
+        return type(self)(*terms)
 
 
 class Projection(_AlongAxis):
@@ -198,17 +273,33 @@ class Projection(_AlongAxis):
 
     __slots__ = ()
 
+    @property
+    def quantity(self) -> str:
+        return f"{self.side}_{self.axis}"
+
+    @property
+    def radius_effects(self) -> tuple[int]:
+        # a disc in the plane leaves heights
+        return (0 if self.axis == "z" else 1 if self.side == "max" else -1,)
+
 
 class CentroidProjection(_AlongAxis):
     """Least or greatest coordinate, along x or y, of the centroids of a footprint's parts."""
 
     __slots__ = ()
 
+    @property
+    def quantity(self) -> str:
+        return f"centroid_{self.side}_{self.axis}"
+
 
 class Misalignment(_OfTwo):
     """Half the squared distance of two unit orientation vectors, 1 - cos of their angle (Def. 10)."""
 
     __slots__ = ()
+    quantity = "misalignment"
+    unit = "orientation"
+    needs_orientation = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,9 +419,6 @@ class Scaled(_Arithmetic):
     operand: Expression
     divisor: float
 
-
-Measurement: TypeAlias = SignedDistance | Protrusion | Projection | CentroidProjection | Misalignment
-"""An expression that geometry answers."""
 
 Expression: TypeAlias = (
     Number | Measurement | Signal | Equality | Sum | Negative | Minimum | Maximum | Product | Scaled

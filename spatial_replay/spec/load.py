@@ -42,7 +42,7 @@ from spatial_replay.spec.formula import (
     Expression,
     Formula,
     Group,
-    Misalignment,
+    Measurement,
     NamedSpec,
     Quantified,
     RegionName,
@@ -231,8 +231,8 @@ class AtomBuilder:
     def _check(self, expression: Expression, written: RelationSyntax, scope: Scope) -> None:
         """Refuse orientations of what has none, and discs of negative radius."""
         for part in iter_expressions(expression):
-            if isinstance(part, Misalignment):
-                for term in (part.first, part.second):
+            if isinstance(part, Measurement) and part.needs_orientation:
+                for term in part.terms:
                     self._check_orientation(term, written, scope)
         for term in terms_of(expression):
             if isinstance(term, Enlarged) and term.radius < 0.0:

@@ -15,7 +15,6 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Centre,
-    CentroidProjection,
     ComputedSignal,
     DerivedTerm,
     Earlier,
@@ -28,14 +27,11 @@ from spatial_replay.spec.formula import (
     Maximum,
     Measurement,
     Minimum,
-    Misalignment,
     Negative,
     Number,
     Present,
     PreviousSignal,
     Product,
-    Projection,
-    Protrusion,
     Quantified,
     Rate,
     RegionName,
@@ -103,24 +99,13 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
                 stack += reversed(current.operands)
 
 
-def measured_terms(measurement: Measurement | Rate) -> tuple[Term, ...]:
-    """Return the one or two terms that a measurement is of; of a rate, those of both samples."""
-    match measurement:
-        case Rate():
-            return tuple(terms_of(change_of(measurement)))
-        case SignedDistance() | Misalignment():
-            return measurement.first, measurement.second
-        case Protrusion():
-            return measurement.inner, measurement.outer
-        case Projection() | CentroidProjection():
-            return (measurement.term,)
-
-
 def terms_of(expression: Expression) -> Iterator[Term]:
-    """Yield the terms that an expression measures."""
-    for current in iter_expressions(expression):
-        if isinstance(current, Measurement | Rate):
-            yield from measured_terms(current)
+    """Yield the terms that an expression measures; of a rate, those of both samples."""
+    for part in iter_expressions(expression):
+        if isinstance(part, Measurement):
+            yield from part.terms
+        elif isinstance(part, Rate):
+            yield from terms_of(change_of(part))
 
 
 def speed_of(*terms: Term) -> Rate:
@@ -452,21 +437,6 @@ def _object(term: TrackedName | Variable, names: Names) -> TrackedName | Variabl
     return names.get(term.name, term) if isinstance(term, Variable) else term
 
 
-def map_terms(measurement: Measurement, change: Callable[[Term], Term]) -> Measurement:
-    """Return a measurement of other terms."""
-    match measurement:
-        case SignedDistance():
-            return SignedDistance(change(measurement.first), change(measurement.second))
-        case Misalignment():
-            return Misalignment(change(measurement.first), change(measurement.second))
-        case Protrusion():
-            return Protrusion(change(measurement.inner), change(measurement.outer))
-        case Projection():
-            return Projection(change(measurement.term), measurement.axis, measurement.side)
-        case CentroidProjection():
-            return CentroidProjection(change(measurement.term), measurement.axis, measurement.side)
-
-
 def map_leaves(
     expression: Expression, change: Callable[[Number | Signal | Measurement], Expression]
 ) -> Expression:
@@ -500,7 +470,7 @@ def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], T
     if isinstance(leaf, Present):
         term: Any = change(leaf.term)
         return presence_of(term).signal
-    return leaf if isinstance(leaf, Number | Signal) else map_terms(leaf, change)
+    return leaf if isinstance(leaf, Number | Signal) else leaf.with_terms(*map(change, leaf.terms))
 
 
 LENGTHS = "lengths"
@@ -624,7 +594,7 @@ def _unit_of(leaf: Signal | Measurement, divisor: float | None) -> Unit:
             return Unit("rate", leaf.signal.name if leaf.signal else None, divisor)
         case Signal():
             return Unit("signal", leaf.name, divisor)
-        case Misalignment():
+        case Measurement(unit="orientation"):
             return Unit("orientation")
     return Unit("length", None, divisor)
 

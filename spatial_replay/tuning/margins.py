@@ -37,11 +37,8 @@ from spatial_replay.spec.formula import (
     Number,
     Outline,
     Product,
-    Projection,
-    Protrusion,
     Quantified,
     Scaled,
-    SignedDistance,
     Specification,
     Sum,
     Temporal,
@@ -327,7 +324,11 @@ def _common(directions: Iterable[Direction | None]) -> Direction | None:
 
 
 def _opposite(direction: Direction | None) -> Direction | None:
-    return None if direction is None else -direction
+    return _times(direction, -1)
+
+
+def _times(direction: Direction | None, sign: int) -> Direction | None:
+    return None if direction is None else _sign(direction * sign)
 
 
 def _sign(difference: float) -> Direction:
@@ -391,14 +392,9 @@ def _of_expression(before: Expression, after: Expression) -> Direction | None:
             return _common(map(_of_expression, old.operands, new.operands))
         case Maximum() as old, Maximum() as new if len(old.operands) == len(new.operands):
             return _common(map(_of_expression, old.operands, new.operands))
-        case SignedDistance() as old, SignedDistance() as new:
-            grown = [_of_term(old.first, new.first), _of_term(old.second, new.second)]
-            return _opposite(_common(grown))
-        case Protrusion() as old, Protrusion() as new:
-            return _common([_of_term(old.inner, new.inner), _opposite(_of_term(old.outer, new.outer))])
-        case Projection() as old, Projection() as new if (old.side, old.axis) == (new.side, new.axis):
-            grew = _of_term(old.term, new.term)
-            return grew if old.side == "max" else _opposite(grew)
+        case Measurement() as old, Measurement() as new if old.quantity == new.quantity:
+            changes = zip(old.radius_effects, map(_of_term, old.terms, new.terms), strict=True)
+            return _common([_times(change, effect) for effect, change in changes])
     return None
 
 

@@ -58,7 +58,6 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import (
     change_of,
     map_leaves,
-    map_terms,
     presence_of,
     step_of,
     substitute_term,
@@ -407,7 +406,7 @@ class LeafCode:
                 for other in others:
                     row = self._row(op, row, other)
                 return row
-        measurement = map_terms(expression, lambda term: substitute_term(term, bindings))
+        measurement = expression.with_terms(*(substitute_term(term, bindings) for term in expression.terms))
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
     def _current(self, rate: Rate, bindings: Bindings) -> int:

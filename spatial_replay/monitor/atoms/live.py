@@ -38,7 +38,6 @@ from spatial_replay.geometry.footprint import (
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import QUANTITY_CODES, closest_rows, misalignment_of
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
-from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.reports import RecentReports, left_out_of
 from spatial_replay.monitor.atoms.terms import (
     NO_DELAY,
@@ -57,7 +56,6 @@ from spatial_replay.spec.formula import (
     Enlarged,
     Formula,
     Group,
-    Misalignment,
     Outline,
     Present,
     PreviousSignal,
@@ -74,7 +72,6 @@ from spatial_replay.spec.walks import (
     base_of,
     is_centre,
     iter_terms,
-    measured_terms,
     named_members,
     rates_of,
     standing,
@@ -841,20 +838,24 @@ _NOT_THERE, _HIDDEN = (Struct("=5d").pack(parts, nan, nan, nan, 0.0) for parts i
 def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
     measurements = list(code.measurements)
     operands: dict[Term, int] = {}
-    geometric = [k for k, each in enumerate(measurements) if not isinstance(each, Misalignment)]
+    geometric = [
+        number for number, measurement in enumerate(measurements) if not measurement.needs_orientation
+    ]
     pairs = [
-        [operands.setdefault(term, len(operands)) for term in measured_terms(measurements[k])]
-        for k in geometric
+        [operands.setdefault(term, len(operands)) for term in measurements[number].terms]
+        for number in geometric
     ]
     yaws = [
-        [k, *(rows.of_term(term)[0].row for term in measured_terms(each))]
-        for k, each in enumerate(measurements)
-        if isinstance(each, Misalignment)
+        [number, *(rows.of_term(term)[0].row for term in measurement.terms)]
+        for number, measurement in enumerate(measurements)
+        if measurement.needs_orientation
     ]
     listed = [rows.of_term(term) for term in operands]
     listed += [rows.of_term(each.group) for each in code.closest]
     listed += [rows.of_membership(each) for each in code.members]
-    listed += [[row for term in measured_terms(each) for row in rows.required(term)] for each in measurements]
+    listed += [
+        [row for term in measurement.terms for row in rows.required(term)] for measurement in measurements
+    ]
     regions = FootprintBatch.from_footprints(
         [each.footprint for each in frame.regions.values()], [each.height for each in frame.regions.values()]
     )
@@ -878,7 +879,7 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         listed_classes=_whole(each.class_code for among in listed for each in among),
         enlargement=np.array([_enlargement(term) for term in operands], np.float64),
         geometric=_whole(geometric),
-        quantity=_whole(QUANTITY_CODES[quantity_of(measurements[k])] for k in geometric),
+        quantity=_whole(QUANTITY_CODES[measurements[number].quantity] for number in geometric),
         first=_whole(pair[0] for pair in pairs),
         second=_whole(pair[1] if len(pair) > 1 else ABSENT for pair in pairs),
         yaws=np.array(yaws, np.int64).reshape(len(yaws), 3),

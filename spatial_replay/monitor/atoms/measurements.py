@@ -14,7 +14,6 @@ from spatial_replay.geometry.arrays import Flags, Floats
 from spatial_replay.geometry.measure import (
     MeasureRequest,
     Operand,
-    Quantity,
     closest_pairs,
     measure,
     misalignment,
@@ -23,18 +22,13 @@ from spatial_replay.monitor.atoms.instructions import ClosestPair, LeafCode, Mem
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.spec.formula import (
     Centre,
-    CentroidProjection,
     Enlarged,
     Formula,
     Measurement,
-    Misalignment,
-    Projection,
-    Protrusion,
     RegionName,
-    SignedDistance,
     Term,
 )
-from spatial_replay.spec.walks import base_of, map_terms, measured_terms
+from spatial_replay.spec.walks import base_of
 from spatial_replay.text import TEXTS
 from spatial_replay.trace.trace import ABSENT
 
@@ -82,19 +76,19 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
         return numbers[term]
 
     requests = [
-        MeasureRequest(quantity_of(each), *(operand(term) for term in measured_terms(each)))
-        for each in measurements
-        if not isinstance(each, Misalignment)
+        MeasureRequest(measurement.quantity, *map(operand, measurement.terms))
+        for measurement in measurements
+        if not measurement.needs_orientation
     ]
     values = iter(measure(scene.batch, operands, requests) if requests else ())
     result = []
-    for each in measurements:
-        found = [scene.resolve(term) for term in measured_terms(each)]
-        if isinstance(each, Misalignment):
-            value, spread = misalignment(*(one.yaw for one in found)), np.zeros(len(scene))
+    for measurement in measurements:
+        resolved_terms = [scene.resolve(term) for term in measurement.terms]
+        if measurement.needs_orientation:
+            value, spread = misalignment(*(term.yaw for term in resolved_terms)), np.zeros(len(scene))
         else:
-            value, spread = next(values), reduce(np.add, [one.spread for one in found])
-        unknown = reduce(np.logical_or, [one.unknown for one in found])
+            value, spread = next(values), reduce(np.add, [term.spread for term in resolved_terms])
+        unknown = reduce(np.logical_or, [term.unknown for term in resolved_terms])
         if unknown.any():
             value = np.where(unknown, np.nan, value)
         array = np.array([value] if scene.is_sure else [value, spread])
@@ -103,30 +97,12 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     return result
 
 
-def quantity_of(measurement: Measurement) -> Quantity:
-    match measurement:
-        case SignedDistance():
-            return "signed_distance"
-        case Protrusion():
-            return "protrusion"
-        case Projection():
-            return f"{measurement.side}_{measurement.axis}"  # type: ignore[return-value]
-        case CentroidProjection():
-            return f"centroid_{measurement.side}_{measurement.axis}"  # type: ignore[return-value]
-        case Misalignment():
-            raise TypeError("an orientation is no quantity of footprints")
-
-
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     """Return the cache key of a measurement: independent of its specification, with regions by shape."""
-    shapes = tuple(
-        scene.regions[name] for name in map(_region, measured_terms(measurement)) if name is not None
-    )
+    shapes = tuple(scene.regions[name] for name in map(_region, measurement.terms) if name is not None)
     if not shapes:
         return scene.skip, measurement
-    if isinstance(measurement, Misalignment | Projection | CentroidProjection):
-        return scene.skip, measurement, shapes
-    return scene.skip, map_terms(measurement, _unnamed), shapes
+    return scene.skip, measurement.with_terms(*map(_unnamed, measurement.terms)), shapes
 
 
 def _region(term: Term) -> str | None:

@@ -19,7 +19,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import Contact, candidate_pairs, contact, enlarged, protrusion_contact
 from spatial_replay.monitor.atoms.instructions import closest_pair_of
-from spatial_replay.monitor.atoms.measurements import leaf_values, measured, quantity_of
+from spatial_replay.monitor.atoms.measurements import leaf_values, measured
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.monitor.offline import OfflineNodes, is_closed, windows_of
 from spatial_replay.monitor.online.codes import low_and_high
@@ -29,7 +29,6 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     BooleanOperator,
-    CentroidProjection,
     DerivedTerm,
     Earlier,
     Equality,
@@ -39,7 +38,6 @@ from spatial_replay.spec.formula import (
     Maximum,
     Measurement,
     Minimum,
-    Misalignment,
     Negative,
     Number,
     Present,
@@ -64,7 +62,6 @@ from spatial_replay.spec.walks import (
     base_of,
     iter_expressions,
     logged_signals,
-    measured_terms,
     named_members,
     standing,
     substitute,
@@ -447,7 +444,7 @@ def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterato
     resolved = scene.resolve(term)
     if resolved.unknown[0]:
         yield from _missing(scene, term)
-    elif isinstance(part, Misalignment) and np.isnan(resolved.yaw[0]):
+    elif isinstance(part, Measurement) and part.needs_orientation and np.isnan(resolved.yaw[0]):
         yield f"{format_term(term)} has no orientation"
     elif isinstance(part, Projection) and part.axis == "z":
         rows = resolved.operand.rows[0]
@@ -683,34 +680,27 @@ def _measured(scene: TraceScene, part: Expression) -> Measured:
             return Measured("present", (part.term.name,), float(scene.signal(part)[0]))
         case Signal():
             return Measured("signal", (part.name,), float(scene.signal(part)[0]))
-        case Misalignment():
-            single: Measurement = part
-        case SignedDistance():
-            pairs = product(_singles(scene, part.first), _singles(scene, part.second))
-            single = _attaining(np.argmin, scene, (SignedDistance(*pair) for pair in pairs))
-        case Protrusion():
-            inners = [
-                _attaining(
-                    np.argmin, scene, (Protrusion(inner, outer) for outer in _singles(scene, part.outer))
-                )
-                for inner in _singles(scene, part.inner)
-            ]
-            single = _attaining(np.argmax, scene, inners)
-        case Projection() | CentroidProjection():
-            projections = [replace(part, term=term) for term in _singles(scene, part.term)]
-            single = _attaining(np.argmin if part.side == "min" else np.argmax, scene, projections)
+        case Measurement():
+            single = _attaining(scene, part)
         case _:
             raise TypeError(f"{part!r} is no measurement")
     (value,), (spread,) = (column[:, 0].tolist() for column in measured(scene, [single]))
-    names = tuple(map(format_term, measured_terms(single)))
-    quantity = "misalignment" if isinstance(single, Misalignment) else quantity_of(single)
-    return Measured(quantity, names, value, spread, _contact(scene, single))
+    return Measured(
+        single.quantity, tuple(map(format_term, single.terms)), value, spread, _contact(scene, single)
+    )
 
 
-def _attaining(pick: Callable[[Floats], Any], scene: TraceScene, candidates: Iterable[Any]) -> Any:
-    """Return the measurement of some that has the least or greatest number (`np.argmin`, `np.argmax`)."""
-    measurements = list(candidates)
-    return measurements[int(pick(measured(scene, measurements)[0][:, 0]))]
+def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
+    """Return the measurement of the members of groups that decide it."""
+    singles = [_singles(scene, term) for term in part.terms]
+    candidates = [part.with_terms(*terms) for terms in product(*singles)]
+    values, places = measured(scene, candidates)[0][:, 0], np.arange(len(candidates))
+    for members, side in zip(reversed(singles), reversed(part.extrema), strict=True):
+        rows = values.reshape(-1, len(members))
+        columns = (np.argmin if side == "min" else np.argmax)(rows, axis=1)
+        row_numbers = np.arange(len(rows))
+        values, places = rows[row_numbers, columns], places.reshape(rows.shape)[row_numbers, columns]
+    return candidates[int(places[0])]
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:

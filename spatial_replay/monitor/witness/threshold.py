@@ -33,12 +33,9 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Product,
-    Projection,
-    Protrusion,
     Quantified,
     Scaled,
     Signal,
-    SignedDistance,
     Sum,
     Temporal,
     Term,
@@ -49,7 +46,6 @@ from spatial_replay.spec.walks import (
     iter_formulas,
     leaf_key,
     map_leaves,
-    map_terms,
     nodes_of,
     operand_signs,
     rewritten,
@@ -122,9 +118,8 @@ class Dial:
             match part:
                 case Number():
                     return Number(value) if self.is_at("number", part.value) else part
-                case SignedDistance() | Protrusion() | Projection():
-                    return map_terms(part, term)
-            # these take no radius: turning and centroids are the same for an enlarged term
+                case Measurement() if any(part.radius_effects):
+                    return part.with_terms(*map(term, part.terms))
             return part
 
         return map_leaves(expression, leaf)
@@ -147,12 +142,9 @@ class Dial:
                 return {slope / divisor for slope in self.slopes(operand)}
             case Minimum() | Maximum():
                 return {slope for operand in expression.operands for slope in self.slopes(operand)}
-            case SignedDistance():
-                return {-self._radii_in(expression.first) - self._radii_in(expression.second)}
-            case Protrusion():
-                return {self._radii_in(expression.inner) - self._radii_in(expression.outer)}
-            case Projection() if expression.axis != "z":
-                return {self._radii_in(expression.term) * (1 if expression.side == "max" else -1)}
+            case Measurement():
+                effects = zip(expression.radius_effects, expression.terms, strict=True)
+                return {sum(effect * self._radii_in(term) for effect, term in effects)}
         return {0}
 
     def _radii_in(self, term: Term) -> int:
@@ -161,14 +153,10 @@ class Dial:
 
 def _radii(expression: Expression) -> list[float]:
     """Return the radii that a measurement depends on, in the order written."""
-    match expression:
-        case SignedDistance():
-            return _radii_of(expression.first) + _radii_of(expression.second)
-        case Protrusion():
-            return _radii_of(expression.inner) + _radii_of(expression.outer)
-        case Projection() if expression.axis != "z":
-            return _radii_of(expression.term)
-    return []
+    if not isinstance(expression, Measurement):
+        return []
+    effects = zip(expression.radius_effects, expression.terms, strict=True)
+    return [radius for effect, term in effects if effect for radius in _radii_of(term)]
 
 
 def _radii_of(term: Term) -> list[float]:
@@ -565,9 +553,9 @@ def _with_enlarged(atom: Atom, place: int, radius: float) -> Atom:
     enlarged = Enlarged(atom.terms[place], radius)
 
     def leaf(part: Number | Signal | Measurement) -> Expression:
-        if isinstance(part, SignedDistance | Protrusion | Projection):
-            return map_terms(part, lambda term: enlarged if term == enlarged.term else term)
-        return part
+        if not isinstance(part, Measurement):
+            return part
+        return part.with_terms(*(enlarged if term == enlarged.term else term for term in part.terms))
 
     terms = (*atom.terms[:place], enlarged, *atom.terms[place + 1 :])
     return replace(atom, expression=map_leaves(atom.expression, leaf), terms=terms)
