@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
 
 from spatial_replay.errors import UsageError, importing
-from spatial_replay.palette import MAP, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.palette import MAP, NEGATIVE, NEUTRAL, PENDING, POSITIVE, hexadecimal
 from spatial_replay.text import printable
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def plain(text: str, longest: int = 72) -> str:
 
 
 _VERDICT_COLOURS: Final[Mapping[str, tuple[float, float, float]]] = MappingProxyType(
-    {"satisfied": POSITIVE, "violated": NEGATIVE}
+    {"satisfied": POSITIVE, "violated": NEGATIVE, "pending": PENDING}
 )
 _CELL: Final = "text-align:left; padding:0.1em 1em 0.1em 0; vertical-align:baseline; background:transparent"
 

@@ -274,6 +274,7 @@ LIGHT: Final[Mapping[str, str]] = MappingProxyType(
         "lit": "#ffe9a8",
         "positive-line": "#0072b2",
         "negative-line": "#d55e00",
+        "pending": "#d9c400",
         "positive-text": "#00598c",
         "negative-text": "#a34700",
     }
@@ -290,6 +291,7 @@ DARK: Final[Mapping[str, str]] = MappingProxyType(
         "lit": "#5c4a12",
         "positive-line": "#3fa2dd",
         "negative-line": "#f0802b",
+        "pending": "#f0e442",
         "positive-text": "#7cc3ee",
         "negative-text": "#ffa35c",
     }

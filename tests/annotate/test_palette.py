@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
 import pytest
 
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
+from spatial_replay.palette import SIGNS
+from spatial_replay.report.page import DARK, LIGHT
 
 # Machado, Oliveira and Fernandes 2009, for sight without red or green cones
 SIGHTS = {
@@ -47,3 +50,24 @@ def test_the_colours_of_any_two_states_differ_by_fifteen(sight: str) -> None:
     assert len(seen) == 5
     differences = {pair: np.linalg.norm(seen[pair[0]] - seen[pair[1]]) for pair in combinations(seen, 2)}
     assert min(differences.values()) >= 15.0, differences
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+@pytest.mark.parametrize("colours", [{**SIGNS, **LIGHT}, {**SIGNS, **LIGHT, **DARK}], ids=["light", "dark"])
+def test_the_colours_of_any_two_states_on_pages_differ_by_fifteen(
+    colours: Mapping[str, str], sight: str
+) -> None:
+    pages = [
+        ("positive", "negative", "pending", "neutral"),
+        ("positive-line", "negative-line", "pending", "quiet"),
+        ("positive-text", "negative-text", "pending", "quiet"),
+    ]
+    for names in pages:
+        seen = [
+            lab(tuple(int(colours[name][place : place + 2], 16) / 255 for place in (1, 3, 5)), SIGHTS[sight])
+            for name in names
+        ]
+        differences = {
+            pair: np.linalg.norm(seen[pair[0]] - seen[pair[1]]) for pair in combinations(range(4), 2)
+        }
+        assert min(differences.values()) >= 15.0, (names, differences)

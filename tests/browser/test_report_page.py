@@ -256,6 +256,9 @@ def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
     expect(readout(page)).to_have_text("0.000 s / 9.967 s")
     expect(mark).to_have_class("mark is-pending")
     assert colour_of(page, mark) != satisfied
+    ground = "mark => getComputedStyle(mark).backgroundColor"
+    assert mark.evaluate(ground) == "rgb(217, 196, 0)"
+    expect(page.locator("#timeline .key .block.pending")).to_have_css("background-color", "rgb(217, 196, 0)")
     expect(row(page, "plate_first").locator(".number").first).to_have_text(f"{MINUS}0.2802")
     # what is pending is no violation: its number is grey
     expect(row(page, "plate_first").locator(".number").first).to_have_class("number is-unknown")

@@ -220,7 +220,8 @@ function eventTicks(clock, events) {
   const place = (event, width) => THUMB + (event.time - clock.start) / (clock.end - clock.start) * (width - 2 * THUMB);
   const {made, redraw} = canvas(`${events.length} events over time`, (context, width, height) => {
     for (const event of events) {
-      context.fillStyle = colour(STATUSES[event.status].colour === "neutral" ? "quiet" : `${STATUSES[event.status].colour}-line`);
+      const ground = STATUSES[event.status].colour;
+      context.fillStyle = colour({neutral: "quiet", pending: "pending"}[ground] ?? `${ground}-line`);
       context.fillRect(place(event, width) - 1, 3, 2, 9);
     }
   });

@@ -83,7 +83,7 @@ function nodeLane(clock, result, node, title = `How ${node.text} stands over tim
   const strip = canvas(title, (context, width, height) => {
     // a lane out of sight costs nothing
     stretches ??= stretchesOf(clock.run, result, node);
-    const fills = {positive: colour("positive"), negative: colour("negative"), neutral: colour("neutral")};
+    const fills = Object.fromEntries(["positive", "negative", "pending", "neutral"].map((name) => [name, colour(name)]));
     for (const stretch of stretches) drawStretch(context, clock, stretch, fills, width, height);
   });
   strip.made.className = "strip";
@@ -95,7 +95,7 @@ function nodeLane(clock, result, node, title = `How ${node.text} stands over tim
 
 // What fails is drawn higher than what holds, and that higher than what is unknown; what is final is full.
 const HEIGHTS = {violated: 1, failing: 1, pending: 0.6, holding: 0.6, satisfied: 0.6, unknown: 0.3};
-const OPACITIES = {violated: 1, failing: 0.5, pending: 0.4, holding: 0.4, satisfied: 1, unknown: 0.6};
+const OPACITIES = {violated: 1, failing: 0.5, pending: 1, holding: 0.4, satisfied: 1, unknown: 0.6};
 
 function drawStretch(context, clock, [from, to, status], fills, width, height) {
   const left = shareOf(clock, from) * width, right = shareOf(clock, to) * width;
@@ -138,11 +138,12 @@ function stateLane(clock, result) {
   return blockLane(clock, "state", `States of the automaton of ${result.title}`, blocks);
 }
 
-// The colour of states: whether the run is accepted as it stands, lost, or pending.
+// The colour of states: whether the run is accepted as it stands, lost, pending, or not known.
 function groundOf(automaton, numbers) {
   const states = automaton.states.filter(({number}) => numbers.includes(number));
   if (states.length && states.every(({lost}) => lost)) return "negative";
-  return states.length && states.every(({accepting}) => accepting) ? "positive" : "neutral";
+  if (states.length && states.every(({accepting}) => accepting)) return "positive";
+  return states.some(({accepting, lost}) => accepting || lost) ? "neutral" : "pending";
 }
 
 function decisionLane(clock) {

@@ -5,7 +5,7 @@ const STATUSES = {
   holding: {sign: "+", words: "holds so far", colour: "positive"},
   violated: {sign: "✕", words: "violated", colour: "negative"},
   failing: {sign: "−", words: "fails now", colour: "negative"},
-  pending: {sign: "−", words: "pending", colour: "neutral"},
+  pending: {sign: "−", words: "pending", colour: "pending"},
   unknown: {sign: "?", words: "unknown", colour: "neutral"},
   vacuous: {sign: "∅", words: "decided nothing", colour: "neutral"},
   absent: {sign: "·", words: "not evaluated here", colour: "neutral"},
