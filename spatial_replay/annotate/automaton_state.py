@@ -20,7 +20,7 @@ from spatial_replay.geometry.arrays import Flags, Floats, Integers, combined, eq
 from spatial_replay.logs.messages import AUTOMATA_PREFIX, Attachment
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.wire import WireTemplate, ordered
+from spatial_replay.logs.wire import WireTemplate, join_in_order
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
@@ -116,7 +116,7 @@ class AutomatonRun:
             marks[:, -3:] = self._summary(after[members[0]])
             words = block.times_ns[members].astype(np.uint64)[:, None]
             encoded.append((members, template.encode(words, marks)))
-        return ordered(encoded)
+        return join_in_order(encoded)
 
     def pass_over(self, block: SeriesBlock) -> None:
         """Take in the next samples without a message."""

@@ -19,7 +19,7 @@ from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, StandingUpdate
-from spatial_replay.logs.wire import WireTemplate, ordered, rounded, words_of
+from spatial_replay.logs.wire import WireTemplate, join_in_order, round_numbers, words_of
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.spec.walks import looks_ahead
@@ -261,11 +261,11 @@ class StandingEncoder:
                 if place not in of_violated:
                     seconds = (np.minimum(instants_ns[:, place], times_ns) - (self.zero_ns or 0)) / 1e9
                     since, at = np.round(seconds, 3)[:, :, None]
-                    of_violated[place] = since, rounded(_finite(-series[place][0, 3, :, None])), at
+                    of_violated[place] = since, round_numbers(_finite(-series[place][0, 3, :, None])), at
                 columns += [column[members] for column in of_violated[place]]
             own_marks = np.concatenate([mark[members] for mark in marks], axis=1)
             encoded.append((members, self._template(layout).encode(words_of(columns), own_marks)))
-        return ordered(encoded)
+        return join_in_order(encoded)
 
     def _made_template(self, layout: _Layout) -> WireTemplate:
         """Return a template with a value in every field that differs between samples."""

@@ -19,7 +19,14 @@ from typing import TypeAlias
 import numpy as np
 
 from spatial_replay.bags.decoders import Topic, full_type_name, topic_of, topics_by_name
-from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, merged, places_in
+from spatial_replay.bags.reader import (
+    Columns,
+    MessageColumns,
+    MessageReader,
+    in_order,
+    merge_files,
+    places_in,
+)
 from spatial_replay.bags.ros1 import BAG_MAGIC, Ros1Bag
 from spatial_replay.bags.sqlite import (
     LARGEST_METADATA,
@@ -28,9 +35,9 @@ from spatial_replay.bags.sqlite import (
     BagMetadata,
     SqliteBag,
     bag_metadata_from_bytes,
+    decompress_message,
     temporary_folder,
     unpack_file,
-    unpacked,
     unpacked_size,
 )
 from spatial_replay.errors import LogError, MissingFileError
@@ -299,7 +306,7 @@ class BagFolder(MessageReader):
             columns: Columns = (columns_of_file for open_file in reads for columns_of_file in open_file())
         else:
             pairs = zip(self._files, reads, strict=True)
-            columns = merged((file.start_ns or 0, open_file) for file, open_file in pairs)
+            columns = merge_files((file.start_ns or 0, open_file) for file, open_file in pairs)
         if self._metadata and self._metadata.compression == "message":
             return self._unpack_all(columns)
         return columns
@@ -376,7 +383,7 @@ class BagFolder(MessageReader):
             when = Instant(int(packed.log_time_ns[place]), 0)
             try:
                 if not payload.startswith(_CDR_BEGIN):
-                    payloads.append(unpacked(payload))
+                    payloads.append(decompress_message(payload))
                 else:
                     payloads.append(payload)
                     if topic not in plain:

@@ -63,7 +63,7 @@ class MessageColumns(Messages):
 
     place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
-    def ordered(self) -> MessageColumns:
+    def sort_by_time(self) -> MessageColumns:
         """Return the same messages by log time, topic and sequence; equal ones keep their order."""
         times = self.log_time_ns
         if (times[1:] > times[:-1]).all():
@@ -123,7 +123,7 @@ def in_order(
         held += sum(map(len, chunk.payloads))
         if held > most_bytes:
             raise too_many_waiting(name, most_bytes)
-        waiting = concatenated([waiting, chunk] if len(waiting) else [chunk]).ordered()
+        waiting = concatenated([waiting, chunk] if len(waiting) else [chunk]).sort_by_time()
         if number == len(starts_ns):
             break
         ready = waiting.count_before(starts_ns[number])
@@ -139,7 +139,7 @@ _Active = list[tuple[int, int, MessageColumns, Columns]]
 """A heap: time of the first message, number of the file, messages, and those that follow them."""
 
 
-def merged(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
+def merge_files(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
     """Merge the messages of several files by log time; a file is opened when its time has come.
 
     Args:

@@ -94,7 +94,7 @@ def time_from(value: int) -> int:
     return (value & 0xFFFFFFFF) * _SECOND_NS + (value >> 32)
 
 
-def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
+def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
     """Decompress the records of a chunk.
 
     Raises:
@@ -375,7 +375,7 @@ def _data(stream: BinaryIO, record: _Record) -> bytes:
 def _content(stream: BinaryIO, record: _Record) -> bytes:
     compression = record.fields.get("compression", b"")
     size = number(record.fields, "size") - record.missing
-    content = decompressed(compression, _data(stream, record), size)
+    content = decompress_chunk(compression, _data(stream, record), size)
     if record.missing:
         # the fault of the file names the loss
         table, _ = record_table(content)

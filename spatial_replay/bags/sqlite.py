@@ -246,7 +246,7 @@ def unpacked_size(payload: bytes) -> int:
     return size if size >= 0 else ALWAYS_ALLOWED
 
 
-def unpacked(payload: bytes) -> bytes:
+def decompress_message(payload: bytes) -> bytes:
     """Decompress a message that was compressed by itself.
 
     Raises:

@@ -260,7 +260,7 @@ def verify(
     original = None
     if source is not None:
         # what is given here has precedence over what the log was made with
-        options = ReadOptions(**reading).given()
+        options = ReadOptions(**reading).non_defaults()
         original = open_source(source, **{**reading, **recorded_reading(annotated, source.name), **options})
     with progress("samples") as advance:
         verified = verify_certificate(annotated, original, advance, explain=explain)

@@ -203,7 +203,7 @@ def join(streams: Sequence[Messages]) -> Messages:
     by_rank = {_rank(channel): channel for channel in distinct.values()}
     number = {rank: place for place, rank in enumerate(sorted(by_rank))}
     numbers = {identity: number[_rank(channel)] for identity, channel in distinct.items()}
-    renumbered = [replace(stream, channel=_renumbered(stream, numbers)) for stream in streams]
+    renumbered = [replace(stream, channel=_renumber(stream, numbers)) for stream in streams]
     channels = {place: by_rank[rank] for rank, place in number.items()}
     return replace(concatenated([Messages(), *renumbered]), channels=channels)
 
@@ -214,7 +214,7 @@ def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str,
     return channel.topic, channel.encoding, name, encoding, data, tuple(sorted(channel.metadata.items()))
 
 
-def _renumbered(stream: Messages, number: dict[int, int]) -> Integers:
+def _renumber(stream: Messages, number: dict[int, int]) -> Integers:
     if not len(stream):
         return np.zeros(0, np.int64)
     new = np.zeros(max(stream.channels) + 1, np.int64)
@@ -280,7 +280,7 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
     """Let `iter_blocks` of a source remark pauses and steps back, and fill pauses beyond its `max_gap_ns`."""
 
     @wraps(iter_blocks)
-    def wrapped(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+    def wrapper(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         pauses, reports = Pauses(), ReportsBack()
         before: Trace | None = None
         for block in iter_blocks(self, start_ns, end_ns):
@@ -297,7 +297,7 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
             said = tuple(Sentence(f"{self.name}: ", remark) for remark in remarks)
             yield Block(Trace.empty(), remarks=said)
 
-    return wrapped
+    return wrapper
 
 
 def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
@@ -638,7 +638,7 @@ class FileSource(Source):
 
     @property
     def _given(self) -> Mapping[str, object]:
-        return self.reading.given()
+        return self.reading.non_defaults()
 
     @property
     def max_gap_ns(self) -> int | None:

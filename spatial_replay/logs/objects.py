@@ -26,7 +26,7 @@ from spatial_replay.geometry.arrays import (
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import OBJECTS, Messages, messages_of, protobuf_channel
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.wire import Bytes, LayoutError, Payloads, WireTemplate, Words, ordered, rows_of
+from spatial_replay.logs.wire import Bytes, LayoutError, Payloads, WireTemplate, Words, join_in_order, rows_of
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import ABSENT, Trace, class_order, require_few
@@ -75,7 +75,7 @@ class SlotLayout:
     signals_reported: dict[str, int]
 
 
-def parsed(payload: bytes) -> ObjectStates:
+def parse_object_states(payload: bytes) -> ObjectStates:
     """Parse a message, or a piece of one.
 
     Raises:
@@ -199,16 +199,16 @@ def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
     Where most messages have a layout of their own, their objects do not: these are read piece by piece.
     """
     whole = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
-    groups, left = _grouped(whole, faults, SAMPLES_PER_LAYOUT)
+    groups, left = _group_by_layout(whole, faults, SAMPLES_PER_LAYOUT)
     if len(left.samples):
         split = [_fields(payload) or [payload] for payload in left.payloads]
         samples = np.repeat(left.samples, [len(fields) for fields in split])
         pieces = _Pieces(samples, [piece for fields in split for piece in fields])
-        groups += _grouped(pieces, faults, 0)[0]
+        groups += _group_by_layout(pieces, faults, 0)[0]
     return groups
 
 
-def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[_Group], _Pieces]:
+def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[_Group], _Pieces]:
     """Group pieces by layout; return also those left over once layouts serve too few pieces each.
 
     Args:
@@ -246,7 +246,7 @@ def _first_group(
     alone = np.zeros(len(rows), np.bool_)
     alone[0] = True
     try:
-        message = parsed(first.payloads[0])
+        message = parse_object_states(first.payloads[0])
         template, layout = WireTemplate.of(message), layout_of(message)
     except (WrongMessageError, LayoutError) as error:
         faults[int(first.samples[0])] = str(error)
@@ -254,10 +254,10 @@ def _first_group(
     same = template.matches(rows) if len(template) == rows.shape[1] else ~alone
     if same[0]:
         matching_rows = rows if same.all() else rows[same]
-        return _Group(first.samples, layout, _padded(template.words(matching_rows))), same
+        return _Group(first.samples, layout, _pad(template.words(matching_rows))), same
     # another encoder's order of fields: the library's own bytes mean the same
     row = rows_of([message.SerializeToString(deterministic=True)])
-    return _Group(first.samples, layout, _padded(template.words(row))), alone
+    return _Group(first.samples, layout, _pad(template.words(row))), alone
 
 
 def _fields(payload: bytes) -> list[bytes] | None:
@@ -328,7 +328,7 @@ def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
     return faults
 
 
-def _padded(words: Words) -> Floats:
+def _pad(words: Words) -> Floats:
     padded = np.empty((len(words), words.shape[1] + 2))
     padded[:, :-2] = words.view(np.float64)
     # UNKNOWN and ZERO
@@ -345,7 +345,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
         picked = [np.take(g.numbers, getattr(g.layout, field), axis=1).reshape(-1) for g in groups]
         return np.concatenate([np.empty(0), *picked])
 
-    def repeated(values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
+    def repeat(values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
         tiled = (np.tile(np.asarray(v, np.int64), len(g.samples)) for g, v in values)
         return np.concatenate([np.empty(0, np.int64), *tiled])
 
@@ -355,15 +355,15 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
     return Observations(
         times_ns=times_ns,
         sample=np.concatenate([np.empty(0, np.int64), *samples]),
-        name=repeated((g, [names[n] for n in g.layout.names]) for g in groups),
+        name=repeat((g, [names[n] for n in g.layout.names]) for g in groups),
         names=list(names),
-        class_code=repeated((g, [classes[c] for c in g.layout.classes]) for g in groups),
+        class_code=repeat((g, [classes[c] for c in g.layout.classes]) for g in groups),
         classes=ordered,
         yaw=column("yaw"),
         uncertainty=column("uncertainty"),
         shapes=FootprintBatch(
-            part_start=starts_from_counts(repeated((g, g.layout.part_counts) for g in groups)),
-            vertex_start=starts_from_counts(repeated((g, g.layout.vertex_counts) for g in groups)),
+            part_start=starts_from_counts(repeat((g, g.layout.part_counts) for g in groups)),
+            vertex_start=starts_from_counts(repeat((g, g.layout.vertex_counts) for g in groups)),
             vertices=column("coordinates").reshape(-1, 2),
             radius=column("radius"),
             bottom=column("bottom"),
@@ -371,13 +371,13 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
         ),
         invalid=np.concatenate([np.empty(0, np.bool_), *map(_invalid, groups)]),
         signals={name: _signal(name, groups, len(times_ns)) for name in signals},
-        reported_ns=_reported(groups, times_ns),
-        signals_reported_ns=_signals_reported(groups, times_ns),
+        reported_ns=_report_times(groups, times_ns),
+        signals_reported_ns=_signal_report_times(groups, times_ns),
         lasting=frozenset().union(*(group.layout.lasting for group in groups)),
     )
 
 
-def _reported(groups: Sequence[_Group], times_ns: Integers) -> Integers | None:
+def _report_times(groups: Sequence[_Group], times_ns: Integers) -> Integers | None:
     """Return when each observation was reported, (R,); None where all have the times of their samples."""
     if all((group.layout.reported == UNKNOWN).all() for group in groups):
         return None
@@ -389,7 +389,7 @@ def _reported(groups: Sequence[_Group], times_ns: Integers) -> Integers | None:
     return np.concatenate(columns)
 
 
-def _signals_reported(groups: Sequence[_Group], times_ns: Integers) -> dict[str, Integers]:
+def _signal_report_times(groups: Sequence[_Group], times_ns: Integers) -> dict[str, Integers]:
     reported: dict[str, Integers] = {}
     for group in groups:
         for name, slot in group.layout.signals_reported.items():
@@ -429,11 +429,11 @@ def encode_objects(trace: Trace) -> Payloads:
     count = len(trace)
     times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
     signals = [_signal_pieces(trace, name) for name in trace.signals]
-    each = np.arange(count)
+    every_sample = np.arange(count)
     of_objects = np.nonzero(trace.rows != ABSENT)[0]
-    samples = np.concatenate([each, of_objects, *[each] * len(signals)])
+    samples = np.concatenate([every_sample, of_objects, *[every_sample] * len(signals)])
     pieces = Payloads.concatenate([times, _object_pieces(trace), *signals])
-    return pieces.select(np.argsort(samples, kind="stable")).grouped(np.bincount(samples, minlength=count))
+    return pieces.select(np.argsort(samples, kind="stable")).join(np.bincount(samples, minlength=count))
 
 
 def _object_pieces(trace: Trace) -> Payloads:
@@ -456,7 +456,7 @@ def _object_pieces(trace: Trace) -> Payloads:
             message.objects[0].reported_ns = 0
             numbers = np.column_stack([numbers, reported_ns[places].view(np.float64)])
         pieces.append((places, _pieces(message, numbers)))
-    return ordered(pieces)
+    return join_in_order(pieces)
 
 
 def _signal_pieces(trace: Trace, name: str) -> Payloads:
@@ -470,7 +470,7 @@ def _signal_pieces(trace: Trace, name: str) -> Payloads:
         signal.reported_ns = 0
         numbers = np.column_stack([values[is_earlier], reported_ns[is_earlier].view(np.float64)])
         current, earlier = np.flatnonzero(~is_earlier), np.flatnonzero(is_earlier)
-        pieces = ordered([(current, pieces.select(current)), (earlier, _pieces(message, numbers))])
+        pieces = join_in_order([(current, pieces.select(current)), (earlier, _pieces(message, numbers))])
     return pieces.without(np.isnan(values))
 
 

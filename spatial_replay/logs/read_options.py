@@ -90,7 +90,7 @@ class ReadOptions:
         if self.rate is not None:
             _check_rate(self.rate)
 
-    def given(self) -> dict[str, object]:
+    def non_defaults(self) -> dict[str, object]:
         """Return the options that differ from their defaults, but for `concave`, which every format takes."""
         return {
             field.name: getattr(self, field.name)
@@ -104,7 +104,7 @@ class ReadOptions:
         Raises:
             UsageError: an option was given that is not in `taken`.
         """
-        for name, value in self.given().items():
+        for name, value in self.non_defaults().items():
             if name not in taken:
                 text = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
                 raise UsageError(

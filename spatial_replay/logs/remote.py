@@ -366,7 +366,7 @@ class RemoteFile(PathLike[str]):
         """
         with self._opening:
             if self._version is None:
-                self._version = self._opened()
+                self._version = self._read_ends()
             return self._version
 
     @property
@@ -381,7 +381,7 @@ class RemoteFile(PathLike[str]):
             MissingFileError, RemoteError: it cannot be read.
         """
         try:
-            return self._versioned(self._get({"head": True}).meta)
+            return self._version_of(self._get({"head": True}).meta)
         except SpatialReplayError:
             # a signed address is for reading alone
             return self.version
@@ -438,7 +438,7 @@ class RemoteFile(PathLike[str]):
         except self._obstore.exceptions.BaseError as error:
             raise store_failure(self._shown, self._scheme, error) from None
 
-    def _opened(self) -> FileVersion:
+    def _read_ends(self) -> FileVersion:
         """Read the end and the beginning."""
         with ThreadPoolExecutor(1, "remote-reading") as thread:
             head = thread.submit(self._part, {"range": (0, _HEAD_BYTES)})
@@ -448,7 +448,7 @@ class RemoteFile(PathLike[str]):
             except self._obstore.exceptions.NotSupportedError:
                 return self._without_suffix(head)
         if first != version:
-            raise self._changed()
+            raise self._replacement_error()
         self._held.add(begin, tail)
         self._held.add(0, beginning)
         return version
@@ -458,7 +458,7 @@ class RemoteFile(PathLike[str]):
         try:
             version, _, beginning = head.result()
         except self._obstore.exceptions.NotSupportedError:
-            return self._versioned(self._get({"head": True}).meta, has_ranges=False)
+            return self._version_of(self._get({"head": True}).meta, has_ranges=False)
         self._held.add(0, beginning)
         self._version = version
         self.fetch([(max(0, version.size - _TAIL_BYTES), version.size)])
@@ -471,7 +471,7 @@ class RemoteFile(PathLike[str]):
         strong = {"if_match": version_before.tag} if version_before and version_before.is_exact else {}
         version, _, data = self._part({"range": wanted, **strong})
         if version != version_before or len(data) != wanted[1] - wanted[0]:
-            raise self._changed()
+            raise self._replacement_error()
         return data
 
     def _part(self, options: dict[str, Any]) -> tuple[FileVersion, int, bytes]:
@@ -481,7 +481,7 @@ class RemoteFile(PathLike[str]):
             try:
                 data = bytes(answer.bytes())
                 if len(data) == answer.range[1] - answer.range[0]:
-                    return self._versioned(answer.meta), answer.range[0], data
+                    return self._version_of(answer.meta), answer.range[0], data
                 error: Exception = EOFError("the connection breaks off")
             except self._obstore.exceptions.BaseError as failure:
                 error = failure
@@ -497,18 +497,18 @@ class RemoteFile(PathLike[str]):
         except exceptions.NotSupportedError:
             raise
         except exceptions.PreconditionError:
-            raise self._changed() from None
+            raise self._replacement_error() from None
         except (OSError, ValueError, exceptions.BaseError) as error:
             raise store_failure(self._shown, self._scheme, error) from None
 
     @staticmethod
-    def _versioned(meta: Any, *, has_ranges: bool = True) -> FileVersion:
+    def _version_of(meta: Any, *, has_ranges: bool = True) -> FileVersion:
         modified = meta["last_modified"]
         # without a date, the library gives the epoch
         dated = modified.isoformat() if modified and modified.timestamp() > 0 else None
         return FileVersion(meta["size"], meta["e_tag"] or dated, has_ranges)
 
-    def _changed(self) -> RemoteError:
+    def _replacement_error(self) -> RemoteError:
         return RemoteError(f"{self._shown} was replaced while it was read; run the command again")
 
 
@@ -630,10 +630,10 @@ def local_copy(path: str | PathLike[str]) -> Path:
         OutputError: the disk cannot take it.
     """
     file = log_file(path)
-    return downloaded(file) if isinstance(file, RemoteFile) else file
+    return download(file) if isinstance(file, RemoteFile) else file
 
 
-def downloaded(file: RemoteFile, reason: str = "") -> Path:
+def download(file: RemoteFile, reason: str = "") -> Path:
     """Return a copy of a remote file on this machine, which is made once for each version of it.
 
     The oldest copies are removed when all together exceed 20 GB, or SPATIAL_REPLAY_DOWNLOADS gigabytes.
@@ -647,10 +647,10 @@ def downloaded(file: RemoteFile, reason: str = "") -> Path:
         MissingFileError, RemoteError: it cannot be read.
         OutputError: the disk cannot take it.
     """
-    return downloaded_folder([file], str(file), reason) / _name(file)
+    return download_files([file], str(file), reason) / _name(file)
 
 
-def downloaded_folder(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
+def download_files(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
     """Return the folder that holds copies of remote files; see `downloaded`.
 
     Args:
@@ -721,7 +721,7 @@ def _make_room(parent: Path, room: int) -> None:
     copies = []
     for folder in parent.iterdir():
         with suppress(OSError):
-            size = sum(each.stat().st_size for each in folder.rglob("*"))
+            size = sum(path.stat().st_size for path in folder.rglob("*"))
             copies.append((folder.stat().st_mtime, folder.name, size))
     total = sum(size for *_, size in copies)
     for _, name, size in sorted(copies):
@@ -737,8 +737,8 @@ def user_cache_folder(name: str) -> Path:
     Raises:
         RuntimeError: the user has no home folder.
     """
-    if chosen := os.environ.get("SPATIAL_REPLAY_CACHE"):
-        return Path(chosen).absolute() / name
+    if folder := os.environ.get("SPATIAL_REPLAY_CACHE"):
+        return Path(folder).absolute() / name
     # the XDG specification has a relative path ignored
     parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (parent if parent.is_absolute() else Path.home() / ".cache") / "spatial-replay" / name
@@ -824,8 +824,8 @@ class RemoteFolder:
         try:
             self._library.put(self._store, self._prefix + name, data)
         except self._failures as error:
-            shown = f"{self.location}/{name}"
-            raise OutputError(str(store_failure(shown, self._scheme, error, "written"))) from None
+            address = f"{self.location}/{name}"
+            raise OutputError(str(store_failure(address, self._scheme, error, "written"))) from None
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove files; one that is gone already is no error.
@@ -844,8 +844,8 @@ class RemoteFolder:
 
     def _keys(self, below: str) -> Iterator[str]:
         try:
-            for some in self._library.list(self._store, self._prefix + below or None):
-                yield from (each["path"] for each in some)
+            for page in self._library.list(self._store, self._prefix + below or None):
+                yield from (entry["path"] for entry in page)
         except self._failures as error:
             raise store_failure(self.location, self._scheme, error) from None
 
@@ -874,6 +874,6 @@ def matching_addresses(pattern: str) -> list[str]:
     bucket, _, key = rest.partition("/")
     _refuse_empty_parts(pattern, key)
     begin = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
-    fixed, wanted = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
-    keys = RemoteFolder(f"{scheme}://{bucket}").names(fixed)
-    return [f"{scheme}://{bucket}/{each}" for each in keys if fnmatchcase(each, wanted)]
+    folder, key_pattern = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
+    keys = RemoteFolder(f"{scheme}://{bucket}").names(folder)
+    return [f"{scheme}://{bucket}/{name}" for name in keys if fnmatchcase(name, key_pattern)]

@@ -59,7 +59,7 @@ class WireTemplate:
         Raises:
             LayoutError: a message with fields that the schema does not have.
         """
-        first, second = (_encoded(message, *sentinels) for sentinels in _SENTINELS)
+        first, second = (_encode(message, *sentinels) for sentinels in _SENTINELS)
         if len(first) != len(second):
             raise LayoutError("the message's length depends on its numbers")
         differing = np.flatnonzero(first != second)
@@ -204,7 +204,7 @@ class Payloads(Sequence[bytes]):
         """Return the messages with nothing in some of them, (M,)."""
         return Payloads(self.buffers, self.buffer, self.start, np.where(is_empty, 0, self.size))
 
-    def grouped(self, counts: Integers) -> Payloads:
+    def join(self, counts: Integers) -> Payloads:
         """Return (n,) messages, each joined from the next `counts` (n,) of these."""
         ends = np.append(0, np.cumsum(self.size))
         target = np.empty(ends[-1], np.uint8)
@@ -247,10 +247,10 @@ def rows_of(payloads: Sequence[bytes]) -> Bytes:
 
 def words_of(columns: Sequence[NDArray[Any]]) -> Words:
     """Return columns of 8-byte numbers, (n, k) each, side by side: (n, W)."""
-    return np.concatenate([np.ascontiguousarray(each).view(np.uint64) for each in columns], axis=1)
+    return np.concatenate([np.ascontiguousarray(column).view(np.uint64) for column in columns], axis=1)
 
 
-def ordered(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
+def join_in_order(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
     """Return messages in the order of their places, which are given for each group."""
     places = np.concatenate([np.empty(0, np.int64), *(places for places, _ in groups)])
     return Payloads.concatenate([payloads for _, payloads in groups]).select(np.argsort(places))
@@ -260,7 +260,7 @@ _POWERS = np.array([float(f"1e{digits}") for digits in range(20)])
 _POWERS.flags.writeable = False
 
 
-def rounded(numbers: Floats) -> Floats:
+def round_numbers(numbers: Floats) -> Floats:
     """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
     size = np.abs(numbers)
     is_usual = (size >= 1e-15) & (size < 1e15)
@@ -268,11 +268,11 @@ def rounded(numbers: Floats) -> Floats:
     digits = (3.0 - np.floor(np.log10(np.abs(usual)))).astype(np.int64)
     power = _POWERS[np.abs(digits)]
     # quotients and products of whole numbers, so that the result is the number nearest to those digits
-    shown = np.where(digits < 0, np.round(usual / power) * power, np.round(usual * power) / power)
-    return np.where(is_usual, shown, numbers)
+    short_numbers = np.where(digits < 0, np.round(usual / power) * power, np.round(usual * power) / power)
+    return np.where(is_usual, short_numbers, numbers)
 
 
-def _encoded(message: Message, word: int, mark: int) -> Bytes:
+def _encode(message: Message, word: int, mark: int) -> Bytes:
     """Encode a message with sentinels in all slots."""
     copy = type(message)()
     copy.CopyFrom(message)

@@ -87,7 +87,7 @@ class EpisodeSource(Source):
     def options(self) -> Mapping[str, object]:
         """See `Source.options`."""
         mapping, concave = self.mapped_by, self.reading.concave
-        options = {**self.reading.given(), **({} if concave == "decompose" else {"concave": concave})}
+        options = {**self.reading.non_defaults(), **({} if concave == "decompose" else {"concave": concave})}
         if mapping is not None:
             options |= {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
         return options

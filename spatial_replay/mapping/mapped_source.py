@@ -82,7 +82,7 @@ class MappedSource(FileSource):
     @property
     def _given(self) -> Mapping[str, object]:
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
-        return {**mapping, **self.reading.given(), **mapping}
+        return {**mapping, **self.reading.non_defaults(), **mapping}
 
     @property
     def begin_ns(self) -> int | None:

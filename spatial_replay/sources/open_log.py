@@ -37,8 +37,8 @@ from spatial_replay.logs.remote import (
     BAG_METADATA,
     LogFile,
     RemoteFile,
-    downloaded,
-    downloaded_folder,
+    download,
+    download_files,
     is_web,
     log_file,
 )
@@ -172,14 +172,14 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log{such}")
         return file
     if not file.version.has_ranges:
-        return downloaded(file, "its server does not give parts of files")
+        return download(file, "its server does not give parts of files")
     with file.open() as stream:
         if stream.read(len(MAGIC)) != MAGIC:
-            return downloaded(file, "only MCAP logs are read in parts")
+            return download(file, "only MCAP logs are read in parts")
         from spatial_replay.logs.mcap.index import has_summary
 
         if not has_summary(stream):
-            return downloaded(file, "it has no index, so all of it is read")
+            return download(file, "it has no index, so all of it is read")
     return file
 
 
@@ -317,7 +317,7 @@ def downloaded_bag(metadata: RemoteFile) -> Path:
     address = str(metadata).removesuffix(BAG_METADATA)
     name = address.rstrip("/").rpartition("/")[2].strip(".") or "bag"
     reason = "the files of a ROS 2 bag are read together"
-    return downloaded_folder(bag_files_at(metadata), address, reason, name)
+    return download_files(bag_files_at(metadata), address, reason, name)
 
 
 def format_of(path: LogFile) -> str | None:
@@ -424,7 +424,7 @@ def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     from spatial_replay.logs.mcap.read import McapSource
 
     source = McapSource(path, kind, options)
-    if not options.given().keys() - {"max_gap"}:
+    if not options.non_defaults().keys() - {"max_gap"}:
         return source
     if source.has_samples:
         options.refuse_except(frozenset({"max_gap"}), kind, path.name)

@@ -131,7 +131,7 @@ def recover_log(
     """
     inputs, output = local_files([log]), Path(output)
     refuse_inputs(output, inputs)
-    reader, faults = _opened(readable_file(log))
+    reader, faults = _open_log(readable_file(log))
     recovery, is_ordered = _write(reader, faults, output, inputs, advance)
     if not is_ordered:
         # a message whose time is damaged is where its chunk was; in what was written, each is at its own time
@@ -202,7 +202,7 @@ def _write(
     return recovery, is_ordered
 
 
-def _opened(file: LogFile) -> tuple[MessageReader, FaultList]:
+def _open_log(file: LogFile) -> tuple[MessageReader, FaultList]:
     """Return a reader of a log, also if its first bytes are damaged, with the faults so far."""
     faults = FaultList()
     if isinstance(file, Path) and is_bag_folder(file):

@@ -25,7 +25,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     Standing,
     StandingUpdate,
 )
-from spatial_replay.logs.wire import rounded
+from spatial_replay.logs.wire import round_numbers
 from spatial_replay.replay.engine import run_replay
 
 STEP_NS = 10**8
@@ -186,7 +186,7 @@ def test_a_fast_log_has_no_topic_for_viewers_above_60_hz(tmp_path: Path) -> None
 @example(float(np.nextafter(1e-3, 0.0)), 1.0)
 @example(float(np.nextafter(1e12, 0.0)), -1.0)
 def test_numbers_of_tables_have_four_digits(size: float, sign: float) -> None:
-    [shown] = rounded(np.array([sign * size])).tolist()
+    [shown] = round_numbers(np.array([sign * size])).tolist()
     # halves may go either way
     assert abs(shown - sign * size) <= 0.5001 * 10.0 ** (np.floor(np.log10(size)) - 3)
     assert shown == float(f"{shown:.4g}")
@@ -194,5 +194,5 @@ def test_numbers_of_tables_have_four_digits(size: float, sign: float) -> None:
 
 def test_what_is_no_usual_number_stays_in_tables() -> None:
     numbers = [np.inf, -np.inf, 0.0, 3e200, 1e-300]
-    assert rounded(np.array(numbers)).tolist() == numbers
-    assert np.isnan(rounded(np.array([np.nan]))).all()
+    assert round_numbers(np.array(numbers)).tolist() == numbers
+    assert np.isnan(round_numbers(np.array([np.nan]))).all()

@@ -59,7 +59,7 @@ from spatial_replay.annotate.violations import (
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.wire import Words, ordered, words_of
+from spatial_replay.logs.wire import Words, join_in_order, words_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline, RegionName
 from spatial_replay.trace.trace import Trace
@@ -267,7 +267,7 @@ class SceneEncoder:
         frames = SceneFrames(
             times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades
         )
-        return SceneMessages(times_ns, ordered(encoded), after, frames)
+        return SceneMessages(times_ns, join_in_order(encoded), after, frames)
 
     def pass_over(self, trace: Trace, state: SceneState) -> SceneState:
         """Take in samples without a message."""

@@ -40,7 +40,7 @@ class DamageError(Exception):
     """Bytes that are not what they should be. The text says what is wrong; the catcher knows where."""
 
 
-def encoded(*several: records.McapRecord) -> bytes:
+def encode_records(*several: records.McapRecord) -> bytes:
     """Encode records one after the other, each with its head."""
     builder = RecordBuilder()
     for record in several:
@@ -48,7 +48,7 @@ def encoded(*several: records.McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def decoded(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Record:
+def decode_record(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Record:
     """Decode the record in a body.
 
     Raises:
@@ -165,9 +165,9 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
     except _NoSummaryError:
         directory = _Scan(stream, size, faults, name).directory()
     except DamageError as damage:
-        known = len(faults)
+        fault_count = len(faults)
         directory = _Scan(stream, size, faults, name).directory()
-        if len(faults) == known:
+        if len(faults) == fault_count:
             faults.add(f"{name}: {damage}; the log was read without its index")
     if _is_own(directory.header):
         directory.chunks = [place._replace(has_checksum=True) for place in directory.chunks]
@@ -207,7 +207,7 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
     tail = _tail(stream, size)
     if not tail:
         raise DamageError("the file ends without a footer; its writer was interrupted")
-    footer = decoded(records.Footer.read, tail[RECORD_HEAD.size :])
+    footer = decode_record(records.Footer.read, tail[RECORD_HEAD.size :])
     if footer.summary_start == 0:
         raise _NoSummaryError
     if not len(MAGIC) <= footer.summary_start <= size - len(tail):
@@ -235,7 +235,7 @@ def _header(stream: BinaryIO) -> records.Header | None:
     opcode, length = RECORD_HEAD.unpack(head)
     if opcode != Opcode.HEADER or length > _STRIDE:
         raise DamageError("the header is damaged")
-    header: records.Header = decoded(records.Header.read, stream.read(length))
+    header: records.Header = decode_record(records.Header.read, stream.read(length))
     return header
 
 
@@ -252,13 +252,13 @@ def _body(section: bytes, position: int) -> tuple[int, bytes]:
 
 def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
     if opcode == Opcode.SCHEMA:
-        schema = decoded(records.Schema.read, body)
+        schema = decode_record(records.Schema.read, body)
         directory.schemas[schema.id] = schema
     elif opcode == Opcode.CHANNEL:
-        channel = decoded(records.Channel.read, body)
+        channel = decode_record(records.Channel.read, body)
         directory.channels[channel.id] = channel
     elif opcode == Opcode.STATISTICS:
-        directory.statistics = decoded(records.Statistics.read, body)
+        directory.statistics = decode_record(records.Statistics.read, body)
     elif opcode == Opcode.CHUNK_INDEX:
         if len(body) < _CHUNK_INDEX.size:
             raise DamageError("the index breaks off")
@@ -268,10 +268,10 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
         place = ChunkPlace(offset, length, start_ns, end_ns, channels=channels, size=size)
         directory.chunks.append(place)
     elif opcode == Opcode.ATTACHMENT_INDEX:
-        attachment = decoded(records.AttachmentIndex.read, body)
+        attachment = decode_record(records.AttachmentIndex.read, body)
         directory.attachments.append((attachment.offset, attachment.length))
     elif opcode == Opcode.METADATA_INDEX:
-        metadata = decoded(records.MetadataIndex.read, body)
+        metadata = decode_record(records.MetadataIndex.read, body)
         directory.metadata.append((metadata.offset, metadata.length))
 
 
@@ -337,8 +337,8 @@ class _Scan:
     def _lose(self, position: int, following: ChunkPlace | None, damage: DamageError) -> None:
         """Report the bytes from a position to the next chunk as lost, with the times around them."""
         lost = max(0, (following.offset if following else self._end) - position)
-        known = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
-        after = [Instant(max(known), 0)] if known else []
+        readable_ends_ns = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
+        after = [Instant(max(readable_ends_ns), 0)] if readable_ends_ns else []
         before = [Instant(following.start_ns, 0)] if following else []
         when: tuple[str | Instant, ...] = ()
         if after and before:
@@ -380,7 +380,7 @@ class _Scan:
             self._stream.seek(position + RECORD_HEAD.size)
             body = self._stream.read(length)
             if opcode == Opcode.HEADER:
-                self._directory.header = decoded(records.Header.read, body)
+                self._directory.header = decode_record(records.Header.read, body)
             else:
                 _take_in(self._directory, opcode, body)
         elif opcode == Opcode.ATTACHMENT:
@@ -471,7 +471,7 @@ def iter_attachments(
         stream.seek(offset + RECORD_HEAD.size)
         body = stream.read(length - RECORD_HEAD.size)
         try:
-            record = decoded(records.Attachment.read, body)
+            record = decode_record(records.Attachment.read, body)
             # behind the fields that are known there may be others
             texts = len(record.name.encode()) + len(record.media_type.encode())
             size = _ATTACHMENT_NUMBERS + texts + len(record.data)
@@ -491,7 +491,7 @@ def iter_metadata(
     for offset, length in directory.metadata:
         stream.seek(offset + RECORD_HEAD.size)
         try:
-            record = decoded(records.Metadata.read, stream.read(length - RECORD_HEAD.size))
+            record = decode_record(records.Metadata.read, stream.read(length - RECORD_HEAD.size))
         except DamageError as damage:
             faults.add(f"{name}: at byte {offset}: {damage}; the metadata is lost")
             continue

@@ -39,7 +39,7 @@ from spatial_replay.logs.mcap.index import (
     Directory,
     check_attachments,
     chunk_place,
-    decoded,
+    decode_record,
     iter_attachments,
     iter_metadata,
     read_directory,
@@ -119,7 +119,7 @@ def _content(place: ChunkPlace, record: bytes) -> bytes:
         raise DamageError(f"the chunk claims to hold {size} bytes, and the index {place.size}")
     begin = RECORD_HEAD.size + CHUNK_HEAD.size
     data = begin + name_length + 8
-    content = _decompressed(record[begin : begin + name_length], memoryview(record)[data:], size)
+    content = _decompress(record[begin : begin + name_length], memoryview(record)[data:], size)
     if len(content) != size:
         raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
     if (checksum or place.has_checksum) and crc32(content) != checksum:
@@ -129,7 +129,7 @@ def _content(place: ChunkPlace, record: bytes) -> bytes:
     return content
 
 
-def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes:
+def _decompress(compression: bytes, data: memoryview, size: int) -> bytes:
     if compression and size > max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data)):
         raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:
@@ -264,15 +264,15 @@ class ChunkWalk:
     ) -> Iterator[tuple[ChunkPlace, Messages]]:
         """Yield the messages of some topics in each place; what is lost of them goes to the faults."""
         declared, passed_over = -1, set[int]()
-        for place, found in iter_records(self.stream, places):
+        for place, content in iter_records(self.stream, places):
             if declared < len(self.channels):
                 declared = len(self.channels)
-                passed_over = {n for n, each in self.channels.items() if not is_wanted(each.topic)}
-            if isinstance(found, DamageError):
-                self._fault(place, f"{found}; the ", " are lost")
+                passed_over = {n for n, channel in self.channels.items() if not is_wanted(channel.topic)}
+            if isinstance(content, DamageError):
+                self._fault(place, f"{content}; the ", " are lost")
                 yield place, Messages(self.channels)
                 continue
-            messages = self._messages(place, split_records(found, passed_over), found)
+            messages = self._messages(place, split_records(content, passed_over), content)
             if declared < len(self.channels):
                 # those that were declared in this chunk
                 topics = [self.channels[n].topic for n in messages.channel.tolist()]
@@ -296,15 +296,15 @@ class ChunkWalk:
         channel, sequence, log_ns, publish_ns = (
             split.heads[name][is_usable].astype(np.int64) for name in names
         )
-        payloads = [content[own] for own in compress(split.payloads, is_usable)]
+        payloads = [content[span] for span in compress(split.payloads, is_usable)]
         return Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
 
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary: chunks need not come in the order of time."""
-        for _, found in iter_records(self.stream, sorted(self.places, key=lambda each: each.offset)):
+        for _, content in iter_records(self.stream, sorted(self.places, key=lambda place: place.offset)):
             # the chunk is read again for its messages, and its damage reported then
-            if not isinstance(found, DamageError):
-                self._take_in(split_records(found).declarations)
+            if not isinstance(content, DamageError):
+                self._take_in(split_records(content).declarations)
 
     def _take_in(self, declarations: Iterable[tuple[int, bytes]]) -> str:
         """Store declarations that are new; return what is wrong with one, or ""."""
@@ -313,9 +313,9 @@ class ChunkWalk:
             number = int.from_bytes(body[:2], "little")
             try:
                 if opcode == Opcode.CHANNEL and number not in self.channels:
-                    self._declare(decoded(records.Channel.read, body))
+                    self._declare(decode_record(records.Channel.read, body))
                 elif opcode == Opcode.SCHEMA and number not in self._schemas:
-                    self._schemas[number] = decoded(records.Schema.read, body)
+                    self._schemas[number] = decode_record(records.Schema.read, body)
             except DamageError as error:
                 damage = damage or str(error)
         return damage
@@ -366,7 +366,7 @@ class McapSource(FileSource):
         Only chunks that reach into the window are read, if the log has an index.
         """
         renamed = set[Channel]()
-        with self.open_walk(lambda channel: self._copied(channel, renamed)) as walk:
+        with self.open_walk(lambda channel: self._channel_of_copy(channel, renamed)) as walk:
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
             for messages in _blocks(walk, window, self.is_wanted):
@@ -376,7 +376,7 @@ class McapSource(FileSource):
                 check_attachments(walk.stream, walk.directory, walk.faults, self.name)
             rest = walk.faults.take(last=True)
             fault = decoder.first_fault or next(iter(rest), None)
-            if not decoder.any_sample and all(each.topic != OBJECTS for each in walk.channels.values()):
+            if not decoder.any_sample and all(channel.topic != OBJECTS for channel in walk.channels.values()):
                 raise self._without_objects(walk, fault)
             if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
                 raise LogError(f"{self.name} holds no sample: {fault}")
@@ -452,7 +452,7 @@ class McapSource(FileSource):
             attachments = tuple(iter_attachments(stream, directory, FaultList(), self.name))
             return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
 
-    def _copied(self, channel: Channel, renamed: set[Channel]) -> Channel:
+    def _channel_of_copy(self, channel: Channel, renamed: set[Channel]) -> Channel:
         """Return the channel that a copy has; collect it if that is on another topic."""
         copied = copied_channel(channel)
         # in a log that we did not write, others may have used our topics with our types
@@ -545,7 +545,7 @@ def _in_order(several: Sequence[Messages]) -> Messages:
 
 def decode_samples(
     messages: Messages,
-    own: Integers,
+    places: Integers,
     latest_ns: int,
     report: Callable[[Sentence], None],
     concave: Concave = "decompose",
@@ -553,19 +553,19 @@ def decode_samples(
     """Decode samples of ours; return them, and the places of those that can be used.
 
     Args:
-        own: the places of the samples among the messages.
+        places: of the samples among the messages.
         latest_ns: the time after which they have to come.
         report: takes what is wrong with the others.
     """
-    times = messages.log_time_ns[own]
+    times = messages.log_time_ns[places]
     before = np.maximum.accumulate(np.append(latest_ns, times))[:-1]
     for time_ns in times[times <= before].tolist():
         report(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
-    own, times = own[times > before], times[times > before]
-    trace, faults = decode_objects([messages.payloads[at] for at in own.tolist()], times, concave=concave)
+    places, times = places[times > before], times[times > before]
+    trace, faults = decode_objects([messages.payloads[at] for at in places.tolist()], times, concave=concave)
     for fault in faults:
         report(fault)
-    return trace, own[np.isin(times, trace.times_ns)]
+    return trace, places[np.isin(times, trace.times_ns)]
 
 
 def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
@@ -585,17 +585,19 @@ class _BlockDecoder:
 
     def block(self, messages: Messages) -> Block:
         """Decode the samples among some messages."""
-        wanted = {n: each for n, each in messages.channels.items() if self._source.is_wanted(each.topic)}
-        columns = replace(messages, channels=MappingProxyType(wanted))
-        samples = [number for number, channel in wanted.items() if self._is_objects(channel)]
-        own = np.flatnonzero(np.isin(columns.channel, samples))
+        channels = {
+            n: channel for n, channel in messages.channels.items() if self._source.is_wanted(channel.topic)
+        }
+        columns = replace(messages, channels=MappingProxyType(channels))
+        samples = [number for number, channel in channels.items() if self._is_objects(channel)]
+        sample_places = np.flatnonzero(np.isin(columns.channel, samples))
         trace, sound = decode_samples(
-            columns, own, self._latest_ns, self._fault, self._source.reading.concave
+            columns, sample_places, self._latest_ns, self._fault, self._source.reading.concave
         )
-        self._latest_ns = int(columns.log_time_ns[own].max(initial=self._latest_ns))
-        if len(sound) < len(own):
+        self._latest_ns = int(columns.log_time_ns[sample_places].max(initial=self._latest_ns))
+        if len(sound) < len(sample_places):
             # a copy holds the samples that were read, and is sound
-            columns = select(columns, without(columns, own, sound))
+            columns = select(columns, without(columns, sample_places, sound))
         self.any_sample = self.any_sample or len(trace) > 0
         lost = self._walk.faults.take()
         self.first_fault = self.first_fault or next(iter(lost), None)
@@ -650,7 +652,7 @@ class LogSummary:
     @property
     def has_objects(self) -> bool:
         """Whether there is a channel for samples."""
-        return any(each.channel.topic == OBJECTS for each in self.channels)
+        return any(summary.channel.topic == OBJECTS for summary in self.channels)
 
 
 def summarise_mcap(source: McapSource) -> LogSummary:

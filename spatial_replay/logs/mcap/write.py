@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 from spatial_replay.compiled import cores
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers, select
-from spatial_replay.logs.mcap.index import RECORD_HEAD, encoded
+from spatial_replay.logs.mcap.index import RECORD_HEAD, encode_records
 from spatial_replay.logs.messages import LIBRARY, MAGIC, OWN_PREFIX, Channel, Messages, Schema, messages_of
 from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.wire import Bytes, Payloads, stretches
@@ -136,11 +136,14 @@ def _pack(lane: _Lane, declaring: bytes) -> _PackedChunk:
     record_bytes = at = RECORD_HEAD.size + length
     offsets, counts = dict[int, int](), dict[int, int]()
     for channel in np.unique(channels).tolist():
-        own = entries[channels == channel].tobytes()
+        entry_bytes = entries[channels == channel].tobytes()
         offsets[channel] = at
-        counts[channel] = len(own) // _INDEX_ENTRY
-        parts += _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, len(own) + 6, channel, len(own)), own
-        at += _INDEX_HEAD.size + len(own)
+        counts[channel] = len(entry_bytes) // _INDEX_ENTRY
+        parts += (
+            _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, len(entry_bytes) + 6, channel, len(entry_bytes)),
+            entry_bytes,
+        )
+        at += _INDEX_HEAD.size + len(entry_bytes)
     index = records.ChunkIndex(
         chunk_length=record_bytes,
         chunk_start_offset=0,
@@ -161,10 +164,10 @@ _local = local()
 def _compressor(is_own: bool) -> zstandard.ZstdCompressor:
     """Return a compressor of this thread: one serves one thread at a time."""
     if not hasattr(_local, "compressors"):
-        own = zstandard.ZstdCompressionParameters.from_level(_OWN_LEVEL, hash_log=_OWN_HASH_LOG)
+        parameters = zstandard.ZstdCompressionParameters.from_level(_OWN_LEVEL, hash_log=_OWN_HASH_LOG)
         _local.compressors = (
             zstandard.ZstdCompressor(level=COMPRESSION_LEVEL),
-            zstandard.ZstdCompressor(compression_params=own),
+            zstandard.ZstdCompressor(compression_params=parameters),
         )
     compressors: tuple[zstandard.ZstdCompressor, zstandard.ZstdCompressor] = _local.compressors
     return compressors[is_own]
@@ -187,7 +190,9 @@ class _Summary:
         """Add a chunk that is written at a place in the file."""
         index = chunk.summary
         places = {channel: offset + at for channel, at in index.message_index_offsets.items()}
-        self.chunks.append(encoded(replace(index, chunk_start_offset=offset, message_index_offsets=places)))
+        self.chunks.append(
+            encode_records(replace(index, chunk_start_offset=offset, message_index_offsets=places))
+        )
         self.counts.update(chunk.counts)
         self.start_ns = min(self.start_ns, index.message_start_time)
         self.end_ns = max(self.end_ns, index.message_end_time)
@@ -195,12 +200,12 @@ class _Summary:
     def section(self, offset: int) -> bytes:
         """Encode the section and the footer for a place in the file."""
         groups = (
-            (Opcode.SCHEMA, encoded(*self.schemas)),
-            (Opcode.CHANNEL, encoded(*self.channels)),
-            (Opcode.STATISTICS, encoded(self._statistics())),
+            (Opcode.SCHEMA, encode_records(*self.schemas)),
+            (Opcode.CHANNEL, encode_records(*self.channels)),
+            (Opcode.STATISTICS, encode_records(self._statistics())),
             (Opcode.CHUNK_INDEX, b"".join(self.chunks)),
-            (Opcode.ATTACHMENT_INDEX, encoded(*self.attachments)),
-            (Opcode.METADATA_INDEX, encoded(*self.metadata)),
+            (Opcode.ATTACHMENT_INDEX, encode_records(*self.attachments)),
+            (Opcode.METADATA_INDEX, encode_records(*self.metadata)),
         )
         section, offsets = b"", []
         for opcode, content in groups:
@@ -208,7 +213,7 @@ class _Summary:
                 offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
                 section += content
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))
-        section += encoded(*offsets) + footer
+        section += encode_records(*offsets) + footer
         return section + struct.pack("<I", crc32(section))
 
     def _statistics(self) -> records.Statistics:
@@ -390,7 +395,7 @@ class LogWriter:
         for number, lane in enumerate(self._lanes):
             if lane.records:
                 self._end(number)
-        self._write_packed(0)
+        self._write_ready_chunks(0)
 
     def close(self) -> None:
         """Finish the log: summary, index and footer. Closing twice does nothing."""
@@ -407,10 +412,10 @@ class LogWriter:
 
     def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
         """Return (M,) channel numbers and (M,) lanes; channels that are new are numbered as they come."""
-        known, first = np.unique(messages.channel, return_index=True)
-        number = np.zeros(int(known.max()) + 1, np.int64)
+        local_numbers, first = np.unique(messages.channel, return_index=True)
+        number = np.zeros(int(local_numbers.max()) + 1, np.int64)
         lane = np.zeros(len(number), np.int64)
-        for local_number in known[np.argsort(first)].tolist():
+        for local_number in local_numbers[np.argsort(first)].tolist():
             channel = messages.channels[local_number]
             lane[local_number] = not channel.topic.startswith(OWN_PREFIX)
             if channel not in self._channels:
@@ -427,7 +432,7 @@ class LogWriter:
             record = records.Schema(id=number, data=schema.data, encoding=schema.encoding, name=schema.name)
             if is_new:
                 self._summary.schemas.append(record)
-            described = encoded(record)
+            described = encode_records(record)
         self._channels[channel] = len(self._channels) + 1
         declared = records.Channel(
             id=self._channels[channel],
@@ -437,7 +442,7 @@ class LogWriter:
             schema_id=0 if schema is None else self._schemas[schema],
         )
         self._summary.channels.append(declared)
-        self._declarations[declared.id] = _Declaration(described, encoded(declared))
+        self._declarations[declared.id] = _Declaration(described, encode_records(declared))
 
     def _end(self, number: int) -> None:
         """Have the open chunk of a lane packed on another thread, and write those that are ready."""
@@ -445,20 +450,25 @@ class LogWriter:
         self._lanes[number] = _Lane(lane.is_own)
         self._packing.append((lane.size, self._threads.submit(_pack, lane, self._declaring(lane))))
         self._packing_bytes += lane.size
-        self._write_packed(WAITING_BYTES)
+        self._write_ready_chunks(WAITING_BYTES)
 
     def _declaring(self, lane: _Lane) -> bytes:
         """Return the declarations that a chunk begins with; each schema is in it once."""
         start_ns = lane.first_ns
         counts = sum(np.bincount(part.channels, minlength=len(self._channels) + 1) for part in lane.records)
-        own = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
-        due = [each for each in own if start_ns >= each.due_ns]
-        for each in due:
-            each.count += 1
-            each.due_ns = -FOREVER if each.count < 2 else start_ns + REPEAT_NS
-        return b"".join(chain(dict.fromkeys(each.schema for each in due), (each.channel for each in due)))
+        declarations = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
+        due = [declaration for declaration in declarations if start_ns >= declaration.due_ns]
+        for declaration in due:
+            declaration.count += 1
+            declaration.due_ns = -FOREVER if declaration.count < 2 else start_ns + REPEAT_NS
+        return b"".join(
+            chain(
+                dict.fromkeys(declaration.schema for declaration in due),
+                (declaration.channel for declaration in due),
+            )
+        )
 
-    def _write_packed(self, waiting_bytes: int) -> None:
+    def _write_ready_chunks(self, waiting_bytes: int) -> None:
         """Write chunks in their order until no more bytes are waiting, and those that are ready."""
         while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
             size, packing = self._packing.popleft()
@@ -470,7 +480,7 @@ class LogWriter:
 
     def _write_record(self, record: records.McapRecord) -> tuple[int, int]:
         """Write a record; return its place and length."""
-        offset, content = self._offset, encoded(record)
+        offset, content = self._offset, encode_records(record)
         self._write(content)
         return offset, len(content)
 
