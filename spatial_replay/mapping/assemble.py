@@ -332,7 +332,7 @@ class _Assembling:
     def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:
         reader = stamped.reader
         if len(stamped.times_ns):
-            self._note_arrived(reader, stamped.times_ns, stamped.contents)
+            self._note_arrivals(reader, stamped.times_ns, stamped.contents)
         log_times_ns = arrived.log_time_ns[stamped.places]
         if reader.is_mapped:
             arrivals = self._tracker.evidence[reader.name].arrivals
@@ -392,7 +392,7 @@ class _Assembling:
             self._forgot_ns = upto_ns
         return trace
 
-    def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
+    def _note_arrivals(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         """Note messages of a topic with their times on its clock, decoded where frames matter."""
 
     def _columns(self, messages: Sequence[Message]) -> MessageColumns:
@@ -921,7 +921,7 @@ class LiveAssembler(_Assembling):
                 self._is_in_order = False
         return times_ns, counts
 
-    def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
+    def _note_arrivals(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         name = reader.name
         newest_ns = np.maximum.accumulate(np.append(self._latest_of[name], times_ns))
         self._latest_of[name] = int(newest_ns[-1])

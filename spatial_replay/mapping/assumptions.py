@@ -229,10 +229,10 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
     # a tag on a table, seen from above, is upside down, and as if upright and not turned in the other order
     if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * count):
         return None
-    other = "xyzw" if layout.order == "wxyz" else "wxyz"
+    other_order = "xyzw" if layout.order == "wxyz" else "wxyz"
     return (
         f"{upright:,} of {counted(count, 'object')} stand upright if the order of the four numbers is"
-        f" {layout.order}, and {other_upright:,} if it is {other}"
+        f" {layout.order}, and {other_upright:,} if it is {other_order}"
     )
 
 
@@ -421,7 +421,7 @@ def _precision(evidence: TopicEvidence, log: Log) -> str | None:
     is_geodetic = evidence.planned.is_geodetic
     if is_geodetic:
         step *= _METRES_A_DEGREE
-    sizes = [other.size.median for other in log.values() if other.size.median > 0]
+    sizes = [topic.size.median for topic in log.values() if topic.size.median > 0]
     if step < _COARSE * min(sizes, default=np.inf):
         return None
     place = f"{most:.0f} degrees" if is_geodetic else f"{most:.0f}"
@@ -538,9 +538,9 @@ def _extent(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
-    others = [other for other in log.values() if other is not evidence and other.objects]
-    sizes = [other.size.median for other in others if other.size.median > 0]
-    speeds = [other.motions.speed.quantile(0.9) for other in others]
+    others = [topic for topic in log.values() if topic is not evidence and topic.objects]
+    sizes = [topic.size.median for topic in others if topic.size.median > 0]
+    speeds = [topic.motions.speed.quantile(0.9) for topic in others]
     speeds = [speed for speed in speeds if speed > 0]
     size, arrivals = evidence.size.median, evidence.arrivals
     # messages that are recorded in bursts only seem to be fast
@@ -608,7 +608,7 @@ def _unset(evidence: TopicEvidence, log: Log) -> str | None:
     return f"{', '.join(counts)}, so it is unknown there"
 
 
-def _unturned(evidence: TopicEvidence, log: Log) -> str | None:
+def _zero_quaternions(evidence: TopicEvidence, log: Log) -> str | None:
     extractor = evidence.reader.extractor
     if extractor is None or not 0 < extractor.unturned < extractor.turned:
         return None
@@ -874,7 +874,7 @@ ASSUMPTIONS: Final = (
         "orientation_set",
         "Orientations are set.",
         "quaternions of zeros among others",
-        _unturned,
+        _zero_quaternions,
         "",
         is_remark=True,
     ),

@@ -241,7 +241,7 @@ def rows_from_detections(
     unknown = np.zeros(count, np.bool_)
     covariance = detections.covariance
     if transforms is not None:
-        poses, solids = poses.transform(transforms), _moved(solids, transforms)
+        poses, solids = poses.transform(transforms), _transform_solids(solids, transforms)
         unknown = ~transforms.known
         if covariance is not None:
             turn = transforms.rotation
@@ -281,7 +281,7 @@ def rows_from_detections(
     return replace(select(both, np.where(unknown, count + indices, indices)), is_valid=readable & ~unknown)
 
 
-def _moved(solids: Solids, transforms: Transforms) -> Solids:
+def _transform_solids(solids: Solids, transforms: Transforms) -> Solids:
     rotation = transforms.rotation[solids.owner]
     position = np.einsum("nij,nj->ni", rotation, solids.position) + transforms.translation[solids.owner]
     return replace(solids, position=position, rotation=rotation @ solids.rotation)
@@ -388,7 +388,7 @@ class Tracker:
                 if columns.detections is not None and len(times_ns):
                     is_placed = self._take_detections(reader, times_ns, log_times_ns, columns.detections)
                 elif columns.signals.size:
-                    self._count_replaced(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
+                    self._count_replacements(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 if columns.signals.size:
                     self.evidence[name].add_signals(columns.signals)
                 for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
@@ -401,7 +401,7 @@ class Tracker:
                 sampled.append(times_ns)
             elif name in self.plan.fallback_topics:
                 others.append(times_ns)
-        self._store_added()
+        self._store_additions()
         return np.concatenate(sampled), np.concatenate(others)
 
     def _note_messages(self, planned: PlannedTopic, times_ns: Integers, is_placed: Booleans) -> None:
@@ -430,7 +430,7 @@ class Tracker:
         if not len(times_ns):
             return Trace.empty()
         codes, rows, classes, reported_ns = self._states(times_ns, newest_ns)
-        self._store_added()
+        self._store_additions()
         names = [self.names.by_code[code] for code in codes.tolist()]
         appears = (rows != ABSENT).any(axis=0).tolist()
         order = sorted((i for i in range(len(names)) if appears[i]), key=names.__getitem__)
@@ -547,7 +547,7 @@ class Tracker:
             key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
             for key, series in self._signals.items()
         }
-        self._store_added()
+        self._store_additions()
 
     def _take_detections(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
@@ -558,7 +558,9 @@ class Tracker:
         self._claim_names(reader.name, detections.name)
         layout = reader.planned.layout
         is_complete = layout is not None and layout.complete
-        self._count_replaced(reader.name, times_ns, _replaced(detections, times_ns, is_complete=is_complete))
+        self._count_replacements(
+            reader.name, times_ns, _superseded_messages(detections, times_ns, is_complete=is_complete)
+        )
 
         def report(index: int, what: str) -> None:
             name = self.names.by_code[int(detections.name[index])]
@@ -601,11 +603,11 @@ class Tracker:
             for row in np.unique(rows).tolist():
                 if row in self._following:
                     where = np.flatnonzero(rows == row)
-                    rows[where] = self._placed(topic, self._following[row], times_ns[where])
+                    rows[where] = self._rows_at(topic, self._following[row], times_ns[where])
                     # a transform is a report of where it is now
                     reported_ns[where] = times_ns[where]
 
-    def _placed(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
+    def _rows_at(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
         """Return the rows of an object that stays in a frame, where that is at some times."""
         mapping, (frame, detections, index) = self.plan.mapping, following
         fixed, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
@@ -627,7 +629,7 @@ class Tracker:
             is_known = frame in self.tree.names
             self.remarks.missing.add((topic, frame, is_known), times_ns)
 
-    def _count_replaced(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
+    def _count_replacements(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
         """Count messages of which nothing, or not all, counts, because a later one has the same time."""
         start_ns, end_ns = self.window_ns
         at = times_ns[replaced]
@@ -635,7 +637,7 @@ class Tracker:
         if len(at):
             self.remarks.replaced.add(topic, at)
 
-    def _store_added(self) -> None:
+    def _store_additions(self) -> None:
         if self._added:
             self._rows = concatenated([self._rows, *self._added])
             self._added = []
@@ -925,7 +927,7 @@ def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
     return f"; its stamp is {stamp_ns / 1e9:.3g} s, in {year}{remedy}"
 
 
-def _replaced(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:
+def _superseded_messages(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:
     """Return the messages with an object that a later message of the same time reports, or leaves out."""
     followed = np.append(times_ns[1:] == times_ns[:-1], False)
     if is_complete or not followed.any():

@@ -170,7 +170,7 @@ class Transforms(NamedTuple):
             self.known & first.known,
         )
 
-    def inverted(self) -> Transforms:
+    def inverse(self) -> Transforms:
         """Return b_from_a for a_from_b."""
         rotation = np.swapaxes(self.rotation, 1, 2)
         return Transforms(rotation, -np.einsum("nij,nj->ni", rotation, self.translation), self.known)
@@ -267,7 +267,7 @@ class FrameTree:
             log_ns: when the message was recorded.
         """
         entry = _Entry(stamp_ns, clock_ns, parent, pose, log_ns)
-        if (reason := _why_ignored(child, entry)) is not None:
+        if (reason := _reason_to_ignore(child, entry)) is not None:
             count, first, first_child = self._ignored.get(reason, (0, entry, child))
             self._ignored[reason] = count + 1, first, first_child
             return
@@ -403,7 +403,7 @@ class FrameTree:
             return Transforms.unknown(len(ask.times_ns))
         common_from_source = self._climb(up[: up.index(common)], ask)
         common_from_target = self._climb(down[: down.index(common)], ask)
-        return common_from_target.inverted().after(common_from_source)
+        return common_from_target.inverse().after(common_from_source)
 
     def _ancestors(self, frame: str, ask: _Question) -> list[str]:
         """Return a frame, its parent, the parent of that and so on, at the first time."""
@@ -633,7 +633,7 @@ def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
     )
 
 
-def _why_ignored(child: str, entry: _Entry) -> str | None:
+def _reason_to_ignore(child: str, entry: _Entry) -> str | None:
     """Return why a transform does not count, as in tf2; None if it does."""
     if not child or not entry.parent:
         return "it has no name for the frame or its parent (child_frame_id, frame_id)"

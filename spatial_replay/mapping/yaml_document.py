@@ -76,7 +76,7 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
         document.faults.append((1, f"the file is larger than {largest // 1024} KiB; {what} is not"))
         return document
     try:
-        if fault := _find_unsupported(yaml.parse(text, Loader=yaml.SafeLoader), what):
+        if fault := _find_unsupported_feature(yaml.parse(text, Loader=yaml.SafeLoader), what):
             document.faults.append(fault)
             return document
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -103,7 +103,7 @@ def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
     return "; put patterns in quotes: 'logs/run-[0-3]*.mcap'"
 
 
-def _find_unsupported(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
+def _find_unsupported_feature(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
     """Find the first feature that such files do not need and that could make a short text mean much."""
     import yaml
 
