@@ -86,12 +86,12 @@ class Trigger:
         if self.most_bytes < 2**20:
             raise UsageError(f"most_bytes is {self.most_bytes}; a ring takes 1 MB (1048576) or more")
         for text in self.texts:
-            _parsed(text)
+            _parse_condition(text)
 
     @property
     def texts(self) -> list[str]:
         """Its conditions; one is enough."""
-        return [each.strip() for each in ([self.when] if isinstance(self.when, str) else self.when)]
+        return [condition.strip() for condition in ([self.when] if isinstance(self.when, str) else self.when)]
 
 
 def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[Monitor]) -> Condition:
@@ -103,7 +103,7 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
     Raises:
         UsageError: it is none, or names no spec.
     """
-    name, what = _parsed(text)
+    name, what = _parse_condition(text)
     if what == MANUAL:
         return lambda updates, has_changed: None
     if what == EVENT:
@@ -131,14 +131,14 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
         hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
         raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
     if isinstance(what, _Below):
-        monitor = next(each for each in monitors if name in each.names)
+        monitor = next(monitor for monitor in monitors if name in monitor.names)
         below = f"{name} {'possibly ' if what.is_possible else ''}below {what.number:g}"
         end = 0 if what.is_possible else 1
         return lambda updates, _: below if monitor.interval(name)[end] < what.number else None
     return lambda updates, _: f"{name} {what}" if _verdict(updates, name) == what else None
 
 
-def _parsed(text: str) -> tuple[str, str | _Below]:
+def _parse_condition(text: str) -> tuple[str, str | _Below]:
     """Return the spec that a condition names, "" for none, and a verdict, `EVENT`, `MANUAL`, or the number
     that its robustness falls below.
 
@@ -365,24 +365,24 @@ class ClipLog(RecorderLog):
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what happened since the last call."""
-        taken: list[str] = []
+        remarks: list[str] = []
         with suppress(queue.Empty):
             while True:
-                taken.append(self._remarks.get_nowait())
-        return tuple(taken)
+                remarks.append(self._remarks.get_nowait())
+        return tuple(remarks)
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Take the next samples and messages into the ring; write what belongs to an open clip."""
-        come = [*self._held_messages(messages)]
-        come += [_Held(each.time_ns, each, _sample_bytes(each)) for each in samples]
+        entries = [*self._held_messages(messages)]
+        entries += [_Held(sample.time_ns, sample, _sample_bytes(sample)) for sample in samples]
         self._begin_due()
         # in the order of time, so that the ring holds what is around the sample that fires
-        for item in sorted(come, key=lambda each: each.time_ns):
-            if self._zero_ns is None and isinstance(item.content, Sample):
-                self._zero_ns = item.time_ns
-            self._hold(item)
-            if isinstance(item.content, Sample):
-                self._evaluate(item.content)
+        for entry in sorted(entries, key=lambda entry: entry.time_ns):
+            if self._zero_ns is None and isinstance(entry.content, Sample):
+                self._zero_ns = entry.time_ns
+            self._hold(entry)
+            if isinstance(entry.content, Sample):
+                self._evaluate(entry.content)
             self._begin_due()
         if self._open is not None:
             self._open.write()
@@ -429,7 +429,7 @@ class ClipLog(RecorderLog):
         """Fire if a condition holds that did not hold before."""
         updates = [monitor.update(sample) for monitor in self._monitors]
         changes = list(self._changes.after(updates))
-        has_changed = not all(each.is_first for each in changes)
+        has_changed = not all(change.is_first for change in changes)
         for text, condition in self._conditions:
             reason = condition(updates, has_changed)
             if reason is not None and not self._held_before[text]:
@@ -460,7 +460,9 @@ class ClipLog(RecorderLog):
 
     def _held_messages(self, messages: Messages) -> Iterator[_Held]:
         self._channels = messages.channels or self._channels
-        static = {n for n, each in messages.channels.items() if each.topic.rsplit("/", 1)[-1] == _STATIC}
+        static = {
+            n for n, channel in messages.channels.items() if channel.topic.rsplit("/", 1)[-1] == _STATIC
+        }
         for row in messages.rows():
             held = _Held(row.log_time_ns, row, _MESSAGE_BYTES + len(row.payload))
             if row.channel in static:
@@ -509,9 +511,9 @@ class ClipLog(RecorderLog):
         clip.until_ns = max(clip.until_ns, at_ns + self._after_ns)
 
     def _between(self, begin_ns: int, end_ns: int) -> list[_Held]:
-        every = [*self._messages, *self._samples, *self._events]
-        chosen = [each for each in every if begin_ns <= each.time_ns <= end_ns]
-        return sorted(chosen, key=lambda each: each.time_ns)
+        entries = [*self._messages, *self._samples, *self._events]
+        entries_within = [entry for entry in entries if begin_ns <= entry.time_ns <= end_ns]
+        return sorted(entries_within, key=lambda entry: entry.time_ns)
 
     def _evict(self) -> None:
         """Let go of what is too old and of what is too much, the oldest first."""
@@ -549,8 +551,8 @@ class ClipLog(RecorderLog):
             for kind, times_ns in self._missed.items()
         }
         end = RunEnd(is_interrupted, missed["sample"], missed["message"])
-        written = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
-        self.written = (*self.written, written)
+        outcome = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
+        self.written = (*self.written, outcome)
         more = counted(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
         lost = "".join(
             f"; {counted(count, kind)} of it {'was' if count == 1 else 'were'} dropped"
@@ -558,8 +560,8 @@ class ClipLog(RecorderLog):
             if count
         )
         self._remarks.put(
-            f"wrote {clip.path}: {written.held_s:.1f} s before and up to {self._trigger.after_s:g} s after"
-            f" {written.reason}{f', and {more}' if more else ''}{lost}"
+            f"wrote {clip.path}: {outcome.held_s:.1f} s before and up to {self._trigger.after_s:g} s after"
+            f" {outcome.reason}{f', and {more}' if more else ''}{lost}"
         )
 
 

@@ -147,7 +147,7 @@ class Recording:
             self._evaluation.annotator.count_from(int(about[ZERO]))
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
-            sink.add_metadata(AUTOMATA, {each.name: each.summary for each in self.automata})
+            sink.add_metadata(AUTOMATA, {automaton.name: automaton.summary for automaton in self.automata})
         automata = automata_attachments(self.automata, RECORDED_PREFIX)
         for attachment in [*specification_attachments(files, RECORDED_PREFIX), *automata]:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
@@ -190,13 +190,13 @@ class Recording:
             TraceError: samples that are not after those before.
         """
         stretches = self._evaluation.extend(trace)
-        own = self._own(trace, beside)
-        self._sink.write_messages(merge([own, *self._evaluation.annotator.messages(trace, stretches)]))
+        messages = self._count_messages(trace, beside)
+        self._sink.write_messages(merge([messages, *self._evaluation.annotator.messages(trace, stretches)]))
         self._hashes.add_results(stretches)
 
     def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
         """Write the next samples alone; `evaluate` them later, in any pieces, before more than these."""
-        self._sink.write_messages(self._own(trace, beside))
+        self._sink.write_messages(self._count_messages(trace, beside))
 
     def evaluate(self, trace: Trace) -> None:
         """Write the messages of the evaluation of samples that were added before."""
@@ -211,23 +211,23 @@ class Recording:
         """
         self._sink.write_messages(merge(self._evaluation.annotator.occurrence(*event)))
 
-    def _own(self, trace: Trace, beside: Messages | None) -> Messages:
+    def _count_messages(self, trace: Trace, beside: Messages | None) -> Messages:
         """Return samples and messages beside them as they are written; count and hash them."""
-        own = sample_messages(trace, self._samples)
-        written = own
+        replayable = sample_messages(trace, self._samples)
+        messages = replayable
         if beside is not None and len(beside):
             # a replay does not keep messages on our topics, such as planning times
-            kept = beside.of_topics({each.topic for each in beside.channels.values()} - DERIVED)
-            own, written = merge([own, kept]), merge([own, beside])
+            copied = beside.of_topics({channel.topic for channel in beside.channels.values()} - DERIVED)
+            replayable, messages = merge([replayable, copied]), merge([replayable, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
             self._images |= image_topics(beside.channels.values())
-            self._messages += len(kept)
-        if len(written):
-            self._start_ns = min(self._start_ns, int(written.log_time_ns[0]))
-            self._end_ns = max(self._end_ns, int(written.log_time_ns[-1]))
+            self._messages += len(copied)
+        if len(messages):
+            self._start_ns = min(self._start_ns, int(messages.log_time_ns[0]))
+            self._end_ns = max(self._end_ns, int(messages.log_time_ns[-1]))
         self._samples += len(trace)
-        self._hashes.add_samples(trace, own)
-        return written
+        self._hashes.add_samples(trace, replayable)
+        return messages
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Write a metadata record; the certificate covers that of a plan, and of doubts."""
@@ -254,11 +254,11 @@ class Recording:
             results = [(self._evaluation.trees[place], streams[place]) for place in places]
             texts = {
                 tree.title: verdict_text(
-                    each.verdict,
-                    (float(each.robustness[0]), *each.final[0].tolist()),
+                    stream.verdict,
+                    (float(stream.robustness[0]), *stream.final[0].tolist()),
                     declared_unit(tree.formula, self._evaluation.units),
                 )
-                for tree, each in results
+                for tree, stream in results
             }
             self._sink.add_metadata(VERDICTS, texts)
         self._sink.add_metadata(ENDING, ending)
@@ -480,7 +480,7 @@ def _record_trial(files: Sequence[Specification], automata: Sequence[SpecAutomat
         Sample(
             time_s * 10**9,
             {
-                name: _tracked(index + time_s, 0.1 * index + time_s)
+                name: _example_object(index + time_s, 0.1 * index + time_s)
                 for index, name in enumerate(dict.fromkeys(objects))
             },
             signals,
@@ -498,7 +498,7 @@ def _record_trial(files: Sequence[Specification], automata: Sequence[SpecAutomat
     contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
 
 
-def _tracked(kind: int, x: float) -> TrackedObject:
+def _example_object(kind: int, x: float) -> TrackedObject:
     box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
     footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
     return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
@@ -562,12 +562,12 @@ class VerdictChanges:
         name = spec.spec.name
         about = requirement_text(spec.spec.id, spec.spec.title)
         title = f"`{name}` ({about})" if about else f"`{name}`"
-        reasons = [each.reason for each in update.satisfied if each.spec is spec.spec]
+        reasons = [result.reason for result in update.satisfied if result.spec is spec.spec]
         sentence = change_sentence(
             title, period, reasons[0] if period.code == SATISFIED and reasons else "", spec.unit
         )
         if period.code == VIOLATED:
-            own = {node for node in spec.names if node is not None} | {name}
-            reasons = [str(each) for each in update.violations if each.spec in own]
+            names = {node for node in spec.names if node is not None} | {name}
+            reasons = [str(violation) for violation in update.violations if violation.spec in names]
             sentence = f"{title} is permanently violated: {'; '.join(reasons)}." if reasons else sentence
         return VerdictChange(update.time_ns, name, _WORDS[period.code], sentence, is_first)

@@ -144,10 +144,10 @@ def payload_encoder(channel: Channel) -> Callable[[object], bytes]:
                     f"{channel.topic} has messages of {channel.schema.name}; this one is a {name}"
                 )
             return data.SerializeToString()
-        wanted = {"json": "a dict or bytes", "protobuf": "a message of its class or bytes"}
+        accepted_forms = {"json": "a dict or bytes", "protobuf": "a message of its class or bytes"}
         raise UsageError(
             f"{channel.topic} has {channel.encoding} messages, and {shortened(data)} is"
-            f" {type(data).__name__}; give {wanted.get(channel.encoding, 'bytes')}"
+            f" {type(data).__name__}; give {accepted_forms.get(channel.encoding, 'bytes')}"
         )
 
     return encode
@@ -194,7 +194,7 @@ def _text(topic: str, encoding: str, schema: object) -> bytes:
         return schema.encode()
     if isinstance(schema, bytes):
         return schema
-    wanted = {
+    accepted_form = {
         "protobuf": "the message class, or the bytes of a FileDescriptorSet",
         "flatbuffer": "the bytes of a .bfbs file",
         "ros1": "the text of the definition",
@@ -202,7 +202,7 @@ def _text(topic: str, encoding: str, schema: object) -> bytes:
     }.get(encoding, "a JSON schema, as a dict or its text")
     raise UsageError(
         f"{topic}: the schema of {encoding} messages is {shortened(schema)} ({type(schema).__name__});"
-        f" give {wanted}"
+        f" give {accepted_form}"
     )
 
 
@@ -229,19 +229,21 @@ def _check_descriptors(topic: str, text: bytes, name: str) -> None:
             f"{topic}: the schema is not a FileDescriptorSet; give the message class, or the bytes that"
             " protoc --include_imports --descriptor_set_out writes"
         ) from None
-    known = [full for file in files.file for full in _type_names(file.package, file.message_type)]
-    if name not in known:
+    type_names = [
+        type_name for file in files.file for type_name in _type_names(file.package, file.message_type)
+    ]
+    if name not in type_names:
         raise UsageError(
-            f"{topic}: the schema has no message {name!r}; it has {listed(known) or 'no message'}"
+            f"{topic}: the schema has no message {name!r}; it has {listed(type_names) or 'no message'}"
         )
 
 
 def _type_names(prefix: str, types: Any) -> list[str]:
-    each: DescriptorProto
+    message_type: DescriptorProto
     names = []
-    for each in types:
-        name = f"{prefix}.{each.name}".lstrip(".")
-        names += [name, *_type_names(name, each.nested_type)]
+    for message_type in types:
+        name = f"{prefix}.{message_type.name}".lstrip(".")
+        names += [name, *_type_names(name, message_type.nested_type)]
     return names
 
 
@@ -315,18 +317,18 @@ class MessageQueue:
         """
         with self.lock:
             self.require_open()
-            known = self.channels.get(channel.topic)
-            if known is None:
+            message_channel = self.channels.get(channel.topic)
+            if message_channel is None:
                 number = len(self.channels)
-                known = MessageChannel(self, number, channel)
+                message_channel = MessageChannel(self, number, channel)
                 # replaced, never changed: the writing thread may be reading it
                 self._declared = MappingProxyType({**self._declared, number: channel})
-                self.channels[channel.topic] = known
-            elif known.declaration != channel:
+                self.channels[channel.topic] = message_channel
+            elif message_channel.declaration != channel:
                 raise UsageError(
                     f"{channel.topic} is open already with another encoding or schema; give one topic to each"
                 )
-            return known
+            return message_channel
 
     def require_open(self) -> None:
         """Check that messages can be taken.
@@ -364,15 +366,15 @@ class MessageQueue:
 
     def take(self) -> Messages:
         """Return some of the messages that wait, none if there are none; for the writing thread."""
-        taken: list[Row] = []
+        rows: list[Row] = []
         size = 0
         with suppress(queue.Empty):
             while size < _TOGETHER_BYTES:
-                message = self._queue.get_nowait()
-                taken.append(message)
-                size += len(message.payload)
+                row = self._queue.get_nowait()
+                rows.append(row)
+                size += len(row.payload)
         self._bytes_out += size
-        return Messages.from_rows(self._declared, taken)
+        return Messages.from_rows(self._declared, rows)
 
     def _is_full(self, size: int) -> bool:
         waiting_bytes = self._bytes_in - self._bytes_out
@@ -414,7 +416,7 @@ class MessageChannel:
             UsageError: a time out of range or order, data that does not fit the channel, a closed recorder.
             OutputError: something before could not be written.
         """
-        time_ns = self._checked(time_ns)
+        time_ns = self._check_time(time_ns)
         payload = self._encode(data)
         queue = self._queue
         with queue.lock:
@@ -443,7 +445,7 @@ class MessageChannel:
             self.dropped += 1
             self._queue.missed(time_ns)
 
-    def _checked(self, time_ns: object) -> int:
+    def _check_time(self, time_ns: object) -> int:
         try:
             number = operator.index(time_ns)  # type: ignore[arg-type]
         except TypeError:
@@ -587,11 +589,11 @@ class SampleWriter:
             UsageError: a topic of ours, or one that is open with another definition; a closed recorder.
             OutputError: something before could not be written.
         """
-        own = self._messages.channels.get(channel.topic)
-        if own is None or own.declaration != channel:
+        message_channel = self._messages.channels.get(channel.topic)
+        if message_channel is None or message_channel.declaration != channel:
             check_topic(channel.topic)
-            own = self._messages.channel(channel)
-        own.copy(time_ns, payload)
+            message_channel = self._messages.channel(channel)
+        message_channel.copy(time_ns, payload)
 
     def write(self, sample: Sample) -> None:
         """Hand over the next sample; return at once unless the queue is full.
@@ -679,22 +681,22 @@ class SampleWriter:
         self._try(self._write_waiting)
 
     def _write_waiting(self) -> None:
-        flushed = taken = time.monotonic()
+        flushed_s = drained_s = time.monotonic()
         ended = False
         while not ended:
             now = time.monotonic()
             samples, ended = self._waiting_samples()
             # those that are left came before the others
-            taken = now if len(samples) < _TOGETHER else taken
+            drained_s = now if len(samples) < _TOGETHER else drained_s
             self._record(samples, self._messages.take())
             self._report_events()
             # decisions come before the samples that follow them
             while self._drains and len(messages := self._messages.take()):
                 self._record([], messages)
-            if self._messages.failure is None and time.monotonic() - flushed >= FLUSH_S:
+            if self._messages.failure is None and time.monotonic() - flushed_s >= FLUSH_S:
                 self._try(self._log.flush)
-                flushed = time.monotonic()
-                self._unsafe_s = taken if self._queue.qsize() else None
+                flushed_s = time.monotonic()
+                self._unsafe_s = drained_s if self._queue.qsize() else None
         while len(messages := self._messages.take()):
             self._record([], messages)
 
@@ -1062,7 +1064,7 @@ def record_source(
         if output.is_file():
             output.unlink(missing_ok=True)
         raise
-    return tally.recorded(source.name, files)
+    return tally.summary(source.name, files)
 
 
 def _units_metadata(source: Source, unit: str) -> dict[str, str]:
@@ -1138,7 +1140,7 @@ class _Tally:
         if len(trace):
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
 
-    def recorded(self, name: str, files: Sequence[Specification]) -> Recorded:
+    def summary(self, name: str, files: Sequence[Specification]) -> Recorded:
         names, signals = sorted(self._names), sorted(self._signals)
         remarks = [remark for file in files for remark in check_names(file, names, signals)]
         doubts = (doubt.remark(name) for doubt in dict.fromkeys(self.doubts))
