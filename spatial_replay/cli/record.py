@@ -144,7 +144,7 @@ def video(
     from spatial_replay.logs.output_file import refuse_existing
     from spatial_replay.perception.observer import camera_names
     from spatial_replay.perception.tags_file import load_tags
-    from spatial_replay.runs.record_video import record_seen
+    from spatial_replay.runs.record_video import record_cameras
 
     if bool(sources) == (camera is not None):
         raise UsageError("give either videos or a log, or --camera N")
@@ -167,7 +167,7 @@ def video(
 
     inputs = [*sources, tags_file, *specs]
     with progress("frames") as advance:
-        seen = record_seen(
+        seen = record_cameras(
             cameras,
             tags,
             output,

@@ -69,13 +69,13 @@ def asked_colours(
     worst: dict[str, int] = {}
     at = np.zeros(1, np.int64)
     specs = [spec for update in updates for spec in update.specs]
-    for of_spec, spec in zip(requirements, specs, strict=True):
+    for spec_requirements, spec in zip(requirements, specs, strict=True):
         if spec.numbers is None:
             continue
         series = spec.numbers[:, :, None]
-        for each in of_spec:
-            standing = _RANKS[Standing(int(each.standing(series, at)[0]))]
-            for name in _members(each, sample):
+        for requirement in spec_requirements:
+            standing = _RANKS[Standing(int(requirement.standing(series, at)[0]))]
+            for name in _members(requirement, sample):
                 worst[name] = max(worst.get(name, 0), standing)
     return {name: _COLOURS[worst.get(name, 0)] for name in sample.objects}
 
@@ -93,8 +93,8 @@ _COLOURS: Final = (NEUTRAL, POSITIVE, NEUTRAL, NEGATIVE)
 def _members(requirement: Requirement, sample: Sample) -> set[str]:
     names = set(requirement.objects)
     for group in requirement.groups:
-        for name, each in sample.objects.items():
-            if group.class_name in (ANY_CLASS, (each.class_name or "").casefold()):
+        for name, tracked_object in sample.objects.items():
+            if group.class_name in (ANY_CLASS, (tracked_object.class_name or "").casefold()):
                 names |= {name} - group.excluded
     return names
 
@@ -115,12 +115,12 @@ def encode_annotations(seen: View, sample: Sample, colours: Mapping[str, Colour]
         _text(message, time_ns, str(detection.id), detection.corners.mean(axis=0), NEUTRAL, 0.7 * _LETTERS)
     if seen.plane is None:
         return message.SerializeToString(deterministic=True)
-    for name, each in sample.objects.items():
+    for name, tracked_object in sample.objects.items():
         colour = colours.get(name, NEUTRAL)
         # as high as its upper face, where its tags are
-        z = 0.0 if each.height is None else each.height[1]
+        z = 0.0 if tracked_object.height is None else tracked_object.height[1]
         lowest: Floats | None = None
-        for part in each.footprint.parts:
+        for part in tracked_object.footprint.parts:
             ring = _ring(part.vertices, part.radius)
             places = np.concatenate([ring, np.full((len(ring), 1), z)], axis=1)
             pixels = seen.plane.pixels(places)
@@ -155,16 +155,16 @@ def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
 def encode_camera_pose(time_ns: int, plane: CameraPlane, frame: str) -> bytes:
     """Return where the camera is in the frame of the scene."""
     message = FrameTransforms()
-    each = message.transforms.add(parent_frame_id=FRAME, child_frame_id=frame)
-    each.timestamp.FromNanoseconds(time_ns)
+    transform = message.transforms.add(parent_frame_id=FRAME, child_frame_id=frame)
+    transform.timestamp.FromNanoseconds(time_ns)
     x, y, z = (-plane.rotation.T @ plane.pose[3:]).tolist()
-    each.translation.x, each.translation.y, each.translation.z = x, y, z
+    transform.translation.x, transform.translation.y, transform.translation.z = x, y, z
     # the other way round than the pose, which takes the scene to the camera
     turn = -plane.pose[:3]
     angle = float(np.linalg.norm(turn))
     part = math.sin(angle / 2) / angle if angle > 0 else 0.5
-    each.rotation.w = math.cos(angle / 2)
-    each.rotation.x, each.rotation.y, each.rotation.z = (part * turn).tolist()
+    transform.rotation.w = math.cos(angle / 2)
+    transform.rotation.x, transform.rotation.y, transform.rotation.z = (part * turn).tolist()
     return message.SerializeToString(deterministic=True)
 
 
@@ -183,25 +183,25 @@ def _ring(vertices: Floats, radius: float) -> Floats:
 def _outline(
     message: ImageAnnotations, time_ns: int, pixels: Floats, colour: Colour, thickness: float
 ) -> None:
-    each = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=thickness)
-    each.timestamp.FromNanoseconds(time_ns)
-    each.outline_color.r, each.outline_color.g, each.outline_color.b = colour
-    each.outline_color.a = 1.0
+    outline = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=thickness)
+    outline.timestamp.FromNanoseconds(time_ns)
+    outline.outline_color.r, outline.outline_color.g, outline.outline_color.b = colour
+    outline.outline_color.a = 1.0
     for x, y in pixels.tolist():
         # viewers count from the outer corner of the first pixel
-        each.points.add(x=x + 0.5, y=y + 0.5)
+        outline.points.add(x=x + 0.5, y=y + 0.5)
 
 
 def _text(
     message: ImageAnnotations, time_ns: int, text: str, place: Floats, colour: Colour, size: float
 ) -> None:
-    each = message.texts.add(text=text, font_size=size)
-    each.timestamp.FromNanoseconds(time_ns)
-    each.position.x, each.position.y = (place + 0.5).tolist()
-    each.text_color.r, each.text_color.g, each.text_color.b = colour
-    each.text_color.a = 1.0
-    each.background_color.r = each.background_color.g = each.background_color.b = 1.0
-    each.background_color.a = 0.8
+    label = message.texts.add(text=text, font_size=size)
+    label.timestamp.FromNanoseconds(time_ns)
+    label.position.x, label.position.y = (place + 0.5).tolist()
+    label.text_color.r, label.text_color.g, label.text_color.b = colour
+    label.text_color.a = 1.0
+    label.background_color.r = label.background_color.g = label.background_color.b = 1.0
+    label.background_color.a = 0.8
 
 
 # -------------------------------------------------------------------------------------------------- recording
@@ -265,7 +265,7 @@ class SeenRun:
     kept: tuple[KeepVideo, ...]
 
 
-def record_seen(
+def record_cameras(
     cameras: Sequence[FrameSource],
     tags: TagsFile,
     output: Path,
@@ -300,18 +300,18 @@ def record_seen(
     """
     refuse_templates(files)
     names = camera_names(cameras)
-    kept: list[KeepVideo] = []
+    keep_modes: list[KeepVideo] = []
     for camera in cameras:
         if keep == "copy" and camera.copy_fault is not None:
             raise UsageError(f"the video cannot be copied: {camera.copy_fault}; write --keep-video h264")
-        kept.append(keep or ("copy" if camera.copy_fault is None else "h264"))
+        keep_modes.append(keep or ("copy" if camera.copy_fault is None else "h264"))
     observer = TagObserver(tags, hold_ns=hold_ns, cameras=names)
     coming = simultaneous(cameras, offsets_ns)
     first = next(coming, None)
     if first is None:
         began = [fault for camera in cameras for fault in camera.faults[:1]]
-        listed = " and ".join(dict.fromkeys(camera.name for camera in cameras))
-        raise LogError("; ".join([f"{listed}: no frame can be read", *began]))
+        camera_list = " and ".join(dict.fromkeys(camera.name for camera in cameras))
+        raise LogError("; ".join([f"{camera_list}: no frame can be read", *began]))
     if keep == "h264" and any(frame is not None and frame.detections is not None for frame in first):
         raise UsageError("detections have no images to encode; leave out --keep-video h264")
     # reference tags that do not fit raise here, before the output is touched
@@ -322,7 +322,7 @@ def record_seen(
     options = {
         "tags": tags.name,
         "hold_ns": observer.hold_ns,
-        "keep_video": kept[0] if len(kept) == 1 else kept,
+        "keep_video": keep_modes[0] if len(keep_modes) == 1 else keep_modes,
         **({"cameras": names, "offsets_ns": [*offsets_ns]} if len(cameras) > 1 else {}),
     }
     sources = list(dict.fromkeys(camera.name for camera in cameras))
@@ -335,25 +335,28 @@ def record_seen(
     begin(first_ns)
     with run_log(output, files, about, inputs, durability=durability) as log:
         log.add_attachment(f"{CAMERA_PREFIX}{tags.name}", "application/yaml", tags.text.encode())
-        pictures = [_Picture(number, *each) for number, each in enumerate(zip(cameras, kept, strict=True), 1)]
+        pictures = [
+            _Picture(number, camera, mode)
+            for number, (camera, mode) in enumerate(zip(cameras, keep_modes, strict=True), 1)
+        ]
         for seen in chain([begun], (observer.observe(*frames) for frames in coming)):
             samples, last_ns = samples + 1, seen.sample.time_ns
             log.write(seen.sample)
             updates: list[Update] = [monitor.update(seen.sample) for monitor in monitors]
             coloured = asked_colours(requirements, seen.sample, updates)
-            for picture, view, own in zip(pictures, seen.views, of_cameras, strict=True):
+            for picture, view, camera_tags in zip(pictures, seen.views, of_cameras, strict=True):
                 if view is not None:
-                    picture.write(log, view, seen.sample, coloured, own.camera)
+                    picture.write(log, view, seen.sample, coloured, camera_tags.camera)
             alone.count(seen)
             for change in changes.after(updates):
                 show(change)
             advance(1)
-    endings = tuple(each for monitor in monitors for each in monitor.endings())
+    endings = tuple(ending for monitor in monitors for ending in monitor.endings())
     faults = tuple(dict.fromkeys(fault for camera in cameras for fault in camera.faults))
     of_sources = [camera.remark for camera in cameras if camera.remark is not None]
     remarks = (*of_sources, *observer.remarks(), *alone.remarks(first_ns, last_ns))
     fits = tuple(zip(names, observer.fits, strict=True))
-    return SeenRun(samples, (last_ns - first_ns) / 1e9, endings, fits, remarks, faults, tuple(kept))
+    return SeenRun(samples, (last_ns - first_ns) / 1e9, endings, fits, remarks, faults, tuple(keep_modes))
 
 
 class _Alone:
@@ -368,9 +371,9 @@ class _Alone:
     def count(self, seen: Observation) -> None:
         """Take in a sample."""
         self._samples += 1
-        there = [place for place, view in enumerate(seen.views) if view is not None]
-        self._together += len(there) > 1
-        for place in there:
+        places_seen = [place for place, view in enumerate(seen.views) if view is not None]
+        self._together += len(places_seen) > 1
+        for place in places_seen:
             self._last[place], self._last_of[place] = self._samples, seen.sample.time_ns
 
     def remarks(self, first_ns: int, last_ns: int) -> Iterator[str]:

@@ -97,26 +97,29 @@ def render(
     depth = None if backdrop is None else backdrop.depth
     # most plates stand still, and are drawn once
     moves = [
-        any((each.centre != same[0].centre).any() or (each.axes != same[0].axes).any() for each in same)
-        for same in zip(*instants, strict=True)
+        any(
+            (plate.centre != plates[0].centre).any() or (plate.axes != plates[0].axes).any()
+            for plate in plates
+        )
+        for plates in zip(*instants, strict=True)
     ]
     still = [plate for plate, is_moved in zip(instants[0], moves, strict=True) if not is_moved]
-    image = _exposed(family, still, camera, pose, base, depth)
+    image = _expose(family, still, camera, pose, base, depth)
     if any(moves):
         total = np.zeros(image.shape, np.uint16)
         for plates in instants:
             moving = [plate for plate, is_moved in zip(plates, moves, strict=True) if is_moved]
-            total += _exposed(family, moving, camera, pose, image, depth)
+            total += _expose(family, moving, camera, pose, image, depth)
         image = ((total + len(instants) // 2) // len(instants)).astype(np.uint8)
     image = blur(image, blur_px)
     # of the brightness: the same in all colours
-    drawn = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
-    brighter = np.rint(drawn * noise).astype(np.int16)
+    normal_noise = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
+    brighter = np.rint(normal_noise * noise).astype(np.int16)
     image = np.clip(image + (brighter if image.ndim == 2 else brighter[..., None]), 0, 255)
     return np.ascontiguousarray(image.astype(np.uint8))
 
 
-def _exposed(
+def _expose(
     family: str, plates: Sequence[Plate], camera: Camera, pose: Floats, base: Image, depth: Floats | None
 ) -> Image:
     image = base.copy()
@@ -152,7 +155,7 @@ def _draw(
     if matrix is None:
         return
     size = (width * _OVERSAMPLED, height * _OVERSAMPLED)
-    drawn = reduce(warp(tile, matrix, size), _OVERSAMPLED).astype(np.float64)
+    tile_pixels = reduce(warp(tile, matrix, size), _OVERSAMPLED).astype(np.float64)
     share = reduce(warp(np.full_like(tile, 255), matrix, size), _OVERSAMPLED) / 255.0
     if depth is not None:
         rows, columns = np.mgrid[low[1] : high[1], low[0] : high[0]]
@@ -162,12 +165,12 @@ def _draw(
         share = share * (
             float(normal @ seen[0]) / along <= depth[low[1] : high[1], low[0] : high[0]] + _BEHIND
         )
-        drawn = drawn * (share > 0)
+        tile_pixels = tile_pixels * (share > 0)
     part = image[low[1] : high[1], low[0] : high[0]]
     if image.ndim == 3:
-        drawn, share = drawn[..., None], share[..., None]
-    # what is drawn is averaged with black beyond the tile, by the share that the tile has
-    part[:] = np.clip(part * (1 - share) + drawn, 0, 255).round().astype(np.uint8)
+        tile_pixels, share = tile_pixels[..., None], share[..., None]
+    # beyond the tile its pixels are averaged with black, by the share of a pixel that the tile covers
+    part[:] = np.clip(part * (1 - share) + tile_pixels, 0, 255).round().astype(np.uint8)
 
 
 @cache
@@ -339,14 +342,14 @@ class Film:
             Plate(_FIRST_REFERENCE + index, np.array([x, y, 0.0]), np.eye(3)[:2], self._views.reference)
             for index, (x, y) in enumerate(self._views.places)
         ]
-        for number, body in _numbered(self._world):
+        for number, body in _bodies_with_tags(self._world):
             pose = poses[body.name]
             moved = np.zeros(3)
             if self._before is not None:
                 moved = share * (pose.position - self._before[body.name].position)
             for index, (x, y) in enumerate(_spots(body)):
-                there = pose.rotation @ np.array([x, y, body.shape.height / 2]) + pose.position + moved
-                plates.append(Plate(number + index, there, pose.rotation.T[:2], self._views.tag))
+                centre = pose.rotation @ np.array([x, y, body.shape.height / 2]) + pose.position + moved
+                plates.append(Plate(number + index, centre, pose.rotation.T[:2], self._views.tag))
         return plates
 
 
@@ -359,10 +362,10 @@ def tags_text(world: Tabletop, cameras: int = 1) -> str:
     """Return the tags file of a world that is at rest, for one or two cameras."""
     view = _VIEWS[world.name][cameras - 1]
     lines = [f"family: {FAMILY}", f"size: {view.tag:g}", "objects:"]
-    for number, body in _numbered(world):
+    for number, body in _bodies_with_tags(world):
         shape = body.shape
         # without a minus before nothing
-        bottom, top = (round(each, 4) + 0.0 for each in world.scene.height(body.name))
+        bottom, top = (round(height, 4) + 0.0 for height in world.scene.height(body.name))
         outline = (
             f"box: [{shape.length:g}, {shape.width:g}]"
             if isinstance(shape, Box)
@@ -385,7 +388,7 @@ def tags_text(world: Tabletop, cameras: int = 1) -> str:
     return "\n".join(lines) + "\n" + camera_text(view.camera)
 
 
-def _numbered(world: Tabletop) -> list[tuple[int, Body]]:
+def _bodies_with_tags(world: Tabletop) -> list[tuple[int, Body]]:
     """Return the bodies, each with the number of its first tag."""
     return [(2 * index, body) for index, body in enumerate(world.bodies)]
 

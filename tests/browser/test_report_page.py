@@ -29,7 +29,7 @@ from spatial_replay.planning import read_decisions
 from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.replay.engine import load_files
 from spatial_replay.report.write import write_report
-from spatial_replay.runs.record_video import record_seen
+from spatial_replay.runs.record_video import record_cameras
 from spatial_replay.sources import open_source
 
 Open = Callable[..., Page]
@@ -165,7 +165,7 @@ def _film(folder: Path) -> None:
     for page, videos in (("filmed", ["table.mp4"]), ("filmed_twice", ["table.mp4", "other.mp4"])):
         log, specifications = folder / f"{page}.mcap", [sr.load_specification(folder / "apart.spatial")]
         cameras = [open_frames(folder / video) for video in videos]
-        record_seen(cameras, load_tags(folder / "tags.yaml"), log, specifications)
+        record_cameras(cameras, load_tags(folder / "tags.yaml"), log, specifications)
         source = open_source(log)
         write_report(source, load_files([], source), folder / f"{page}.html")
 

@@ -470,7 +470,7 @@ def test_a_camera_that_is_unplugged_leaves_a_whole_log(folder: Path) -> None:
     cv2 = pytest.importorskip("cv2")
 
     from spatial_replay.perception import CameraFrames, parse_tags
-    from spatial_replay.runs.record_video import record_seen
+    from spatial_replay.runs.record_video import record_cameras
 
     # for OpenCV, an unplugged camera is a capture that ends: here of a pipe whose other end stops in a frame
     _write_streamed(folder / "table.mp4", folder / "plugged.ts")
@@ -479,7 +479,7 @@ def test_a_camera_that_is_unplugged_leaves_a_whole_log(folder: Path) -> None:
     cable = Thread(target=(folder / "camera").write_bytes, args=(sent[: len(sent) * 2 // 3],))
     cable.start()
     camera = CameraFrames(0, opened=lambda number: cv2.VideoCapture(str(folder / "camera")))
-    seen = record_seen([camera], parse_tags(TABLE), folder / "camera.mcap")
+    seen = record_cameras([camera], parse_tags(TABLE), folder / "camera.mcap")
     cable.join()
     assert 4 <= seen.samples < COUNT and "is it unplugged?" in seen.faults[0]
     assert len(read_trace(folder / "camera.mcap")) == seen.samples
