@@ -313,7 +313,9 @@ def _serve(
             edited = server.edited
             return edited.loaded.write_constants(edited.given)
 
-        return follow_saves(files, server.show_saved, write, refuse=server.show_error, check=server.check)
+        return follow_saves(
+            files, server.show_specifications, write, refuse=server.show_error, check=server.check
+        )
 
 
 @click.command()

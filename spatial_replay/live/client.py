@@ -70,14 +70,14 @@ class MessageData(NamedTuple):
 Frame: TypeAlias = Connected | Advertised | Unadvertised | Warned | MessageData
 
 
-def decoded(raw: str | bytes) -> Frame | None:
+def decode_frame(raw: str | bytes) -> Frame | None:
     """Decode a frame of a server; None for those that a monitor has no use for.
 
     Raises:
         LogError: it does not keep to the protocol; what is wrong with it.
     """
     if isinstance(raw, str):
-        return _decoded_text(raw)
+        return _decode_text(raw)
     if not raw:
         raise LogError("a binary frame is empty")
     if raw[0] != _MESSAGE:
@@ -96,7 +96,7 @@ def subscribe(numbers: Iterable[int]) -> str:
     return json.dumps({"op": "subscribe", "subscriptions": subscriptions})
 
 
-def _decoded_text(raw: str) -> Frame | None:
+def _decode_text(raw: str) -> Frame | None:
     try:
         frame: Any = json.loads(raw)
     except (ValueError, RecursionError) as error:
@@ -320,7 +320,7 @@ class Client:
                     await asyncio.sleep(0)
                     turn_s = arrived_s
                 try:
-                    frame = decoded(raw)
+                    frame = decode_frame(raw)
                 except LogError as error:
                     if not has_warned:
                         has_warned = True

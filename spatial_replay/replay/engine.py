@@ -240,7 +240,7 @@ class LogAccount:
         """Return the assumptions that the log contradicts, whose sentences count time from `first_ns`."""
         return distinct_doubts(self._doubts, first_ns)
 
-    def replayed(
+    def summary(
         self,
         selection: Selection,
         first_ns: int,
@@ -542,7 +542,7 @@ class Replay:
                 dict(self._source.metadata()).get(PLAN_METADATA),
                 (doubt.title for doubt in doubts),
             )
-        return self._account.replayed(self._selection, first_ns, results, certificate)
+        return self._account.summary(self._selection, first_ns, results, certificate)
 
 
 def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trace, list[SeriesBlock]]:

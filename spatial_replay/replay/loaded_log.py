@@ -368,7 +368,7 @@ class LoadedLog:
         stored = [
             logged
             if file is file_as_written
-            else with_numbers(_as_stored(file, file_as_written, logged), self.trace.units)
+            else with_numbers(_storable(file, file_as_written, logged), self.trace.units)
             for file, file_as_written, logged in zip(edited, self._files, self._kept, strict=True)
         ]
         return EditedFiles(self, tuple(stored), MappingProxyType(dict(values)), self._constants(edited))
@@ -566,7 +566,7 @@ def _edit_file(file: Specification, values: Mapping[str, float | str]) -> Specif
     return parse_specification(file.source, filename=file.filename, profile=file.profile, constants=values)
 
 
-def _as_stored(edited: Specification, written: Specification, kept: Specification) -> Specification:
+def _storable(edited: Specification, written: Specification, kept: Specification) -> Specification:
     """Return an edited specification as a log stores it: its text says the new values.
 
     Messages refer to nodes by their place in the text. If a log stores a canonical text of the written one,

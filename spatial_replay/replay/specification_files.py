@@ -106,7 +106,7 @@ class SpecificationFiles:
             yield_on_timeout=True,
             recursive=False,
         ):
-            yield self._saved() if self._state() != self._read else None
+            yield self._wait_for_save() if self._state() != self._read else None
 
     def write(
         self, values: Sequence[Mapping[str, float | str]] = (), loaded: Sequence[Specification] = ()
@@ -162,7 +162,7 @@ class SpecificationFiles:
                     f"{name} was just saved as {saved}; write it again once the saved file is evaluated"
                 )
 
-    def _saved(self) -> list[Specification] | SpatialReplayError | None:
+    def _wait_for_save(self) -> list[Specification] | SpatialReplayError | None:
         """Return the files as saved; None if their text is the one before, or they change all the time."""
         before, give_up = self._sources, time.monotonic() + _PATIENCE_S
         while time.monotonic() < give_up:

@@ -130,9 +130,9 @@ def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]
     faults: list[str] = []
     for series, lost in _iter_series(source):
         faults += lost
-        for each in series:
-            result = (each.specification, each.object or None)
-            for identifier, name in zip(each.ids, each.names, strict=True):
+        for part in series:
+            result = (part.specification, part.object or None)
+            for identifier, name in zip(part.ids, part.names, strict=True):
                 nodes.setdefault((result, int(identifier)), name or None)
     if not nodes:
         if faults:
@@ -140,34 +140,36 @@ def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]
         raise UsageError(
             f"{source.name} holds no {ROBUSTNESS}; write it with spatial-replay replay … -o FILE.mcap"
         )
-    taken = {TIME, SECONDS}
+    used_titles = {TIME, SECONDS}
     paths = {result: _paths(result, tree) for result, tree in _trees(source).items()}
     titles: dict[_Node, str] = {}
     for (result, identifier), name in nodes.items():
-        numbered = f"{_shown(result)}#{identifier}"
-        own = f"{_shown(result)}/{name}" if name and identifier else _shown(result)
-        fallback = own if name or not identifier else numbered
+        numbered = f"{_result_title(result)}#{identifier}"
+        name_title = f"{_result_title(result)}/{name}" if name and identifier else _result_title(result)
+        fallback = name_title if name or not identifier else numbered
         title = paths.get(result, {}).get(identifier, fallback)
-        titles[result, identifier] = _free(title, numbered, taken)
+        titles[result, identifier] = _claim_title(title, numbered, used_titles)
     automata = {
-        result: _free(f"{_shown(result)}/automaton", f"{_shown(result)}#automaton", taken)
+        result: _claim_title(
+            f"{_result_title(result)}/automaton", f"{_result_title(result)}#automaton", used_titles
+        )
         for result in dict.fromkeys(result for _, result, _ in _iter_states(source))
     }
     return titles, automata
 
 
-def _shown(result: _Result) -> str:
+def _result_title(result: _Result) -> str:
     return result[0] if result[1] is None else f"{result[0]}({result[1]})"
 
 
-def _free(title: str, other: str, taken: set[str]) -> str:
+def _claim_title(title: str, other: str, used_titles: set[str]) -> str:
     """Return the first of a title and its alternatives that no column has, and take it."""
     choices = chain(
         [title, f"{title} #{other.rpartition('#')[2]}", other], (f"{other} ({n})" for n in count(2))
     )
-    chosen = next(choice for choice in choices if choice not in taken)
-    taken.add(chosen)
-    return chosen
+    free_title = next(choice for choice in choices if choice not in used_titles)
+    used_titles.add(free_title)
+    return free_title
 
 
 def _trees(source: Source) -> Mapping[_Result, SpecificationResult]:
@@ -178,7 +180,7 @@ def _trees(source: Source) -> Mapping[_Result, SpecificationResult]:
             message = Specification.FromString(payload)
         except DecodeError:
             continue
-        trees |= {(each.name, each.object or None): each for each in message.results}
+        trees |= {(tree.name, tree.object or None): tree for tree in message.results}
     return trees
 
 
@@ -189,7 +191,7 @@ def _paths(result: _Result, tree: SpecificationResult) -> Mapping[int, str]:
     for node in tree.nodes:
         owner = owners.get(node.parent) if node.HasField("parent") else None
         if owner is None:
-            title = owners[node.id] = _shown(result)
+            title = owners[node.id] = _result_title(result)
         elif node.name:
             title = owners[node.id] = f"{owner}/{node.name}"
         else:
@@ -232,15 +234,18 @@ def _iter_tables(
         faults += lost
         if not series:
             continue
-        times_ns = np.unique(np.concatenate([each.times_ns for each in series]))
+        times_ns = np.unique(np.concatenate([part.times_ns for part in series]))
         first_ns = int(times_ns[0]) if first_ns is None else first_ns
         numbers = np.full((len(times_ns), len(column)), np.nan)
-        for each in series:
-            result = (each.specification, each.object or None)
-            rows = np.searchsorted(times_ns, each.times_ns)
-            columns = [column[result, int(identifier)] for identifier in each.ids]
-            numbers[rows[:, None], columns] = each.series[:, quantity].T
-        cells = [[each.get(time_ns, "") for time_ns in times_ns.tolist()] for each in states.values()]
+        for part in series:
+            result = (part.specification, part.object or None)
+            rows = np.searchsorted(times_ns, part.times_ns)
+            columns = [column[result, int(identifier)] for identifier in part.ids]
+            numbers[rows[:, None], columns] = part.series[:, quantity].T
+        cells = [
+            [state_by_time.get(time_ns, "") for time_ns in times_ns.tolist()]
+            for state_by_time in states.values()
+        ]
         yield TableRows(times_ns, (times_ns - first_ns) / 1e9, numbers, cells)
 
 

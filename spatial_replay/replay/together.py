@@ -118,9 +118,9 @@ class JointReplay:
         for log, *runs_of_log in zip(logs, *runs, strict=True):
             streams = [stream for streams, _ in runs_of_log for stream in streams]
             blocks = [block for _, blocks in runs_of_log for block in blocks]
-            yield self._replayed(log, streams, blocks)
+            yield self._log_result(log, streams, blocks)
 
-    def _replayed(
+    def _log_result(
         self, log: ShortLog, streams: Sequence[InstanceStream], blocks: Sequence[SeriesBlock]
     ) -> Replayed:
         results = replayed_specs(
@@ -134,7 +134,7 @@ class JointReplay:
             has_series=False,
             doubts=log.account.doubts(log.zero_ns),
         )
-        return log.account.replayed(log.selection, log.zero_ns, results)
+        return log.account.summary(log.selection, log.zero_ns, results)
 
 
 def can_join(files: Sequence[Specification], options: ReplayOptions) -> bool:

@@ -107,7 +107,7 @@ def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mappin
 
 
 def _constants_in(request: Mapping[str, Any], evaluated: Evaluated) -> Values:
-    return _as_stored(request.get("constants", {}), constant_values(evaluated.edited.constants))
+    return _stored_values(request.get("constants", {}), constant_values(evaluated.edited.constants))
 
 
 def _constants_of(evaluated: Evaluated) -> dict[str, float]:
@@ -498,7 +498,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             if ARROW in values:
                 self._session.point_at(values[ARROW])
             if constants:
-                self._session.set_constants(_as_stored(constants, self._session.values))
+                self._session.set_constants(_stored_values(constants, self._session.values))
             if playback:
                 self.send_state(self._session.steer(playback))
         except SpatialReplayError as error:
@@ -666,7 +666,7 @@ def _value(parameter: Parameter) -> float | str | bool:
     raise _misfit(parameter.name, value)
 
 
-def _as_stored(values: Mapping[str, float | str | bool], present: Values) -> Values:
+def _stored_values(values: Mapping[str, float | str | bool], present: Values) -> Values:
     """Return values of constants as a specification has them: seconds of a duration as a text.
 
     Raises:
@@ -748,7 +748,7 @@ class Serving:
         """The specifications with the constants as viewers set them."""
         return self._session.edited
 
-    def show_saved(self, files: Sequence[Specification]) -> Evaluated:
+    def show_specifications(self, files: Sequence[Specification]) -> Evaluated:
         """Evaluate specifications that were saved, show viewers what they give, and return it.
 
         Constants that viewers changed keep their values, unless the text changed them, too. After an error
