@@ -390,7 +390,9 @@ def evaluate_logs(
     refuse_unknown(reading, Reading.__annotations__)
     fails = checked_kinds("fail_on", fail_on, FAILING_KINDS)
     allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
-    conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
+    conditions = Conditions.from_tables(
+        reading, each, constants, semantics=semantics, strict_names=strict_names
+    )
     if specifications is None:
         named = _paths(logs)
         if len(named) != 1 or conditions != Conditions():
@@ -453,7 +455,9 @@ def judge(
     if same_start is not None and not against:
         raise UsageError("same_start is about pairs; give the earlier episodes: against=")
     allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
-    conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
+    conditions = Conditions.from_tables(
+        reading, each, constants, semantics=semantics, strict_names=strict_names
+    )
     files = [specifications] if isinstance(specifications, str | PathLike) else list(specifications)
     specifications = files if failures is None else [failures, *files]
     suites = [_suite(episodes, specifications, conditions) for episodes in (logs, against) if episodes]

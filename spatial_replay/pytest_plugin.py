@@ -128,10 +128,10 @@ class _Results:
     def rows(self, task: Task) -> tuple[tuple[ResultRow, ...], ...]:
         """Return the rows of a log, by specification file."""
         if task not in self._rows:
-            self._rows.update(self._evaluated(self._tasks if self._jobs > 1 else [task]))
+            self._rows.update(self._evaluate(self._tasks if self._jobs > 1 else [task]))
         return self._rows[task]
 
-    def _evaluated(self, tasks: list[Task]) -> Iterator[tuple[Task, tuple[tuple[ResultRow, ...], ...]]]:
+    def _evaluate(self, tasks: list[Task]) -> Iterator[tuple[Task, tuple[tuple[ResultRow, ...], ...]]]:
         from spatial_replay.batch.rows import error_rows, rows_with_explanations
         from spatial_replay.batch.run import workers_of
         from spatial_replay.batch.workers import WorkerLost

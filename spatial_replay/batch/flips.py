@@ -164,7 +164,7 @@ def diff_runs(
         UsageError: the runs have no result in common, or a tolerance without the unit of the results.
     """
     unexplained = before, now
-    before, now = _tested(_renamed(before, now)), _tested(now)
+    before, now = _replace_untested_verdicts(_match_file_name(before, now)), _replace_untested_verdicts(now)
     if not set(keys_of(before)) & set(keys_of(now)):
         examples = [f"{name} has {_example(table)}" for name, table in zip(names, (before, now), strict=True)]
         raise UsageError(f"no result is in both: {', and '.join(examples)}; give runs over the same logs")
@@ -205,7 +205,7 @@ def _example(table: pa.Table) -> str:
     return first_lines(lines, 1)[0] if lines else "none"
 
 
-def _renamed(table: pa.Table, other: pa.Table) -> pa.Table:
+def _match_file_name(table: pa.Table, other: pa.Table) -> pa.Table:
     """Return a table in which the only file that another one lacks has the name of its counterpart there."""
     import pyarrow as pa
 
@@ -218,7 +218,7 @@ def _renamed(table: pa.Table, other: pa.Table) -> pa.Table:
     return table.set_column(place, table.schema.field(place), pa.array(names, pa.string()))
 
 
-def _tested(table: pa.Table) -> pa.Table:
+def _replace_untested_verdicts(table: pa.Table) -> pa.Table:
     """Return a table with "untested" for verdicts that nothing tested."""
     import pyarrow.compute as pc
 

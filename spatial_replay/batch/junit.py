@@ -82,7 +82,7 @@ def _lines(
     failures, errors = _counts(row for rows in suites.values() for row in rows)
     yield '<?xml version="1.0" encoding="utf-8"?>\n'
     yield (
-        f'<testsuites name={_quoted(name)} tests="{len(table)}" failures="{failures}" errors="{errors}" '
+        f'<testsuites name={_quote(name)} tests="{len(table)}" failures="{failures}" errors="{errors}" '
         f'time="{_time(row for rows in suites.values() for row in rows)}">\n'
     )
     for (case, file, spec), rows in suites.items():
@@ -90,8 +90,8 @@ def _lines(
         failures, errors = _counts(rows)
         title = f"{case}.{spec or file}"
         yield (
-            f'<testsuite name={_quoted(title)} tests="{len(rows)}" failures="{failures}" errors="{errors}" '
-            f'skipped="0" file={_quoted(file)} time="{_time(rows)}">\n<properties>\n'
+            f'<testsuite name={_quote(title)} tests="{len(rows)}" failures="{failures}" errors="{errors}" '
+            f'skipped="0" file={_quote(file)} time="{_time(rows)}">\n<properties>\n'
         )
         properties = {"specification": f"{file}:{rows[0]['line']}"}
         properties |= {key: rows[0][key] for key in ("requirement", "title") if rows[0][key]}
@@ -102,7 +102,7 @@ def _lines(
             properties["baseline"] = EDITED_SINCE
         pairs = [*properties.items(), *(("flaky", line) for line in flaky.get((case, file, spec), ()))]
         for key, value in pairs:
-            yield f"<property name={_quoted(key)} value={_quoted(value)}/>\n"
+            yield f"<property name={_quote(key)} value={_quote(value)}/>\n"
         yield "</properties>\n"
         # two files may have a spec of one name
         class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
@@ -119,7 +119,7 @@ def _case(
     row: Values, class_name: str, reports: Mapping[tuple[str, str], str], limit: int | None
 ) -> Iterator[str]:
     name = row["log"] if row["object"] is None else f"{row['log']}[{row['object']}]"
-    yield f'<testcase classname={_quoted(class_name)} name={_quoted(name)} time="{row["seconds"]:.3f}">\n'
+    yield f'<testcase classname={_quote(class_name)} name={_quote(name)} time="{row["seconds"]:.3f}">\n'
     tested = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
     if row["failure"] is not None:
         # errors are about the test, failures about what it tests
@@ -129,7 +129,7 @@ def _case(
         text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
         text = cut(text, limit or len(text))
         message = printable(row["failure"], limit or 1_000)
-        yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"
+        yield f"<{tag} type={_quote(kind)} message={_quote(message)}>{_text(text)}</{tag}>\n"
         if (row["case"], row["log"]) in reports:
             yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
     elif row["untested"] and limit is None:
@@ -166,5 +166,5 @@ def _text(text: str) -> str:
     return escape("\n".join(printable(line, len(line)) for line in text.split("\n")))
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return quoteattr(printable(str(text), 1_000))

@@ -130,8 +130,8 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
     body = [
         element(
             "tr",
-            element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
-            element("td", *_named(row)),
+            element("td", _log_link((row["case"], row["log"]), reports), **{"class": "log"}),
+            element("td", *_result_cell(row)),
             _number("td", robustness_of(row)),
             element("td", text(row["failure"])),
             element("td", *_with_code(row["reason"] or "")),
@@ -141,7 +141,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
     return element("table", element("thead", head), element("tbody", *body))
 
 
-def _named(row: Values) -> Iterator[Html]:
+def _result_cell(row: Values) -> Iterator[Html]:
     """Yield the name of a result, and below it the requirement that it is about."""
     yield text(result_name(row["spec"] or row["file"], row["object"]))
     if about := requirement_of(row):
@@ -249,7 +249,7 @@ def _matrix(
         report = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
         if is_judged:
             row_cells.insert(0, _label_cell(next(iter(of_log.values()))))
-        body.append(element("tr", element("td", _linked(report, reports)), *row_cells))
+        body.append(element("tr", element("td", _log_link(report, reports)), *row_cells))
     yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
 
 
@@ -318,7 +318,7 @@ def _number(tag: str, words: str) -> Html:
     return element(tag, words, **{"class": "number"})
 
 
-def _linked(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:
+def _log_link(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:
     """Return the name of a log, given with its case, linked to the page about it."""
     return element("a", text(log[1]), href=quote(reports[log])) if log in reports else text(log[1])
 

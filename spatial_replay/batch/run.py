@@ -108,7 +108,7 @@ def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, 
     """Return a specification file that was read and parsed; paths are shown relative to a folder."""
     lines = tuple(spec_lines(parsed).items())
     meanings = tuple((spec.name, _hash_of_text(_meaning(parsed, spec))) for spec in parsed.results)
-    name, digest = _shown(path, folder), meaning_hash(parsed)
+    name, digest = _relative_name(path, folder), meaning_hash(parsed)
     return SpecFile(name, text, digest, meanings, lines, parsed.warnings, bool(parsed.plugins))
 
 
@@ -130,7 +130,7 @@ def _hash_of_text(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
 
 
-def _shown(file: Path | str, folder: Path) -> str:
+def _relative_name(file: Path | str, folder: Path) -> str:
     path = log_file(file)
     if isinstance(path, RemoteFile):
         return str(path)
@@ -218,18 +218,18 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
             yield from _logs_in(path, folder)
         elif path.exists():
             # opening what is no regular file is the error of its row
-            yield from _episodes_in(path, folder) or [_found(path, folder)]
+            yield from _episodes_in(path, folder) or [_log_at(path, folder)]
         elif (address := data_set_address(path)) is not None:
             data_set = open_data_set(address[0])
             if data_set is not None:
                 data_set.episode(address[1])
-            yield _found(path, folder)
+            yield _log_at(path, folder)
         elif has_magic(text):
             for name in sorted(glob(text, root_dir=folder, recursive=True)):  # noqa: PTH207 - absolute ones, too
                 log = folder / name
                 episodes = _episodes_in(log, folder)
                 if episodes or (log.exists() and not log.is_dir()) or (log / BAG_METADATA).is_file():
-                    yield from episodes or [_found(log, folder)]
+                    yield from episodes or [_log_at(log, folder)]
     except (OSError, ValueError):
         # a name that cannot be one, such as one with a null character
         return
@@ -261,7 +261,7 @@ def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
 
     To open a damaged one is the error of its row: a batch does not pass over logs in silence.
     """
-    whole = _found(path, folder)
+    whole = _log_at(path, folder)
     try:
         data_set = open_data_set(path)
     except LogError:
@@ -281,7 +281,7 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
     closed: list[OSError] = []
     for parent, folders, names in os.walk(path, onerror=closed.append):
         if BAG_METADATA in names:
-            yield _found(Path(parent), folder)
+            yield _log_at(Path(parent), folder)
             folders.clear()
             continue
         if episodes := _episodes_in(Path(parent), folder) if _DATA_SET_FOLDERS & {*folders} else []:
@@ -290,7 +290,7 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
             continue
         # in the order of their names, and without hidden folders
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        parent_log = _found(Path(parent), folder)
+        parent_log = _log_at(Path(parent), folder)
         for name in sorted(names):
             if name.lower().endswith(LOG_ENDINGS) and not name.startswith("."):
                 # as texts: paths would take most of the time
@@ -299,10 +299,10 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
             elif name.lower().endswith(DATA_SET_ENDINGS) and not name.startswith("."):
                 yield from _episodes_in(Path(parent) / name, folder)
     # to open one is the error of its row: a batch does not pass over logs in silence
-    yield from (_found(Path(error.filename), folder) for error in closed)
+    yield from (_log_at(Path(error.filename), folder) for error in closed)
 
 
-def _found(path: Path, folder: Path) -> FoundLog:
+def _log_at(path: Path, folder: Path) -> FoundLog:
     name = path.relative_to(folder) if path.is_relative_to(folder) else path
     return FoundLog(encodable(name.as_posix()), str(path))
 
@@ -508,11 +508,11 @@ def run_batch(
         ClusterError: the scheduler of a cluster is lost; rows written so far stay.
     """
     folder = ResultsFolder.create(results)
-    with folder.locked():
+    with folder.lock():
         known_identities, remarks = folder.identities()
         paths = list(dict.fromkeys(log.path for case in cases for log in case.logs))
         identities, states = identify(paths, known_identities, workers, progress)
-        requests = _wanted(cases, identities)
+        requests = _requests(cases, identities)
         by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
@@ -599,7 +599,7 @@ class _Groups:
             self._size = max(1, min(size, _GROWTH * len(seconds), _MOST_IN_GROUP))
 
 
-def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
+def _requests(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
     requests = []
     for prepared in cases:
         case = prepared.case
@@ -676,10 +676,10 @@ def _table(
             indices.append(place)
             asked.append(request)
     asked_rows = rows.take(pa.array(indices, pa.int64()))
-    return _judged(_named(asked_rows, asked), asked, fail_on)
+    return _judge_rows(_restore_file_names(asked_rows, asked), asked, fail_on)
 
 
-def _named(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
+def _restore_file_names(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
     """Return rows whose texts name the file that was asked for, not another one that holds the same."""
     import pyarrow as pa
 
@@ -693,17 +693,17 @@ def _named(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
     for column in ("faults", "remarks", "missing", "error"):
         texts = rows.column(column).to_pylist()
         for place in renamed:
-            texts[place] = _renamed(texts[place], sources[place], names[place])
+            texts[place] = _rename_file(texts[place], sources[place], names[place])
         field = rows.schema.field(column)
         rows = rows.set_column(rows.schema.get_field_index(column), field, pa.array(texts, field.type))
     return rows
 
 
-def _renamed(text: str | list[str] | None, old: str, new: str) -> str | list[str] | None:
+def _rename_file(text: str | list[str] | None, old: str, new: str) -> str | list[str] | None:
     """Return texts with another name of a file, where it is a word: "a.csv" is part of "b-a.csv.gz"."""
     if isinstance(text, str):
         return re.sub(rf"(?<![\w./-]){re.escape(old)}(?![\w-]|\.\w)", lambda _: new, text)
-    return text and [str(_renamed(line, old, new)) for line in text]
+    return text and [str(_rename_file(line, old, new)) for line in text]
 
 
 def _unreadable(wanted: Wanted) -> tuple[ResultRow, ...]:
@@ -717,7 +717,7 @@ def _unreadable(wanted: Wanted) -> tuple[ResultRow, ...]:
     return rows
 
 
-def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) -> pa.Table:
+def _judge_rows(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) -> pa.Table:
     """Return the table of a run: rows with what was asked for, and with why they fail."""
     import pyarrow as pa
 

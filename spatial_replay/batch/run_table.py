@@ -123,7 +123,7 @@ def summary_text(table: pa.Table) -> str:
         passed[word] += row["failure"] is None
         damaged += bool(damage_word(row))
     parts = [
-        _expected(f"{total[name]:,} {name}", total[name], passed[name])
+        _count_text(f"{total[name]:,} {name}", total[name], passed[name])
         if name not in ("satisfied", *_WORDS)
         else f"{total[name]:,} {_WORDS.get(name, name)}"
         + (f" ({bad:,} failed)" if name == "satisfied" and (bad := total[name] - passed[name]) else "")
@@ -136,7 +136,7 @@ def summary_text(table: pa.Table) -> str:
     return f"{counted(len(table), 'result')}: {', '.join(parts) or 'none'}"
 
 
-def _expected(text: str, total: int, passed: int) -> str:
+def _count_text(text: str, total: int, passed: int) -> str:
     """Say how many results with a verdict that fails unless it is expected were."""
     if not passed:
         return text
@@ -376,10 +376,10 @@ class _Condition:
             case ast.Compare(left=ast.Name() as name, ops=[op], comparators=[value]) if (
                 type(op) in _COMPARISONS
             ):
-                return self._compared(self._column(name), op, self._value(value))
+                return self._compare(self._column(name), op, self._value(value))
         raise UsageError(_no_condition(self.text))
 
-    def _compared(self, column: Any, op: ast.cmpop, value: Any) -> Any:
+    def _compare(self, column: Any, op: ast.cmpop, value: Any) -> Any:
         if value is None:
             if isinstance(op, ast.Eq | ast.NotEq):
                 return column.is_null() if isinstance(op, ast.Eq) else ~column.is_null()
@@ -534,8 +534,8 @@ class Difference:
     @property
     def failure(self) -> str:
         """The change with both numbers, in a few words."""
-        now = "gone" if self.change == "gone" else _described(self.now, self.robustness)
-        return f"{now}; it was {_described(self.before, self.before_robustness)}"
+        now = "gone" if self.change == "gone" else _describe_verdict(self.now, self.robustness)
+        return f"{now}; it was {_describe_verdict(self.before, self.before_robustness)}"
 
 
 def compare(
@@ -701,7 +701,7 @@ def _least_first(number: float | None) -> float:
     return math.inf if number is None else number
 
 
-def _described(verdict: str | None, number: float | None) -> str:
+def _describe_verdict(verdict: str | None, number: float | None) -> str:
     if verdict is None:
         return "an error"
     return f"{verdict} with robustness {'not determined' if number is None else f'{number:.6g}'}"

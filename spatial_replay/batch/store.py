@@ -103,7 +103,7 @@ class LocalFolder:
             yield from (f"{parent}/{name}" for name in names if not name.endswith(_PARTIAL))
 
     @contextmanager
-    def locked(self, name: str) -> Iterator[None]:
+    def lock(self, name: str) -> Iterator[None]:
         """Keep other commands from writing here, by a lock on a file, and remove what killed ones have left.
 
         Raises:
@@ -127,7 +127,7 @@ class BucketFolder(RemoteFolder):
     is_on_this_machine: Final = False
 
     @contextmanager
-    def locked(self, name: str) -> Iterator[None]:
+    def lock(self, name: str) -> Iterator[None]:
         """Let others write, too: a batch that is killed could not take a lock back."""
         yield
 
@@ -210,7 +210,7 @@ def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _encoded(table: pa.Table) -> bytes:
+def _encode_table(table: pa.Table) -> bytes:
     """Return a table as a Parquet file that holds a digest of its other bytes right before its footer.
 
     Readers of Parquet skip what no column refers to.
@@ -225,8 +225,8 @@ def _encoded(table: pa.Table) -> bytes:
     return data[:footer] + hashlib.sha256(data).digest() + data[footer:]
 
 
-def _decoded(data: bytes) -> pa.Table:
-    """Return the table of `_encoded`.
+def _decode_table(data: bytes) -> pa.Table:
+    """Return the table of `_encode_table`.
 
     Raises:
         ValueError: the digest does not fit.
@@ -282,7 +282,7 @@ def _write_rows(files: ResultFiles, table: pa.Table) -> str:
     """Write rows as one file, named after their keys, and return its name."""
     keys = "".join(table.column("key").to_pylist())
     name = f"{_ROWS}/{hashlib.sha256(keys.encode()).hexdigest()[:32]}.parquet"
-    files.write(name, _encoded(table))
+    files.write(name, _encode_table(table))
     return name
 
 
@@ -335,18 +335,18 @@ class ResultsFolder:
             )
         return cls(files)
 
-    def locked(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[None]:
         """Keep other batches from writing here, unless it is in a bucket.
 
         Raises:
             UsageError: another batch is running.
         """
-        return self._files.locked(_FORMAT_FILE)
+        return self._files.lock(_FORMAT_FILE)
 
     def rows(self, wanted: set[str]) -> tuple[pa.Table, list[str]]:
         """Return the stored rows of keys, those of each together, and a remark on each damaged file.
 
-        Damaged files are removed, and small ones are joined; call it while `locked`.
+        Damaged files are removed, and small ones are joined; call it inside `lock`.
 
         Raises:
             OutputError: that cannot be done.
@@ -416,7 +416,7 @@ class ResultsFolder:
             columns = {
                 name: pa.array([pair[n] for pair in pairs], pa.string()) for n, name in enumerate(names)
             }
-            self._files.write(_IDENTITIES, _encoded(pa.table(columns)))
+            self._files.write(_IDENTITIES, _encode_table(pa.table(columns)))
 
     def write_run(self, table: pa.Table) -> None:
         """Write the table of a run, whole or not at all.
@@ -424,7 +424,7 @@ class ResultsFolder:
         Raises:
             OutputError: it cannot be written.
         """
-        self._files.write(LAST_RUN, _encoded(table))
+        self._files.write(LAST_RUN, _encode_table(table))
 
     def read_run(self) -> pa.Table:
         """Return the table of the last run that ended.
@@ -467,7 +467,7 @@ class ResultsFolder:
             LogError: it is damaged.
         """
         try:
-            return _decoded(data)
+            return _decode_table(data)
         except (OSError, ValueError, _pyarrow().ArrowException) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise LogError(f"{self._files}/{name} cannot be used: {reason}") from None

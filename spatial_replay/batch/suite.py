@@ -67,7 +67,7 @@ class Conditions:
     requires: str = ""
 
     @classmethod
-    def given(
+    def from_tables(
         cls,
         reading: Mapping[str, Any],
         each: Mapping[str, str] | None,
@@ -141,7 +141,7 @@ class Expectation:
         Args:
             fail_on: what fails although the case allows it, see `FAILING_KINDS`.
         """
-        failure = self._unexpected(outcome)
+        failure = self._difference(outcome)
         is_unknown = outcome.verdict == Verdict.UNKNOWN
         if failure is None and "unknown" in fail_on and is_unknown:
             failure = "unknown"
@@ -160,7 +160,7 @@ class Expectation:
         damage = f"{DAMAGED}: {outcome.faults[0]}" if outcome.faults else None
         return "; ".join(filter(None, (failure, damage))) or None
 
-    def _unexpected(self, outcome: ResultRow) -> str | None:
+    def _difference(self, outcome: ResultRow) -> str | None:
         """Return how a verdict or a robustness differs from what is expected."""
         if outcome.verdict == Verdict.UNKNOWN and self.allow_unknown:
             return None
@@ -312,14 +312,14 @@ def _case(
     folder = path.parent
     lines = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
 
-    def listed(key: str) -> Iterator[tuple[Place, str]]:
-        for number, value in enumerate(_listed(entry.get(key))):
+    def texts_of(key: str) -> Iterator[tuple[Place, str]]:
+        for number, value in enumerate(_as_list(entry.get(key))):
             place = (*places[key], number)
             if isinstance(value, str) and place not in wrong:
                 yield place, value
 
-    logs = [LogPattern(log, f"{path.name}:{document.line_of(place)}") for place, log in listed("logs")]
-    specs = dict.fromkeys(spec for _, spec in listed("specs"))
+    logs = [LogPattern(log, f"{path.name}:{document.line_of(place)}") for place, log in texts_of("logs")]
+    specs = dict.fromkeys(spec for _, spec in texts_of("specs"))
     is_whole = bool(specs) and not any(places.get(key) in wrong for key in ("specs", "each", "constants"))
     name = str(entry.get("name", ""))
     entry = {key: value for key, value in entry.items() if places.get(key) not in wrong}
@@ -346,9 +346,9 @@ def _case(
             entry.get("at_least"),
             entry.get("tolerance", 0.0),
             entry.get("allow_unknown", False),
-            frozenset(_listed(entry.get("allow"))),
+            frozenset(_as_list(entry.get("allow"))),
         ),
-        requirements=tuple(_listed(entry.get("requirements"))),
+        requirements=tuple(_as_list(entry.get("requirements"))),
         at_least_logs=entry.get("at_least_logs", 1),
         places=tuple(lines.items()),
         is_whole=is_whole,
@@ -411,6 +411,6 @@ def _pairs(table: Mapping[str, _Value]) -> Pairs[_Value]:
     return tuple(sorted(table.items()))
 
 
-def _listed(value: Any) -> Sequence[Any]:
+def _as_list(value: Any) -> Sequence[Any]:
     """Return what a key with one value or several lists; nothing for anything else."""
     return [value] if isinstance(value, str) else value if isinstance(value, list) else ()

@@ -189,7 +189,7 @@ class DaskCluster:
         """
         self._address = address
         self._report = report
-        with self._connected():
+        with self._connection():
             pass
 
     def results(
@@ -204,7 +204,7 @@ class DaskCluster:
         rest = iter(tasks)
         waiting: dict[Future[_Result], _Task] = {}
         is_reported = False
-        with self._connected() as client:
+        with self._connection() as client:
             pool = client.get_executor(pure=False)
             try:
                 while self._hand_out(client, pool, work, rest, waiting):
@@ -238,7 +238,7 @@ class DaskCluster:
                 waiting[pool.submit(work, task)] = task
         except (OSError, RuntimeError, ValueError) as error:
             # a connection that is closed has many names
-            raise self._lost() from error
+            raise self._scheduler_loss() from error
         return bool(waiting)
 
     def _result(self, future: Future[Any]) -> Any:
@@ -250,16 +250,16 @@ class DaskCluster:
         except KilledWorker:
             return WorkerLost(f"the workers that evaluated it died{_MEMORY}")
         except CancelledError as error:
-            raise self._lost() from error
+            raise self._scheduler_loss() from error
 
-    def _lost(self) -> ClusterError:
+    def _scheduler_loss(self) -> ClusterError:
         return ClusterError(
             f"--dask {self._address}: the scheduler answers no more; the results so far stay, and the same "
             "command goes on from there"
         )
 
     @contextmanager
-    def _connected(self) -> Iterator[Any]:
+    def _connection(self) -> Iterator[Any]:
         """Connect a client, which closes whatever has become of the cluster."""
         with importing("clusters need Dask", extra="cluster"):
             import distributed

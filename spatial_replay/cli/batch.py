@@ -397,7 +397,7 @@ def _conditions(given: ConditionArguments, semantics: Semantics) -> Conditions:
 
     others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
     objects = objects_by_parameter(given.choices)
-    return Conditions.given(given.reading, objects, given.constants, semantics=semantics, **others)
+    return Conditions.from_tables(given.reading, objects, given.constants, semantics=semantics, **others)
 
 
 def inputs_of(suite: Suite) -> list[Path]:

@@ -149,7 +149,9 @@ def _over_logs(
 
     others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
     objects = objects_by_parameter(given.choices)
-    conditions = Conditions.given(given.reading, objects, given.constants, semantics=semantics, **others)
+    conditions = Conditions.from_tables(
+        given.reading, objects, given.constants, semantics=semantics, **others
+    )
     cases = prepare(Suite.of_logs(logs, [sendable(spec) for spec in given.specs], conditions), progress)
     old, new = cases[0].files
     show_diagnostics({str(warning): warning for file in (old, new) for warning in file.warnings}.values())

@@ -810,7 +810,7 @@ def search_failures(
     refuse_addresses(Path(folder))
     files = LocalFolder(Path(folder))
     _claim(files, _identity(simulation, space, seed))
-    with files.locked(_SEARCH):
+    with files.lock(_SEARCH):
         try:
             return _Search(simulation, space, files, workers, progress).run(budget, seed)
         except KeyboardInterrupt as interruption:
