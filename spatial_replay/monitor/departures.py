@@ -76,17 +76,17 @@ class _Watch(NamedTuple):
 
     Attributes:
         visitors: the open group of the members, or the one object that its formula asks to be present.
-        member, other: not enlarged.
+        member, reference: the terms, not enlarged.
         threshold: enlargements are part of it.
     """
 
     visitors: _Visitors
     member: Term
-    other: Term
+    reference: Term
     threshold: float
 
     def distance(self, name: str) -> SignedDistance:
-        return SignedDistance(_about(self.member, name), _without(self.other, name))
+        return SignedDistance(_about(self.member, name), _without(self.reference, name))
 
 
 class Departures:
@@ -133,39 +133,49 @@ class Departures:
         self._past = tail(trace, Reach(1, _APPROACH_NS))
 
     def _follow(self, visitors: _Visitors, scene: TraceScene) -> None:
-        trace, before = scene.trace, 0 if self._past is None else len(self._past)
+        trace, past_count = scene.trace, 0 if self._past is None else len(self._past)
         names, members = _memberships(visitors, scene)
         # the first sample of a log is no turn
-        start = max(before, 1)
+        start = max(past_count, 1)
         samples, columns = np.nonzero(np.diff(members[start - 1 :], axis=0))
         turns = list(zip((samples + start).tolist(), columns.tolist(), strict=True))
         if not turns:
             return
-        early = [_early(trace, members, *turn) for turn in turns]
-        wanted = [(first, sample - 1, sample) for first, (sample, _) in zip(early, turns, strict=True)]
-        own_columns = np.array([trace.names.index(names[column]) for _, column in turns])
-        distances = self._distances(visitors, own_columns, np.array(wanted), trace)
-        sizes = _sizes(trace, np.array(wanted)[:, 1:], own_columns)
-        for (sample, column), places, own, (last_size, size) in zip(
-            turns, wanted, distances, sizes.tolist(), strict=True
+        early_samples = [_early(trace, members, *turn) for turn in turns]
+        sample_triples = [
+            (first, sample - 1, sample) for first, (sample, _) in zip(early_samples, turns, strict=True)
+        ]
+        member_columns = np.array([trace.names.index(names[column]) for _, column in turns])
+        distances = self._distances(visitors, member_columns, np.array(sample_triples), trace)
+        sizes = _sizes(trace, np.array(sample_triples)[:, 1:], member_columns)
+        for (sample, column), triple, member_distances, (last_size, size) in zip(
+            turns, sample_triples, distances, sizes.tolist(), strict=True
         ):
-            key, times_ns = (visitors, names[column]), trace.times_ns[list(places)].tolist()
+            key, times_ns = (visitors, names[column]), trace.times_ns[list(triple)].tolist()
             if not members[sample, column]:
                 why = _why_absent(visitors, names[column], trace, sample)
                 early_ns, last_ns, start_ns = times_ns
                 self._absent[key] = _Absence(
-                    why, early_ns, last_ns, start_ns, own[:, 0], own[:, 1], last_size
+                    why,
+                    early_ns,
+                    last_ns,
+                    start_ns,
+                    member_distances[:, 0],
+                    member_distances[:, 1],
+                    last_size,
                 )
             elif key in self._absent:
-                self._return(visitors, names[column], self._absent.pop(key), times_ns[-1], own[:, 2], size)
+                self._return(
+                    visitors, names[column], self._absent.pop(key), times_ns[-1], member_distances[:, 2], size
+                )
 
     def _distances(self, visitors: _Visitors, columns: Integers, samples: Integers, trace: Trace) -> Floats:
         """Return the distances (N, watches, 3) of N members in three samples of each (N, 3)."""
         rows = trace.rows[samples.ravel()]
-        own = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
+        cells = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
         # one object stands for each member in its samples, so that all are measured at once
-        rows = np.column_stack([rows[own], rows])
-        rows[own[0], own[1] + 1] = ABSENT
+        rows = np.column_stack([rows[cells], rows])
+        rows[cells[0], cells[1] + 1] = ABSENT
         stand_in = replace(
             trace,
             times_ns=np.arange(len(rows), dtype=np.int64),
@@ -198,7 +208,7 @@ class Departures:
                 start, end = Instant(absence.start_ns, 0), Instant(end_ns, 0)
                 distance, when = (last, "before") if was_near else (back, "after")
                 away = f"it was {with_unit(distance, self._unit)} away {when}"
-                text = f"; {away}, from {format_term(_without(watch.other, name))}"
+                text = f"; {away}, from {format_term(_without(watch.reference, name))}"
                 message = Sentence(absence.why, " from ", start, " to ", end, text)
                 self.departures.append(Departure(name, absence.start_ns, end_ns, distance, message))
                 return
@@ -271,13 +281,13 @@ def _watches_of(instance: Instance) -> Iterator[_Watch]:
         limits = (abs(limit) for limit in node.parameters if isinstance(limit, float))
         threshold = max(limits, default=0.0) + sum(map(_enlargement, terms))
         first, second = (_with_group(_without_enlargement(term), groups) for term in terms)
-        for member, other in ((first, second), (second, first)):
+        for member, reference in ((first, second), (second, first)):
             visitors = base_of(member)
-            is_now = not looks_back(member) and not looks_back(other)
-            is_bound = not isinstance(base_of(other), Variable)
+            is_now = not looks_back(member) and not looks_back(reference)
+            is_bound = not isinstance(base_of(reference), Variable)
             may_leave = visitors.is_open if isinstance(visitors, Group) else visitors in present_terms
             if isinstance(visitors, Group | TrackedName) and may_leave and is_now and is_bound:
-                yield _Watch(visitors, member, other, threshold)
+                yield _Watch(visitors, member, reference, threshold)
 
 
 def _distances_of(atom: Atom) -> Iterator[SignedDistance]:

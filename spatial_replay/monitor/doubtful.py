@@ -31,8 +31,8 @@ class ClassMembers:
 
     def add(self, trace: Trace) -> None:
         """Add the objects of the next samples."""
-        own = {code: (name or "").casefold() for code, name in enumerate(trace.classes)}
-        codes = [code for code, name in own.items() if name in self._names]
+        class_by_code = {code: (name or "").casefold() for code, name in enumerate(trace.classes)}
+        codes = [code for code, name in class_by_code.items() if name in self._names]
         if not codes:
             return
         rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
@@ -40,7 +40,7 @@ class ClassMembers:
         code_of_row = np.append(trace.class_code, -1)[rows]
         for code in codes:
             columns = np.flatnonzero((code_of_row == code).any(axis=0)).tolist()
-            self._names[own[code]].update(trace.names[column] for column in columns)
+            self._names[class_by_code[code]].update(trace.names[column] for column in columns)
 
     def may_include(self, classes: Iterable[str], objects: frozenset[str]) -> bool:
         """Return whether one of the objects was of one of the classes."""
@@ -86,8 +86,8 @@ def doubts_of_instances(
     """
     if all(doubt.is_accepted for doubt in doubts):
         return [()] * len(instances)
-    needs_of_each = [needs_of_spec(instance.spec, instance.object) for instance in instances]
-    members = ClassMembers(name for needs in needs_of_each for name in needs.classes)
+    needs_by_instance = [needs_of_spec(instance.spec, instance.object) for instance in instances]
+    members = ClassMembers(name for needs in needs_by_instance for name in needs.classes)
     for trace in traces() if members else ():
         members.add(trace)
-    return [doubts_about(needs, doubts, members) for needs in needs_of_each]
+    return [doubts_about(needs, doubts, members) for needs in needs_by_instance]

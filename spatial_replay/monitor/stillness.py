@@ -61,13 +61,16 @@ class Stillness:
             if not len(rows):
                 continue
             reports = self._reports[name]
-            own = np.concatenate([reports.last[None], numbers[rows]])
-            is_first = bool(np.isnan(own[0]).all())
-            changed = ((own[1:] != own[:-1]) & ~(np.isnan(own[1:]) & np.isnan(own[:-1]))).any(axis=1)
+            report_numbers = np.concatenate([reports.last[None], numbers[rows]])
+            is_first = bool(np.isnan(report_numbers[0]).all())
+            is_changed = (
+                (report_numbers[1:] != report_numbers[:-1])
+                & ~(np.isnan(report_numbers[1:]) & np.isnan(report_numbers[:-1]))
+            ).any(axis=1)
             reports.count += len(rows) - is_first
-            reports.changes += int(changed[is_first:].sum())
+            reports.changes += int(is_changed[is_first:].sum())
             reports.class_name = trace.classes[trace.class_code[rows[-1]]]
-            reports.last = own[-1]
+            reports.last = report_numbers[-1]
 
     def remarks(self) -> Iterator[str]:
         """Yield a sentence on each object that never changed while all others of its class mostly did."""

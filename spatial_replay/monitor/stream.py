@@ -120,7 +120,7 @@ def find_instances(
     choices = {
         spec.parameter: Choice.parse(spec.parameter or "", each[spec.parameter or ""]) for spec in templates
     }
-    chosen = _appearances(choices, traces, start_ns, end_ns) if choices else {}
+    spans_by_parameter = _appearances(choices, traces, start_ns, end_ns) if choices else {}
     instances: list[Instance] = []
     named = {spec.name: spec for spec in specification.specs}
     for spec in specification.results:
@@ -128,7 +128,7 @@ def find_instances(
         if spec.parameter is None:
             instances.append(Instance(spec, None, program, {}, start_ns, end_ns, named))
             continue
-        for name, (first_ns, last_ns) in sorted(chosen[spec.parameter].items()):
+        for name, (first_ns, last_ns) in sorted(spans_by_parameter[spec.parameter].items()):
             bindings = {spec.parameter: TrackedName(name)}
             instances.append(Instance(spec, name, program, bindings, first_ns, last_ns + 1, named))
     return instances
@@ -150,8 +150,8 @@ def check_parameters(templates: list[NamedSpec], each: Mapping[str, str]) -> Non
     """Check that every choice of objects is for the parameter of some template."""
     for parameter in each:
         if parameter not in {spec.parameter for spec in templates}:
-            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
-            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {known}")
+            template_names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
+            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {template_names}")
 
 
 def _appearances(
@@ -164,12 +164,12 @@ def _appearances(
         begin, end = window_of(trace.times_ns, start_ns, end_ns)
         times = trace.times_ns[begin:end]
         for name, rows in zip(trace.names, trace.rows[begin:end].T, strict=True):
-            seen = np.flatnonzero(rows != ABSENT)
-            if not len(seen):
+            present_samples = np.flatnonzero(rows != ABSENT)
+            if not len(present_samples):
                 continue
-            first_ns = spans[name][0] if name in spans else int(times[seen[0]])
-            spans[name] = (first_ns, int(times[seen[-1]]))
-            codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[seen]])
+            first_ns = spans[name][0] if name in spans else int(times[present_samples[0]])
+            spans[name] = (first_ns, int(times[present_samples[-1]]))
+            codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[present_samples]])
             for parameter, choice in choices.items():
                 if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
                     fitting[parameter].add(name)
@@ -297,9 +297,9 @@ class InstanceStream:
     def _settle(self, times_ns: Integers, series: Floats) -> None:
         """Take the time of the first sample at which each node became certain."""
         newest = series[:, :, -1]
-        for column, settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
+        for column, is_settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
             # what is certain stays so: only where the newest sample is, the first one is looked for
-            for node in np.flatnonzero(settled & (self.settled_ns[:, column] == NEVER)):
+            for node in np.flatnonzero(is_settled & (self.settled_ns[:, column] == NEVER)):
                 self.settled_ns[node, column] = times_ns[_first_certain(series[node], column)]
 
 
@@ -404,13 +404,13 @@ class LiveStream:
             start_ns: earlier samples are not evaluated, only looked back at.
         """
         formulas = [spec.formula for spec in specification.results]
-        self._evaluators = [Evaluator(each, compile_formula(each), semantics) for each in formulas]
+        self._evaluators = [Evaluator(formula, compile_formula(formula), semantics) for formula in formulas]
         programs = [evaluator.program for evaluator in self._evaluators]
         self._leaves = SampleLeaves([program.leaves for program in programs], specification.regions)
         self._runs = [evaluator.begin(is_live=True) for evaluator in self._evaluators]
-        self._own_leaves = _ranges(len(program.leaves) for program in programs)
+        self._leaf_ranges = _ranges(len(program.leaves) for program in programs)
         self._is_online = semantics == "ltlf"
-        first_leaves = [own.start for own in self._own_leaves]
+        first_leaves = [leaf_range.start for leaf_range in self._leaf_ranges]
         self._online_runs = list(zip(cast(list[OnlineRun], self._runs), first_leaves, strict=True))
         self._start_ns = start_ns
         self._first_ns: int | None = None
@@ -450,7 +450,7 @@ class LiveStream:
         room = self._leaves.room
         if not (room.channels and self._is_online):
             raise UsageError("no sample has been evaluated, or under the paper's semantics; add a sample")
-        return room.leaves[: room.channels, self._own_leaves[place]].copy()
+        return room.leaves[: room.channels, self._leaf_ranges[place]].copy()
 
     def _extend_apart(self, sample: Sample) -> list[Floats | None]:
         self._position += 1
@@ -458,12 +458,12 @@ class LiveStream:
             self._first_ns = sample.time_ns
         if sample.time_ns < self._start_ns:
             self._leaves.look_at(sample)
-            return [np.full((len(each.program.reports), 4), np.nan) for each in self._evaluators]
+            return [np.full((len(evaluator.program.reports), 4), np.nan) for evaluator in self._evaluators]
         values = self._leaves.fill_room(sample).measure()
         position, time_ns = np.array([self._position]), np.array([sample.time_ns])
         results: list[Floats | None] = []
-        for evaluator, run, own in zip(self._evaluators, self._runs, self._own_leaves, strict=True):
-            leaves = evaluator.leaves_within_log(values[:, own], position, time_ns, self._first_ns)
+        for evaluator, run, leaf_range in zip(self._evaluators, self._runs, self._leaf_ranges, strict=True):
+            leaves = evaluator.leaves_within_log(values[:, leaf_range], position, time_ns, self._first_ns)
             results.append(run.extend(leaves, time_ns)[:, :, 0])
         return results
 

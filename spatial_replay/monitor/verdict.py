@@ -79,7 +79,7 @@ def online_verdict(lower: float, upper: float) -> Verdict:
 def counts_text(verdicts: Iterable[str]) -> str:
     """Return how many of some verdicts are of each kind, the worst first: "26 violated, 2 satisfied"."""
     counts = Counter(map(str, verdicts))
-    return ", ".join(f"{counts[each]:,} {each}" for each in reversed(_BEST_FIRST) if counts[each])
+    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in reversed(_BEST_FIRST) if counts[verdict])
 
 
 _BEST_FIRST: Final = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdict.VIOLATED)
