@@ -17,7 +17,7 @@ from spatial_replay.monitor.offline import (
     evaluate_unfinished,
     windows_of,
 )
-from spatial_replay.monitor.sentences import Conjunct, what_was_measured
+from spatial_replay.monitor.sentences import Conjunct, measurement_clause
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import (
     DecidingAtom,
@@ -26,7 +26,7 @@ from spatial_replay.monitor.witness.path import (
     missed_response,
     short_title,
 )
-from spatial_replay.monitor.witness.witness import atom_of_path, find_missed
+from spatial_replay.monitor.witness.witness import atom_of_path, find_missed_response
 from spatial_replay.spec.formula import Temporal, operands_of, operator_of
 from spatial_replay.text import Instant, Sentence, counted, number_text
 
@@ -201,7 +201,7 @@ def _with_atoms(
     for interval, path, asked in zip(intervals, paths, conditions, strict=True):
         deciding = atom_of_path(evidence, nodes, path, scene_at)
         deciding_ns = int(nodes.times_ns[path.steps[-1].sample])
-        closest = find_missed(evidence, nodes, path, scene_at).closest
+        closest = find_missed_response(evidence, nodes, path, scene_at).closest
         if closest is not None:
             deciding, deciding_ns = closest
         if deciding is None:
@@ -255,7 +255,7 @@ def _interval_sentence(interval: ViolatedInterval, first_ns: int, units: Mapping
     if interval.place is not None:
         parts.append(f", near ({', '.join(map(number_text, interval.place))})")
     if deciding is not None:
-        measured = " and ".join(deciding.unknown) or what_was_measured(deciding, units, first_ns)
+        measured = " and ".join(deciding.unknown) or measurement_clause(deciding, units, first_ns)
         parts += [": ", measured]
         if interval.deciding_ns not in (None, interval.worst_ns):
             parts += [" at ", Instant(interval.deciding_ns, first_ns)]

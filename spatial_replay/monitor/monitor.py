@@ -24,10 +24,10 @@ from spatial_replay.monitor.sentences import (
     conjuncts_of,
     divisor_of,
     how_text,
+    measurement_clause,
     missed_sentences,
     reason_sentence,
     sentences_of,
-    what_was_measured,
     without_residue,
 )
 from spatial_replay.monitor.stream import Instance, LiveStream
@@ -294,15 +294,15 @@ class Monitor:
         require_specification(specification)
         checked = checked_semantics(semantics, [specification])
         require_time(start_ns, "start_ns")
-        known = checked_units(units)
-        specification = with_numbers(specification, known)
+        declared_units = checked_units(units)
+        specification = with_numbers(specification, declared_units)
         templates = [spec for spec in specification.results if spec.parameter is not None]
         if templates:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)
             raise UsageError(f"{names} is a template; name its object, or evaluate it over a log")
         self._specs = specification.results
         node_names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
-        self._units = tuple(declared_unit(spec.formula, known) for spec in self._specs)
+        self._units = tuple(declared_unit(spec.formula, declared_units) for spec in self._specs)
         self._monitored = Monitored(
             tuple(zip(self._specs, node_names, self._units, strict=True)), _places_of_names(node_names)
         )
@@ -312,7 +312,7 @@ class Monitor:
         self._begin = partial(LiveStream, specification, checked, first_ns)
         self._remember: Callable[[], ViolationLog | None] = lambda: None
         if checked == "ltlf":
-            self._remember = partial(ViolationLog, specification, first_ns, known)
+            self._remember = partial(ViolationLog, specification, first_ns, declared_units)
         self._await = partial(_AwaitedNames, specification, missing_after, strict=strict_names)
         self._wait = partial(_Start, wait_for, start_within)
         self.reset()
@@ -350,11 +350,11 @@ class Monitor:
 
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends here; unknown before the first sample."""
-        known = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
-        endings = (_ending(spec, final, last, unit) for spec, final, last, unit in known)
+        results = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
+        endings = (_ending(spec, final, last, unit) for spec, final, last, unit in results)
         return tuple(
-            each._replace(reason=self._unknown[index].reason) if index in self._unknown else each
-            for index, each in enumerate(endings)
+            ending._replace(reason=self._unknown[index].reason) if index in self._unknown else ending
+            for index, ending in enumerate(endings)
         )
 
     @property
@@ -474,7 +474,9 @@ class _AwaitedNames:
         missing = len(self._objects) + len(self._signals)
         objects, signals = {*sample.objects, *sample.unknown}, sample.signals.keys()
         self._learn(
-            objects, signals, {each.class_name for each in sample.objects.values() if each.class_name}
+            objects,
+            signals,
+            {tracked.class_name for tracked in sample.objects.values() if tracked.class_name},
         )
         self._objects -= objects
         self._signals -= signals
@@ -483,7 +485,7 @@ class _AwaitedNames:
         if self._after is None or elapsed < self._after:
             return ()
         if not self._remarks or len(self._objects) + len(self._signals) < missing:
-            self._remarks = self._found()
+            self._remarks = self._diagnose_missing_names()
         if self._strict and self._remarks:
             raise SpecificationError(self._remarks)
         return self._remarks
@@ -491,15 +493,15 @@ class _AwaitedNames:
     def _learn(self, *names: Collection[str]) -> None:
         """Keep names, for hints."""
         if not self._remarks:
-            for known, new in zip(self._known, names, strict=True):
-                if len(known) < _MOST_KNOWN:
-                    known.update(new)
+            for names_so_far, new_names in zip(self._known, names, strict=True):
+                if len(names_so_far) < _MOST_KNOWN:
+                    names_so_far.update(new_names)
 
-    def _found(self) -> tuple[Diagnostic, ...]:
+    def _diagnose_missing_names(self) -> tuple[Diagnostic, ...]:
         after = self._after or 0
         during = time_text(after) if self._is_time else counted(after, "sample")
         objects, signals, classes = self._known
-        found = check_names(
+        diagnostics = check_names(
             self._specification,
             sorted(objects.union(object_names(self._specification)) - self._objects),
             sorted(signals.union(signal_names(self._specification)) - self._signals),
@@ -508,7 +510,11 @@ class _AwaitedNames:
             classes=sorted(classes),
         )
         severity: Literal["error", "warning"] = "error" if self._strict else "warning"
-        return tuple(replace(each, severity=severity) for each in found if each.severity == "error")
+        return tuple(
+            replace(diagnostic, severity=severity)
+            for diagnostic in diagnostics
+            if diagnostic.severity == "error"
+        )
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
@@ -596,7 +602,7 @@ class Violation:
         missed = self.witness.missed
         if missed is not None and missed.is_condition:
             return " ".join(missed_sentences(self.witness, missed, self.first_ns)).removesuffix(".")
-        number = _settling(self.atom)
+        number = _settling_number(self.atom)
         amount = abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
         unit = declared_unit(self.atom.atom, self.witness.units, is_scaled=False)
         short = _short(self.atom, self.spec, with_unit(amount, unit) if amount else "just")
@@ -609,14 +615,14 @@ def _has_factor(atom: Atom) -> bool:
     return any(isinstance(part, Product | Scaled) for part in iter_expressions(whole))
 
 
-def _settling(atom: DecidingAtom) -> float:
+def _settling_number(atom: DecidingAtom) -> float:
     return atom.upper if atom.end is End.HIGH else atom.lower
 
 
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
     is_violated = witness.verdict is Verdict.VIOLATED
-    how = how_text(_settling(atom), atom.atom, witness.units, is_violated=is_violated)
+    how = how_text(_settling_number(atom), atom.atom, witness.units, is_violated=is_violated)
     return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 
 
@@ -633,8 +639,8 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
             first, second = measured.names
             where = f"too close to {second}" if needs_more else f"too far from {second}"
             return f"{first} is {amount} {where}"
-        if measured.quantity == "signal" and not isfinite(_settling(atom)):
-            return what_was_measured(atom, {}, 0)
+        if measured.quantity == "signal" and not isfinite(_settling_number(atom)):
+            return measurement_clause(atom, {}, 0)
         if isinstance(part, Signal):
             return f"{part.name} is {amount} too {'low' if needs_more else 'high'}"
     return f"`{spec}` is violated"
@@ -678,22 +684,22 @@ class Settled:
     @property
     def reason(self) -> str:
         """The atom that settled it and by how much, in words; "" if it was not found."""
-        found = self.witness
-        if found is not None and self.verdict is Verdict.UNKNOWN:
-            return str(reason_sentence(found, first_ns=self.first_ns))
-        if found is None or found.deciding is None:
+        witness = self.witness
+        if witness is not None and self.verdict is Verdict.UNKNOWN:
+            return str(reason_sentence(witness, first_ns=self.first_ns))
+        if witness is None or witness.deciding is None:
             return ""
-        return _deciding_words(found.deciding, found, self.first_ns)
+        return _deciding_words(witness.deciding, witness, self.first_ns)
 
     @cached_property
     def witness(self) -> Witness | None:
         """Return the witness on the fewest of the newest samples that give the part its number."""
         for begin in self._begins():
-            found = self._witness_from(begin)
-            number = found.upper if self.verdict is Verdict.VIOLATED else found.lower
+            witness = self._witness_from(begin)
+            number = witness.upper if self.verdict is Verdict.VIOLATED else witness.lower
             is_same = self.verdict is Verdict.UNKNOWN or number == self.number
-            if found.verdict is self.verdict and is_same:
-                return found
+            if witness.verdict is self.verdict and is_same:
+                return witness
         return None
 
     def _begins(self) -> Iterator[int]:
@@ -785,24 +791,28 @@ class ViolationLog:
             elif index in self._unsatisfied and after.item(0, 2) >= 0.0:
                 del self._unsatisfied[index]
                 whole = Conjunct(0, spec.name, spec.formula)
-                found = self._settled(spec, whole, Verdict.SATISFIED, float(after[0, 2]))
-                self.satisfied = (*self.satisfied, found)
+                newly_satisfied = self._verdict_with_samples(
+                    spec, whole, Verdict.SATISFIED, float(after[0, 2])
+                )
+                self.satisfied = (*self.satisfied, newly_satisfied)
         return self.settled is not settled or self.satisfied is not satisfied
 
     def unknown(self, spec: NamedSpec) -> Settled:
         """Return a result that is unknown since the newest sample, if the run ends there."""
         whole = Conjunct(0, spec.name, spec.formula)
-        return self._settled(spec, whole, Verdict.UNKNOWN, float("nan"))
+        return self._verdict_with_samples(spec, whole, Verdict.UNKNOWN, float("nan"))
 
     def _settle(self, spec: NamedSpec, conjuncts: list[Conjunct], numbers: Floats) -> None:
         for conjunct in tuple(conjuncts):
             upper = float(numbers[conjunct.node, 3])
             if upper < 0.0:
                 conjuncts.remove(conjunct)
-                found = self._settled(spec, conjunct, Verdict.VIOLATED, upper)
-                self.settled = (*self.settled, found)
+                newly_violated = self._verdict_with_samples(spec, conjunct, Verdict.VIOLATED, upper)
+                self.settled = (*self.settled, newly_violated)
 
-    def _settled(self, spec: NamedSpec, conjunct: Conjunct, verdict: Verdict, number: float) -> Settled:
+    def _verdict_with_samples(
+        self, spec: NamedSpec, conjunct: Conjunct, verdict: Verdict, number: float
+    ) -> Settled:
         samples = tuple(self._samples)
         first_ns = self._first_ns or 0
         return Settled(
@@ -813,7 +823,7 @@ class ViolationLog:
             verdict,
             number,
             samples,
-            next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns),
+            next(k for k, sample in enumerate(samples) if sample.time_ns >= self._start_ns),
             samples[0].time_ns == first_ns,
             first_ns,
             self._units,

@@ -208,10 +208,10 @@ class SpecResult(Displayed):
     def nodes(self) -> tuple[NodeResult, ...]:
         """All nodes, by id."""
         series = self.series if self.has_series else np.empty((len(self.final), 4, 0))
-        found = []
+        nodes = []
         for identifier, parent, node in iter_nodes(self.formula):
             spec = self.spec if parent is None else self.evidence.instance.named.get(node.name or "")
-            found.append(
+            nodes.append(
                 NodeResult(
                     identifier,
                     parent,
@@ -224,7 +224,7 @@ class SpecResult(Displayed):
                     *map(float, (self.values[identifier], *self.final[identifier])),
                 )
             )
-        return tuple(found)
+        return tuple(nodes)
 
     def node(self, name: str) -> NodeResult:
         """Return the node of the spec with the given name, within this result's tree.
@@ -275,8 +275,10 @@ class SpecResult(Displayed):
     def certain_ns(self, node: int = 0) -> int | None:
         """Return when a node's verdict became certain; None if only the end decided, or it is unknown."""
         verdict = final_verdict(*self.final[node].tolist())
-        at = NEVER if verdict is Verdict.UNKNOWN else self.settled_ns[node, int(verdict is Verdict.VIOLATED)]
-        return None if at == NEVER else int(at)
+        settled_ns = (
+            NEVER if verdict is Verdict.UNKNOWN else self.settled_ns[node, int(verdict is Verdict.VIOLATED)]
+        )
+        return None if settled_ns == NEVER else int(settled_ns)
 
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
@@ -407,8 +409,8 @@ class SpecResult(Displayed):
         goals that hold in the first sample already."""
         doubts = [Sentence("The verdict is doubtful: ", doubt.text, ".") for doubt in self.doubts]
         parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
-        own = [_UNTESTED] if self._is_untested else []
-        return (*doubts, *own, *(part.message for part in parts), *self.goals_at_the_start)
+        untested_remarks = [_UNTESTED] if self._is_untested else []
+        return (*doubts, *untested_remarks, *(part.message for part in parts), *self.goals_at_the_start)
 
     @cached_property
     def goals_at_the_start(self) -> tuple[Sentence, ...]:
@@ -480,8 +482,8 @@ class SpecResult(Displayed):
             UsageError: under the paper's semantics.
         """
         leaves = self._leaves("what decides a verdict")
-        done = evaluate_offline(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
-        return deciding_path(done, 0, End.of(final_verdict(*done.interval(0)))).steps[-1].node
+        nodes = evaluate_offline(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
+        return deciding_path(nodes, 0, End.of(final_verdict(*nodes.interval(0)))).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
         """Return what gave the verdict its robustness, and how a violation began where that was earlier.
@@ -512,8 +514,8 @@ class SpecResult(Displayed):
 
     def sentences(self, first_ns: int) -> tuple[Sentence, ...]:
         """Return the sentences of `explain`, which count time from `first_ns`."""
-        found = self.sentences_about(0, self.causes, first_ns)
-        return (*found, *counted_from(self.remarks, first_ns))
+        sentences = self.sentences_about(0, self.causes, first_ns)
+        return (*sentences, *counted_from(self.remarks, first_ns))
 
     def sentences_about(
         self, node: int, causes: Sequence[Cause], first_ns: int, *, goes_on: bool = False
@@ -524,18 +526,18 @@ class SpecResult(Displayed):
             goes_on: whether samples may follow those evaluated.
         """
         conjuncts = {part.node: part for part in self._conjuncts_of(node)}
-        found = [self._headline(node, causes, first_ns)]
+        sentences = [self._headline(node, causes, first_ns)]
         for cause in causes:
             about = cause_sentences(cause, first_ns=first_ns, object=self.object)
             # of the whole formula, the headline has said the first of them
-            found += about if cause.node != node else about[1:]
+            sentences += about if cause.node != node else about[1:]
             part = [conjuncts[cause.node]]
             for invariant in self._violated_invariants(part, goes_on=goes_on, most=LISTED):
-                found += invariant_sentences(invariant, first_ns, self.evidence.units)
+                sentences += invariant_sentences(invariant, first_ns, self.evidence.units)
         if not causes and self.can_explain:
             witness = self.worst if node == 0 and not self.causes else self.worst_of(node, causes)
-            found += () if witness is None else sentences_of(witness, first_ns=first_ns)[1:]
-        return tuple(found)
+            sentences += () if witness is None else sentences_of(witness, first_ns=first_ns)[1:]
+        return tuple(sentences)
 
     def _headline(self, node: int, causes: Sequence[Cause], first_ns: int) -> Sentence:
         instance = f" for {self.object}" if self.object is not None else ""
@@ -568,8 +570,8 @@ class SpecResult(Displayed):
         least = float(self.final[first.node, 1])
         if not least < first.witness.upper:
             return None
-        of = self.evidence.instance
-        return time_of_least(of, self.leaves, self.times_ns, first.node, first.settled_ns, least)
+        instance = self.evidence.instance
+        return time_of_least(instance, self.leaves, self.times_ns, first.node, first.settled_ns, least)
 
     def _name_of(self, node: int) -> str:
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
@@ -614,10 +616,10 @@ class SpecResult(Displayed):
 
 def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
     """Return the message for an unknown node: the nearest name, and all of them."""
-    known = tuple(names)
-    listed = f"there are {', '.join(known)}" if known else "there are none yet"
-    hint = nearest_hint(name, known) if isinstance(name, str) else ""
-    return f"no node is named {name!r}{place}; {f'{hint} ' if hint else ''}{listed}"
+    existing_names = tuple(names)
+    listing = f"there are {', '.join(existing_names)}" if existing_names else "there are none yet"
+    hint = nearest_hint(name, existing_names) if isinstance(name, str) else ""
+    return f"no node is named {name!r}{place}; {f'{hint} ' if hint else ''}{listing}"
 
 
 def worst_first(results: Sequence[SpecResult]) -> list[int]:
@@ -667,10 +669,10 @@ class Evaluation(Displayed):
         definition of the same name.
         """
         # computed on demand: it takes as long as the evaluation itself
-        found = check_names(
+        diagnostics = check_names(
             self.specification, self.objects, self.signals, classes=self.classes, each=self.each
         )
-        names = (replace(remark, severity="warning") for remark in found)
+        names = (replace(remark, severity="warning") for remark in diagnostics)
         return (*self.specification.warnings, *names)
 
     @cached_property
@@ -703,11 +705,14 @@ class Evaluation(Displayed):
         ]
         if len(fitting) == 1:
             return fitting[0]
-        known = ", ".join(r.name if r.object is None else f"{r.name} for {r.object}" for r in self.results)
+        titles = ", ".join(
+            result.name if result.object is None else f"{result.name} for {result.object}"
+            for result in self.results
+        )
         is_part = any(node.name == name for result in self.results for node in result.nodes if node.name)
         hint = f"; {name!r} is part of a result: node({name!r})" if is_part and not fitting else ""
         raise UsageError(
-            f"{len(fitting)} results fit name={name!r}, object={object!r}; there are {known}{hint}"
+            f"{len(fitting)} results fit name={name!r}, object={object!r}; there are {titles}{hint}"
         )
 
     def to_pandas(self) -> Any:
@@ -724,21 +729,21 @@ class Evaluation(Displayed):
         Raises:
             UsageError: no node, or nodes of several objects, have the name.
         """
-        found = [
+        nodes = [
             node
             for result in self.results
             if object is None or object == result.object
             for node in result.nodes
             if node.name == name
         ]
-        if not found:
+        if not nodes:
             names = {node.name for result in self.results for node in result.nodes if node.name}
             for_object = "" if object is None else f" for object {object!r}"
             raise UsageError(no_such_node(name, sorted(names), for_object))
         objects = {result.object for result in self.results if object in (None, result.object)}
-        if len(objects) > 1 and object is None and len(found) > 1:
-            raise UsageError(f"{len(found)} nodes are named {name!r}; say of which object: object=…")
-        return found[0]
+        if len(objects) > 1 and object is None and len(nodes) > 1:
+            raise UsageError(f"{len(nodes)} nodes are named {name!r}; say of which object: object=…")
+        return nodes[0]
 
     def witness(self, node: str | None = None, object: str | None = None) -> Witness:
         """Return what decides the verdict: of a named node or, by default, of the worst result.
@@ -752,7 +757,9 @@ class Evaluation(Displayed):
         results = [result for result in self.results if object in (None, result.object)]
         if node is not None:
             self.node(node, object)
-            results = [result for result in results if node in {each.name for each in result.nodes}]
+            results = [
+                result for result in results if node in {node_result.name for node_result in result.nodes}
+            ]
         if not results:
             for_object = "" if object is None else f" for {object!r}"
             raise UsageError(f"there is no result{for_object} to explain")
@@ -762,7 +769,7 @@ class Evaluation(Displayed):
     def explain(self) -> str:
         """Explain every verdict in sentences, as the command `explain` does (see `SpecResult.explain`)."""
         texts = [result.explain() for result in self.results]
-        return "\n\n".join([*texts, *(each.message for each in self.vacuous)])
+        return "\n\n".join([*texts, *(part.message for part in self.vacuous)])
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self.verdict}; {', '.join(map(repr, self.results))}>"

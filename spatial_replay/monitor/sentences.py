@@ -105,7 +105,7 @@ def conjuncts_of(formula: Formula, name: str, node: int = 0) -> tuple[Conjunct, 
         node: its id.
     """
     specs: dict[int, str] = {}
-    found = []
+    conjuncts = []
     for identifier, parent, part in iter_nodes(formula):
         if parent is None:
             specs[identifier] = name
@@ -114,8 +114,8 @@ def conjuncts_of(formula: Formula, name: str, node: int = 0) -> tuple[Conjunct, 
         else:
             continue
         if operator_of(part) not in ("and", "spec"):
-            found.append(Conjunct(node + identifier, specs.pop(identifier), part))
-    return tuple(found)
+            conjuncts.append(Conjunct(node + identifier, specs.pop(identifier), part))
+    return tuple(conjuncts)
 
 
 def find_causes(
@@ -139,22 +139,22 @@ def find_causes(
             what gave it its robustness later.
         named: specs by name.
     """
-    failing = [each for each in conjuncts if _verdict(final, each.node) is not Verdict.SATISFIED]
+    failing = [conjunct for conjunct in conjuncts if _verdict(final, conjunct.node) is not Verdict.SATISFIED]
     first: dict[str, Conjunct] = {}
-    for each in sorted(failing, key=lambda each: _order(each.node, values, final, settled_ns)):
-        first.setdefault(each.spec, each)
+    for conjunct in sorted(failing, key=lambda conjunct: _order(conjunct.node, values, final, settled_ns)):
+        first.setdefault(conjunct.spec, conjunct)
     causes = []
-    for each in first.values():
-        at = settled_time(settled_ns, each.node)
-        about = named.get(each.spec)
-        witness, least = witnesses(each.node, at)
+    for conjunct in first.values():
+        at = settled_time(settled_ns, conjunct.node)
+        about = named.get(conjunct.spec)
+        witness, least = witnesses(conjunct.node, at)
         causes.append(
             Cause(
-                each.spec,
-                each.node,
-                format_formula(each.formula),
-                _verdict(final, each.node),
-                float(values[each.node]),
+                conjunct.spec,
+                conjunct.node,
+                format_formula(conjunct.formula),
+                _verdict(final, conjunct.node),
+                float(values[conjunct.node]),
                 at,
                 witness,
                 None if about is None else about.id,
@@ -231,7 +231,7 @@ def sentences_of(
     title += f" ({requirement})" if requirement else ""
     numbers = _robustness(witness.lower, witness.upper, witness.unit)
     if witness.settled_ns is not None:
-        sentences = [_settled(title, witness.verdict, Instant(witness.settled_ns, first_ns))]
+        sentences = [_permanence_sentence(title, witness.verdict, Instant(witness.settled_ns, first_ns))]
     elif is_open:
         sentences = [Sentence(f"{title} is pending: {numbers} so far, and later samples decide.")]
     else:
@@ -242,14 +242,14 @@ def sentences_of(
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
-        sentences.append(_unknown(witness, witness.deciding, first_ns))
-        sentences += [gap_sentence(each, first_ns) for each in witness.gaps]
-        if (shown := witness.while_present) is not None:
-            are = "is" if len(shown.names) == 1 else "are"
-            what = f"Asked only while {' and '.join(shown.names)} {are} in the samples"
-            sentences.append(Sentence(f"{what}, it is {shown.verdict}: write `{shown.text}`."))
+        sentences.append(_unknown_sentence(witness, witness.deciding, first_ns))
+        sentences += [gap_sentence(gap, first_ns) for gap in witness.gaps]
+        if (presence := witness.while_present) is not None:
+            are = "is" if len(presence.names) == 1 else "are"
+            what = f"Asked only while {' and '.join(presence.names)} {are} in the samples"
+            sentences.append(Sentence(f"{what}, it is {presence.verdict}: write `{presence.text}`."))
     elif witness.verdict is Verdict.UNKNOWN:
-        sentences.append(_uncertain(witness, witness.deciding, first_ns))
+        sentences.append(_uncertain_sentence(witness, witness.deciding, first_ns))
     else:
         what = "What counts so far" if is_open else "What decides"
         how = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
@@ -279,7 +279,11 @@ def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -
     instance = f" for {object}" if object is not None else ""
     instance += f" ({requirement})" if requirement else ""
     if cause.settled_ns is not None:
-        return (_settled(f"`{cause.spec}`{instance}", cause.verdict, Instant(cause.settled_ns, first_ns)),)
+        return (
+            _permanence_sentence(
+                f"`{cause.spec}`{instance}", cause.verdict, Instant(cause.settled_ns, first_ns)
+            ),
+        )
     robustness = number_text(cause.robustness)
     return (Sentence(f"`{cause.spec}`{instance} is {cause.verdict}: robustness {robustness}."),)
 
@@ -378,7 +382,7 @@ def uncertain_text(least: str) -> str:
 def without_residue(number: float, atom: Formula) -> float:
     """Return a number of an atom, but 0 where it is no more than a rounding error."""
     limits = [abs(part.value) for part in iter_parts(atom) if isinstance(part, Number)]
-    limits = [each for each in limits if math.isfinite(each)]
+    limits = [limit for limit in limits if math.isfinite(limit)]
     scale = max(limits, default=0.0) or 1.0
     return 0.0 if abs(number * divisor_of(atom)) <= RESIDUE * scale else number
 
@@ -390,7 +394,7 @@ def _robustness(lower: float, upper: float, unit: str) -> str:
     return f"robustness {low}" if lower == upper else f"robustness between {low} and {high}"
 
 
-def _settled(title: str, verdict: Verdict, since: Instant) -> Sentence:
+def _permanence_sentence(title: str, verdict: Verdict, since: Instant) -> Sentence:
     return Sentence(f"{title} is permanently {verdict} from ", since, " on.")
 
 
@@ -399,17 +403,17 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     deciding = witness.deciding
     missed = () if witness.missed is None else missed_sentences(witness, witness.missed, first_ns)
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
-        return _joined(*missed, sentences_of(witness, first_ns=first_ns)[1 + len(missed)])
+        return _join(*missed, sentences_of(witness, first_ns=first_ns)[1 + len(missed)])
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
-        return _joined(*missed)
+        return _join(*missed)
     how = _how_it_decides(witness, deciding, first_ns)
     if witness.missed is not None and witness.missed.response == deciding.text:
         return Sentence(_missed_clause(witness.missed, first_ns), ": it ", how)
-    return _joined(*missed, Sentence(f"`{deciding.text}` ", how))
+    return _join(*missed, Sentence(f"`{deciding.text}` ", how))
 
 
-def _joined(first: Sentence, *others: Sentence) -> Sentence:
+def _join(first: Sentence, *others: Sentence) -> Sentence:
     return Sentence(first, *(part for sentence in others for part in (" ", sentence)))
 
 
@@ -439,19 +443,19 @@ def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) ->
 
     The response and what came closest to it are first, what the condition was measured by is last.
     """
-    said = _missed_clause(missed, first_ns)
+    clause = _missed_clause(missed, first_ns)
     deciding, closest = witness.deciding, []
     if witness.closest is not None:
         best, best_ns = witness.closest
-        measured = what_was_measured(best, witness.units, first_ns)
+        measured = measurement_clause(best, witness.units, first_ns)
         if (best.text, best_ns) == (missed.response, missed.time_ns):
-            said = Sentence(said, ": ", measured)
+            clause = Sentence(clause, ": ", measured)
         else:
             at = Instant(best_ns, first_ns)
             closest = [Sentence(f"`{best.text}` came closest at ", at, ": ", measured, ".")]
-    sentences = [Sentence(said, "."), *closest]
+    sentences = [Sentence(clause, "."), *closest]
     if missed.is_condition and deciding is not None and not deciding.unknown:
-        measured = what_was_measured(deciding, witness.units, first_ns)
+        measured = measurement_clause(deciding, witness.units, first_ns)
         # an operator such as `Y` measures in another sample
         own_time = () if witness.time_ns == missed.time_ns else (" at ", Instant(witness.time_ns, first_ns))
         sentences.append(Sentence("The condition held: ", measured, *own_time, "."))
@@ -477,20 +481,20 @@ def _how_it_decides(
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
-    what = what_was_measured(deciding, witness.units, first_ns)
+    what = measurement_clause(deciding, witness.units, first_ns)
     return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: ", what, ".")
 
 
-def what_was_measured(deciding: DecidingAtom, units: Mapping[str, str], first_ns: int) -> Sentence:
+def measurement_clause(deciding: DecidingAtom, units: Mapping[str, str], first_ns: int) -> Sentence:
     """Return a clause on what decided an atom, without a full stop."""
-    if any(is_text_number(each.value) for each in deciding.measured):
+    if any(is_text_number(number.value) for number in deciding.measured):
         signal, sign, text = deciding.atom.parameters
         is_equal = (deciding.value > 0.0) == (sign == "==")
         return Sentence(f"{signal} is {text if is_equal else 'another text'}")
     clauses: list[str | Instant] = []
     for measured in deciding.measured:
         is_rate = measured.reports_ns is not None and measured.value != 0.0
-        clause = _change(measured, units, first_ns) if is_rate else _measured(measured, units)
+        clause = _change(measured, units, first_ns) if is_rate else _measurement_text(measured, units)
         clauses += [" and ", clause]
     return Sentence(*clauses[1:])
 
@@ -518,14 +522,14 @@ def _in_time(witness: Witness) -> str:
     """Name the temporal operator that chose the sample."""
     for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
-            return f" (within `{_called(witness, place)}`)"
+            return f" (within `{_step_title(witness, place)}`)"
     return ""
 
 
-def _called(witness: Witness, place: int) -> str:
+def _step_title(witness: Witness, place: int) -> str:
     """Return what a step of a path is called: its name, its text, or the name around a text that is long."""
     step = witness.path[place]
-    names = [each.name for each in witness.path[: place + 1] if each.name]
+    names = [node.name for node in witness.path[: place + 1] if node.name]
     if step.name or shortened_formula(step.text) == step.text or not names:
         return step.name or shortened_formula(step.text)
     return names[-1]
@@ -539,7 +543,7 @@ def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> st
     for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator == unsure:
             break
-        where = f"{so_far}within `{_called(witness, place)}`"
+        where = f"{so_far}within `{_step_title(witness, place)}`"
         if step.operator in ("F", "O") and passed <= {"or", "spec"}:
             return f" (its greatest {where})"
         if step.operator in ("G", "H") and passed <= {"and", "spec"}:
@@ -550,7 +554,7 @@ def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> st
     return _in_time(witness)
 
 
-def _measured(measured: Measured, units: Mapping[str, str]) -> str:
+def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
     names, value, lengths = measured.names, measured.value, units.get("", "")
     size = with_unit(abs(value), lengths)
     match measured.quantity:
@@ -642,7 +646,7 @@ def _place(deciding: DecidingAtom, threshold: Threshold) -> str:
     return f"for `{threshold.constant}`" if threshold.constant else f"in `{deciding.text}`"
 
 
-def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
+def _unknown_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
     reasons = " and ".join(deciding.unknown)
     return Sentence(
         f"`{deciding.text}` is unknown at ",
@@ -696,11 +700,11 @@ def open_text(witness: Witness) -> str:
 
 
 def _between(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
-    low, high = (amount_text(each, deciding.atom, units) for each in (deciding.lower, deciding.upper))
+    low, high = (amount_text(end, deciding.atom, units) for end in (deciding.lower, deciding.upper))
     return f"between {low} and {high}"
 
 
-def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
+def _uncertain_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
     return Sentence(
         f"The robustness of `{deciding.text}` lies {_between(deciding, witness.units)} at ",
         Instant(witness.time_ns, first_ns),

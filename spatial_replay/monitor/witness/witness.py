@@ -211,7 +211,7 @@ def find_witness(
     has_open_end = end is not End.OPEN and lower < upper and not goes_on
     missed, closest, closest_path = _NOTHING_MISSED
     if verdict is Verdict.VIOLATED:
-        missed, closest, closest_path = find_missed(evidence, nodes, path, evidence.scene)
+        missed, closest, closest_path = find_missed_response(evidence, nodes, path, evidence.scene)
     response = flip(closest[0]) if closest is not None and flips else None
     return Witness(
         instance.name,
@@ -280,7 +280,7 @@ def atom_of_path(
     return deciding_atom(scene_at(int(nodes.times_ns[step.sample])), leaf, path.end)
 
 
-def find_missed(
+def find_missed_response(
     evidence: Evidence, nodes: OfflineNodes, path: DecidingPath, scene_at: SceneAt
 ) -> MissedWitness:
     """Return the response that was missed on a path to what violates a formula."""
@@ -328,7 +328,7 @@ def _while_present(
     ]
     if not around or not terms:
         return None
-    conditions = [Atom(each.signal.name, "present", each) for each in map(presence_of, terms)]
+    conditions = [Atom(presence.signal.name, "present", presence) for presence in map(presence_of, terms)]
     columns = evidence.columns(conditions)[:, :, : len(times_ns)]
     absent = [place for place in range(len(terms)) if (columns[0, place] < 0.0).any()]
     if not absent or any((columns[0, place] < 0.0).all() for place in absent):
@@ -340,14 +340,14 @@ def _while_present(
     body = Boolean(how, (condition, *operands_of(operator)))
     asked = with_operands(formula, around[-1], (body,))
     both = joined_channels([leaves, columns], axis=1)
-    done = evaluate_offline(asked, (*order, *conditions), both, times_ns)
+    evaluated = evaluate_offline(asked, (*order, *conditions), both, times_ns)
     # nodes before the operator and around it keep their ids
-    verdict = final_verdict(*done.interval(node))
+    verdict = final_verdict(*evaluated.interval(node))
     if verdict is Verdict.UNKNOWN:
         return None
-    written = " and ".join(conditions[place].text for place in absent)
+    condition_text = " and ".join(conditions[place].text for place in absent)
     names = tuple(bindings.get(terms[place].name, terms[place]).name for place in absent)
-    return WhilePresent(names, f"{title_of(operator)} ({written} {how} …)", verdict)
+    return WhilePresent(names, f"{title_of(operator)} ({condition_text} {how} …)", verdict)
 
 
 def time_of_least(
@@ -360,8 +360,8 @@ def time_of_least(
         least: the upper end of its interval for the finished log.
     """
     order = instance.program.leaves
-    done = evaluate_offline(instance.formula, order, leaves, times_ns)
-    path = deciding_path(done, node, End.HIGH)
+    nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
+    path = deciding_path(nodes, node, End.HIGH)
     earliest = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
 
     def is_reached(sample: int) -> bool:
