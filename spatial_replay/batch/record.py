@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -16,8 +16,6 @@ from spatial_replay.spec.load import SpecificationText
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from spatial_replay.batch.run import Wanted
 
 
 _RECORD: Final = b"spatial_replay"
@@ -44,6 +42,11 @@ class RunRecord:
         data = (table.schema.metadata or {}).get(_RECORD, b'{"folder": "", "cases": {}}')
         return cls(**json.loads(data))
 
+    def store_in(self, table: pa.Table) -> pa.Table:
+        """Return a table with this record."""
+        record = json.dumps({"folder": self.folder, "cases": self.cases})
+        return table.replace_schema_metadata({**(table.schema.metadata or {}), _RECORD: record.encode()})
+
     def files(self, case: str) -> list[str]:
         """Return the names of the specification files of a case."""
         return list(self.cases[case]["files"])
@@ -65,27 +68,8 @@ def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def with_record(table: pa.Table, wanted: Sequence[Wanted]) -> pa.Table:
-    """Return the table of a run with its record."""
-    cases: dict[str, dict[str, Any]] = {}
-    for request in wanted:
-        case, file = request.case, request.file
-        if case.name not in cases:
-            cases[case.name] = {"conditions": _recorded_conditions(case.conditions), "files": {}}
-        cases[case.name]["files"][file.name] = [file.text.text, file.text.filename]
-    record = json.dumps({"folder": _folder_of(wanted), "cases": cases})
-    return table.replace_schema_metadata({**(table.schema.metadata or {}), _RECORD: record.encode()})
-
-
-def _folder_of(wanted: Sequence[Wanted]) -> str:
-    for request in wanted:
-        log = request.log
-        if not is_address(log.path) and log.path.endswith(log.name) and not Path(log.name).is_absolute():
-            return str(Path(log.path.removesuffix(log.name)).absolute())
-    return str(Path.cwd())
-
-
-def _recorded_conditions(conditions: Conditions) -> dict[str, Any]:
+def recorded_conditions(conditions: Conditions) -> dict[str, Any]:
+    """Return conditions as values for JSON, with the absolute path of a mapping."""
     mapping = conditions.mapping
     if mapping is not None and not is_address(mapping):
         mapping = str(Path(mapping).absolute())

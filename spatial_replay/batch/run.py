@@ -17,7 +17,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from spatial_replay.batch.identities import identify, states_of
-from spatial_replay.batch.record import with_explanations, with_record
+from spatial_replay.batch.record import RunRecord, recorded_conditions, with_explanations
 from spatial_replay.batch.rows import (
     ResultRow,
     Task,
@@ -29,7 +29,7 @@ from spatial_replay.batch.rows import (
     spec_lines,
 )
 from spatial_replay.batch.store import FORMAT, SOURCE, ResultsFolder, run_columns, table_of
-from spatial_replay.batch.suite import Case, Conditions, Expectation, LogPattern, Suite
+from spatial_replay.batch.suite import Case, Conditions, Expectation, LogPattern, Outcome, Suite
 from spatial_replay.batch.workers import (
     DaskCluster,
     LocalProcesses,
@@ -540,7 +540,7 @@ def run_batch(
         explanations = folder.read_explanations()
         names = zip(*(table.column(name).to_pylist() for name in ("key", "spec", "object")), strict=True)
         places = {place: explanations[name] for place, name in enumerate(names) if name in explanations}
-        table = with_record(with_explanations(table, places), requests)
+        table = _record_of(requests).store_in(with_explanations(table, places))
         folder.write_run(table)
     # a log that cannot be read was tried, and is not known
     evaluated = {task.log for task in tasks} | {
@@ -679,6 +679,25 @@ def _table(
     return _judge_rows(_restore_file_names(asked_rows, asked), asked, fail_on)
 
 
+def _record_of(wanted: Sequence[Wanted]) -> RunRecord:
+    cases: dict[str, dict[str, Any]] = {}
+    for request in wanted:
+        case, file = request.case, request.file
+        if case.name not in cases:
+            cases[case.name] = {"conditions": recorded_conditions(case.conditions), "files": {}}
+        cases[case.name]["files"][file.name] = [file.text.text, file.text.filename]
+    return RunRecord(_folder_of(wanted), cases)
+
+
+def _folder_of(wanted: Sequence[Wanted]) -> str:
+    """Return what the names of logs are relative to."""
+    for request in wanted:
+        log = request.log
+        if not is_address(log.path) and log.path.endswith(log.name) and not Path(log.name).is_absolute():
+            return str(Path(log.path.removesuffix(log.name)).absolute())
+    return str(Path.cwd())
+
+
 def _restore_file_names(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
     """Return rows whose texts name the file that was asked for, not another one that holds the same."""
     import pyarrow as pa
@@ -759,7 +778,7 @@ def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozense
     """Return why a row does not pass, in a few words; None if it does."""
     if row["verdict"] is None:
         return cast("str | None", row["error"])
-    return expectation.failure(cast(ResultRow, SimpleNamespace(**{**row, "lower": _lower(row)})), fail_on)
+    return expectation.failure(cast(Outcome, SimpleNamespace(**{**row, "lower": _lower(row)})), fail_on)
 
 
 def _lower(row: Mapping[str, Any]) -> float:

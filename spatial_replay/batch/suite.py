@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.read_options import KEYS
@@ -28,9 +28,6 @@ from spatial_replay.mapping.yaml_document import (
 )
 from spatial_replay.monitor.verdict import Semantics, Verdict
 from spatial_replay.trace.trace import time_point_from_text
-
-if TYPE_CHECKING:
-    from spatial_replay.batch.rows import ResultRow
 
 LARGEST_SUITE: Final = 8 * 2**20
 """Bytes of a suite file."""
@@ -102,6 +99,29 @@ DAMAGED: Final = "the log is damaged"
 """Beginnings of failures that are no violations."""
 
 
+class Outcome(Protocol):
+    """The values of a result that decide whether it passes; see `ResultRow`."""
+
+    @property
+    def verdict(self) -> str | None: ...
+    @property
+    def lower(self) -> float: ...
+    @property
+    def tested(self) -> str | None: ...
+    @property
+    def untested(self) -> Sequence[str]: ...
+    @property
+    def vacuous(self) -> Sequence[str]: ...
+    @property
+    def left(self) -> Sequence[str]: ...
+    @property
+    def doubtful(self) -> Sequence[str]: ...
+    @property
+    def dropped(self) -> str | None: ...
+    @property
+    def faults(self) -> Sequence[str]: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Expectation:
     """Expectations of a case for every result.
@@ -135,7 +155,7 @@ class Expectation:
             return str(Verdict.SATISFIED)
         return verdict
 
-    def failure(self, outcome: ResultRow, fail_on: AbstractSet[str] = frozenset()) -> str | None:
+    def failure(self, outcome: Outcome, fail_on: AbstractSet[str] = frozenset()) -> str | None:
         """Return why a result with a verdict does not pass, in a few words; None if it does.
 
         Args:
@@ -160,7 +180,7 @@ class Expectation:
         damage = f"{DAMAGED}: {outcome.faults[0]}" if outcome.faults else None
         return "; ".join(filter(None, (failure, damage))) or None
 
-    def _difference(self, outcome: ResultRow) -> str | None:
+    def _difference(self, outcome: Outcome) -> str | None:
         """Return how a verdict or a robustness differs from what is expected."""
         if outcome.verdict == Verdict.UNKNOWN and self.allow_unknown:
             return None

@@ -5,107 +5,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
-from math import dist, isfinite
-from typing import Any, Final, TypeAlias
+from dataclasses import replace
+from math import dist
+from typing import Final, TypeAlias
 
 from spatial_replay.batch.rows import Task, opened_task
 from spatial_replay.batch.run import BatchResult
 from spatial_replay.batch.suite import Conditions
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.footprint import centres_of
-from spatial_replay.judging.judgement import JudgedEpisode, Judgement, PreparedJudgement
+from spatial_replay.judging.judgement import Comparison, JudgedEpisode, Judgement, PreparedJudgement
 from spatial_replay.judging.statistics import (
     EVIDENCE,
-    SIGNIFICANCE,
-    SignedRank,
-    e_value,
-    mcnemar_p,
-    more_pairs,
-    wilcoxon,
 )
-from spatial_replay.text import counted, json_value
+from spatial_replay.text import counted
 
 SAME_START: Final = 0.001
 """Distance of first places that counts as none, in units of length."""
 _Place: TypeAlias = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """New episodes against old ones.
-
-    Attributes:
-        new: name of the new episodes.
-        old: the judgement of the old ones.
-        pairs: decided episodes of both that have the same key and first places.
-        elsewhere: number of pairs with the same key whose objects start elsewhere, or are others.
-        undecided: number of pairs in which one episode is undecided, or its success unstored.
-        alone: number of episodes without a partner.
-    """
-
-    new: str
-    old: Judgement
-    pairs: tuple[tuple[JudgedEpisode, JudgedEpisode], ...]
-    elsewhere: int
-    undecided: int
-    alone: int
-
-    @property
-    def won(self) -> int:
-        """Number of pairs in which only the new episode succeeds."""
-        return sum(bool(new.is_success and not old.is_success) for new, old in self.pairs)
-
-    @property
-    def lost(self) -> int:
-        """Number of pairs in which only the old episode succeeds."""
-        return sum(bool(old.is_success and not new.is_success) for new, old in self.pairs)
-
-    @property
-    def p(self) -> float:
-        """McNemar's exact p-value."""
-        return mcnemar_p(self.won, self.lost)
-
-    @property
-    def evidence(self) -> float:
-        """The e-value, see `e_value`; 20 decides."""
-        return e_value(self.won, self.lost)
-
-    @property
-    def more_pairs(self) -> int | None:
-        """How many further pairs would decide, see `statistics.more_pairs`."""
-        return more_pairs(self.won, self.lost, len(self.pairs))
-
-    @property
-    def margins(self) -> SignedRank | None:
-        """Wilcoxon's signed-rank test of the finite margins; None if no pair differs."""
-        margins = [
-            (new.margin, old.margin)
-            for new, old in self.pairs
-            if new.margin is not None and old.margin is not None and isfinite(new.margin - old.margin)
-        ]
-        return wilcoxon([new for new, _ in margins], [old for _, old in margins])
-
-    @property
-    def decision(self) -> str:
-        """The word "better", "worse" or "undecided"."""
-        if self.p > SIGNIFICANCE:
-            return "undecided"
-        return "better" if self.won > self.lost else "worse"
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """The comparison for JSON."""
-        names = ["decision", "won", "lost", "elsewhere", "undecided", "alone"]
-        names += ["p", "evidence", "more_pairs", "margins"]
-        numbers = {name: getattr(self, name) for name in names}
-        return {
-            "old": self.old.name,
-            "pairs": len(self.pairs),
-            "old_rate": self.old.rate.value,
-            "old_with_unstored_rate": self.old.rate_with_unstored.value,
-            **{name: json_value(value) for name, value in numbers.items()},
-        }
 
 
 def judge_batch(
