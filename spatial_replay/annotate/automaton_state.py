@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.specification import ReportedTree
-from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, TransitionTable
+from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, TransitionTable, size_words
 from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.guards import Transition
-from spatial_replay.automata.text import size_words
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers, combined, equal_places
 from spatial_replay.logs.messages import AUTOMATA_PREFIX, Attachment

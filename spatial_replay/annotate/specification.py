@@ -221,7 +221,8 @@ def _add_nodes(
 
 
 def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: Automaton) -> None:
-    from spatial_replay.automata.text import abbreviated, draw_automaton, guard_of, meanings
+    from spatial_replay.automata.automaton import abbreviated, meanings
+    from spatial_replay.automata.drawing import draw_automaton, guard_of
 
     drawing, short = draw_automaton(automaton), abbreviated(automaton)
     result.automaton.legend.extend(map(tree.named, meanings(short)))

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.automata.automaton import TransitionTable
+    from spatial_replay.automata.automaton import TransitionTable, words_text
     from spatial_replay.automata.compile import Compiler, automaton_from, chosen_spec, stored_text
+    from spatial_replay.automata.drawing import svg_text
     from spatial_replay.automata.guards import Transition
-    from spatial_replay.automata.text import dot_text, hoa_text, svg_text, words_text
 
 __all__ = [
     "Compiler",
@@ -21,8 +21,6 @@ __all__ = [
     "TransitionTable",
     "automaton_from",
     "chosen_spec",
-    "dot_text",
-    "hoa_text",
     "stored_text",
     "svg_text",
     "words_text",

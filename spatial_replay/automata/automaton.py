@@ -1,272 +1,30 @@
-"""The automaton of a specification: the least of the machines that compilers produce, and its runs."""
+"""The automaton of a specification: its runs, its words, and its texts for other tools."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from textwrap import wrap
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.automata.guards import (
-    LEAF,
-    Diagrams,
     Moves,
     Proposition,
     Successors,
     Transition,
     guard_words,
 )
+from spatial_replay.automata.machine import Machine, above_of, sources_of
 from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.lazy import Displayed, drawn_as_svg
-
-
-@dataclass(frozen=True, eq=False)
-class Machine:
-    """A deterministic automaton with a move from every state for every symbol.
-
-    A *place* is a row of `decisions`, or ~q for state q.
-
-    Attributes:
-        moves: (S,), the place with which the moves of each state begin.
-        decisions: (D, 3), a proposition and the places where it is false, and true. These decide on later
-            propositions and stand in earlier rows.
-        accepting: (S,), whether a run may end in each state.
-        start: the place with which the first sample of a run begins.
-    """
-
-    moves: Integers
-    decisions: Integers
-    accepting: Flags
-    start: int
-
-    @property
-    def size(self) -> int:
-        """How many states and decisions it has."""
-        return len(self.moves) + len(self.decisions)
-
-
-def machine_of(diagrams: Diagrams, moves: Sequence[int], accepting: Sequence[bool], start: int) -> Machine:
-    """Return the machine whose moves are nodes of diagrams with states as leaves."""
-    places: list[int] = []
-    rows: list[tuple[int, int, int]] = []
-    for node in range(len(diagrams)):
-        variable, low, high = diagrams[node]
-        if variable == LEAF:
-            places.append(~low)
-        else:
-            places.append(len(rows))
-            rows.append((variable, places[low], places[high]))
-    return _machine([places[node] for node in moves], rows, accepting, places[start])
-
-
-def _machine(
-    moves: Sequence[int], rows: Sequence[tuple[int, int, int]], accepting: Sequence[bool], start: int
-) -> Machine:
-    decisions = np.array(rows, np.int64).reshape(-1, 3)
-    return Machine(np.array(moves, np.int64), decisions, np.array(accepting, np.bool_), start)
-
-
-def merged(machine: Machine) -> Machine:
-    """Return a machine that accepts the same runs, without equivalent states."""
-    _, firsts, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
-    places, decisions = _relabel(machine, classes)
-    moves = places[machine.moves[firsts]]
-    return Machine(moves, decisions, machine.accepting[firsts], int(places[machine.start]))
-
-
-def least(machine: Machine) -> Machine:
-    """Return the automaton with the fewest states, one of them, 0, for a run that has not begun.
-
-    Two machines that accept the same runs of at least one sample give equal ones: states are numbered by
-    their distance from the first one. No run is empty, so that may be any state with the same moves, and one
-    that does not accept if there is a choice.
-    """
-    machine = merged(machine)
-    reachable = _reachable(machine)
-    # compilers differ in states that no run is in
-    same = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
-    if len(same):
-        first = int(same[np.argmin(machine.accepting[same])])
-    else:
-        first = len(machine.moves)
-        moves, accepting = np.append(machine.moves, machine.start), np.append(machine.accepting, False)
-        machine = Machine(moves, machine.decisions, accepting, machine.start)
-    return _select_states(machine, [first, *(state for state in reachable if state != first)])
-
-
-def _reachable(machine: Machine) -> list[int]:
-    """Return the states that can be reached: nearer ones first, then false before true."""
-    moves, rows = machine.moves.tolist(), machine.decisions.tolist()
-    order: dict[int, None] = {}
-    waiting: list[int] = []
-    # a decision visited before leads to no new state
-    visited = [False] * len(rows)
-    stack = [machine.start]
-    expanded = 0
-    while stack:
-        place = stack.pop()
-        if place < 0:
-            if ~place not in order:
-                order[~place] = None
-                waiting.append(~place)
-        elif not visited[place]:
-            visited[place] = True
-            _, low, high = rows[place]
-            stack += (high, low)
-        if not stack and expanded < len(waiting):
-            stack.append(moves[waiting[expanded]])
-            expanded += 1
-    return waiting
-
-
-def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
-    """Return only some states, in the order given, and decisions in theirs; no move leads to another."""
-    numbers = {state: number for number, state in enumerate(states)}
-    rows = machine.decisions.tolist()
-    places: dict[int, int] = {}
-    decisions: list[tuple[int, int, int]] = []
-
-    def place(before: int) -> int:
-        if before < 0:
-            return ~numbers[~before]
-        after = places.get(before)
-        if after is None:
-            variable, low, high = rows[before]
-            row = (variable, place(low), place(high))
-            after = places[before] = len(decisions)
-            decisions.append(row)
-        return after
-
-    moves = [place(before) for before in machine.moves[np.array(states, np.int64)].tolist()]
-    start = place(machine.start)
-    return _machine(moves, decisions, machine.accepting[np.array(states, np.int64)].tolist(), start)
-
-
-def _relabel(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
-    """Give the states other numbers, and merge decisions that have become equal.
-
-    Returns:
-        For each place its new place, (D + S,), to be indexed by place: ~q is index D + S - 1 - q. And the new
-        decisions.
-    """
-    decisions = machine.decisions
-    places = np.concatenate([np.empty(len(decisions), np.int64), ~numbers[::-1]])
-    span = len(places) + 1
-    levels: list[Integers] = []
-    count = 0
-    for rows in _levels(decisions):
-        variable = decisions[rows[0], 0]
-        low, high = places[decisions[rows, 1]], places[decisions[rows, 2]]
-        places[rows] = low
-        differ = low != high
-        keys = (low[differ] + span) * (2 * span) + high[differ] + span
-        kinds, firsts, inverse = np.unique(keys, return_index=True, return_inverse=True)
-        places[rows[differ]] = count + inverse.ravel()
-        level = np.empty((len(kinds), 3), np.int64)
-        level[:, 0], level[:, 1], level[:, 2] = variable, low[differ][firsts], high[differ][firsts]
-        levels.append(level)
-        count += len(kinds)
-    return places, np.concatenate(levels) if levels else np.empty((0, 3), np.int64)
-
-
-def _levels(decisions: Integers) -> Iterator[Integers]:
-    """Yield the rows that decide on each proposition, the last proposition first."""
-    if not len(decisions):
-        return
-    order = np.argsort(-decisions[:, 0], kind="stable")
-    bounds = np.flatnonzero(np.diff(decisions[order, 0])) + 1
-    yield from np.split(order, bounds)
-
-
-def _split_classes(machine: Machine) -> list[int]:
-    """Return the class of each state: states of one class accept the same runs, the empty one included.
-
-    Classes are split until the moves of all members of one lead to the same ones.
-    The largest part of a class keeps its number, so that few states are checked again (Hopcroft, 1971).
-    """
-    moves, rows = machine.moves.tolist(), machine.decisions.tolist()
-    classes: list[int] = machine.accepting.astype(np.int64).tolist()
-    parts: list[dict[int, set[int]]] = [{}, {}]
-    leading: dict[int, int] = {}
-    above = above_of(moves, rows)
-    diagrams = Diagrams()
-    pending: Collection[int] = range(len(classes))
-    while pending:
-        copies: dict[int, int] = {}
-
-        def copy(place: int, copies: dict[int, int] = copies) -> int:
-            if place < 0:
-                return diagrams.leaf(classes[~place])
-            if place not in copies:
-                variable, low, high = rows[place]
-                copies[place] = diagrams.decide(variable, copy(low), copy(high))
-            return copies[place]
-
-        for state in pending:
-            parts_of_class = parts[classes[state]]
-            if state in leading:
-                parts_of_class[leading[state]].remove(state)
-                if not parts_of_class[leading[state]]:
-                    del parts_of_class[leading[state]]
-            leading[state] = copy(moves[state])
-            parts_of_class.setdefault(leading[state], set()).add(state)
-        moved = _split(parts, classes, dict.fromkeys(classes[state] for state in pending))
-        pending = sources_of(above, moved)
-    return classes
-
-
-def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterable[int]) -> list[int]:
-    """Make all parts of some classes but the largest classes of their own; gives the states in these."""
-    moved: list[int] = []
-    for number in touched:
-        parts_of_class = parts[number]
-        largest = max(parts_of_class, key=lambda node: len(parts_of_class[node]))
-        for node in [part for part in parts_of_class if part != largest]:
-            members = parts_of_class.pop(node)
-            for state in members:
-                classes[state] = len(parts)
-            parts.append({node: members})
-            moved += sorted(members)
-    return moved
-
-
-def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
-    """Return for each place the rows that lead to it at once, and ~q if the moves of state q begin there."""
-    above: dict[int, list[int]] = {}
-    for number, (_, low, high) in enumerate(rows):
-        above.setdefault(low, []).append(number)
-        above.setdefault(high, []).append(number)
-    for state, place in enumerate(moves):
-        above.setdefault(place, []).append(~state)
-    return above
-
-
-def sources_of(
-    above: dict[int, list[int]], targets: Iterable[int], visited: set[int] | None = None
-) -> dict[int, None]:
-    """Return the states from which one sample can lead to some states.
-
-    Args:
-        above: as from `above_of`.
-        visited: rows that are not followed again; those that are followed are added.
-    """
-    sources: dict[int, None] = {}
-    seen = set() if visited is None else visited
-    stack = [~target for target in targets]
-    while stack:
-        for parent_row in above.get(stack.pop(), ()):
-            if parent_row < 0:
-                sources[~parent_row] = None
-            elif parent_row not in seen:
-                seen.add(parent_row)
-                stack.append(parent_row)
-    return sources
-
+from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
+from spatial_replay.text import counted
 
 MAX_PROPOSITIONS = 64
 """How many propositions an automaton reads at most."""
@@ -279,6 +37,18 @@ _OF_MOVES = {"_moves", "_above", "distances", "can_accept", "can_reject", "trans
 
 MAX_LISTED = 100_000
 """How many transitions are listed at most, and how many cubes their guards have together."""
+
+MOST_STATES = 60
+"""States that a drawing shows at most, and a text of an automaton whose transitions cannot all be listed."""
+MOST_MOVES = 300
+LONGEST_GUARD = 300
+"""The most moves there, and characters of a guard."""
+_LONGEST_LABEL = 12
+"""Characters of a proposition that stands on an arrow as it is."""
+_WIDTH = 20
+"""Characters after which a label of an arrow goes on in a new line."""
+_LEGEND_WIDTH = 100
+"""Characters of a line below a drawing."""
 
 
 @dataclass(frozen=True)
@@ -491,16 +261,48 @@ class Automaton(Displayed):
         return drawn_as_svg(self)
 
     def to_dot(self) -> str:
-        """Return the automaton in the language of Graphviz; see `dot_hoa.dot_text`."""
-        from spatial_replay.automata.text import dot_text
+        """Return the automaton for Graphviz, with guards in words and long propositions in a legend.
 
-        return dot_text(self)
+        Accepting states have a double outline. Those that accept permanently are blue, traps are vermillion.
+        If not all transitions can be listed, it has the states nearest to the start.
+        """
+        short = abbreviated(self)
+        cut = () if self.is_listable else (_left_out(self),)
+        return digraph_text(short, [*meanings(short), *cut])
 
     def to_hoa(self) -> str:
-        """Return the automaton in the Hanoi format for tools of automata theory; see `dot_hoa.hoa_text`."""
-        from spatial_replay.automata.text import hoa_text
+        """Return the automaton in the Hanoi omega-automata format, version 1.
 
-        return hoa_text(self)
+        That format is about infinite runs and has no acceptance for finite ones. So the accepting states are
+        written as the acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a state
+        of that set. The header `finite-runs`, which readers may ignore, says so.
+
+        Raises:
+            UsageError: its transitions are too many to be listed.
+        """
+        if not self.is_listable:
+            raise UsageError(
+                f"the Hanoi format has every transition of {self.name}, of which there are too many "
+                f"({size_words(self)}); text and .dot files show the states nearest to the start"
+            )
+        numbers = range(len(self.propositions))
+        names = [_quote(proposition.label) for proposition in self.propositions]
+        lines = [
+            "HOA: v1",
+            f"name: {_quote(self.name)}",
+            f"States: {len(self.states)}",
+            f"Start: {self.initial}",
+            " ".join(["AP:", str(len(numbers)), *names]),
+            "acc-name: Buchi",
+            "Acceptance: 1 Inf(0)",
+            "properties: trans-labels explicit-labels state-acc complete deterministic",
+            'finite-runs: "accepted iff they end in a state of set 0"',
+            "--BODY--",
+        ]
+        for state, transitions in _by_source(self).items():
+            lines.append(f"State: {state} {{0}}" if state in self.accepting else f"State: {state}")
+            lines += [f"  [{_hoa_guard(transition)}] {transition.target}" for transition in transitions]
+        return "\n".join([*lines, "--END--", ""])
 
     @cached_property
     def _moves(self) -> Moves:
@@ -649,3 +451,149 @@ def _spread(
                     stack[height] = decisions[place, 2]
                     height += 1
         before = after
+
+
+def words_text(automaton: Automaton) -> str:
+    """Describe states, what they mean, and their moves in words.
+
+    If not all transitions can be listed, it has the states nearest to the start.
+    """
+    lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
+    lines += [
+        f"  {proposition.name} means {proposition.text}"
+        for proposition in automaton.propositions
+        if proposition.name is not None
+    ]
+    for state, transitions in _by_source(automaton).items():
+        lines.append(f"  state {state}: {state_words(automaton, state)}")
+        for transition in transitions:
+            to = "stays" if transition.target == state else f"to {transition.target}"
+            lines.append(f"    {to} if {_guard_text(automaton, transition)}")
+    if not automaton.is_listable:
+        lines.append(f"  … {_left_out(automaton)}")
+    return "\n".join(lines)
+
+
+def size_words(automaton: Automaton) -> str:
+    """Return its size: "33 states, 6 propositions"."""
+    return f"{counted(len(automaton.states), 'state')}, {counted(len(automaton.propositions), 'proposition')}"
+
+
+def state_words(automaton: Automaton, state: int) -> str:
+    """Return the verdict of a run that ends in a state, and whether it can change."""
+    begins = "start, " if state == automaton.initial else ""
+    if state == automaton.initial and not automaton.has_returns:
+        return f"{begins}before the first sample"
+    now = "accepting" if state in automaton.accepting else "not accepting"
+    if state not in automaton.can_reject:
+        now = "accepting permanently"
+    elif state not in automaton.can_accept:
+        now = "a trap: acceptance is lost"
+    return begins + now
+
+
+def state_colour(automaton: Automaton, state: int) -> str:
+    """Return a state's fill: light blue if it accepts permanently, light vermillion if it is a trap."""
+    if state not in automaton.can_reject:
+        return hexadecimal(light(POSITIVE))
+    return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
+
+
+def abbreviated(automaton: Automaton) -> Automaton:
+    """Return the automaton with short names for long propositions, as fit on arrows."""
+    labels = {proposition.label for proposition in automaton.propositions}
+    names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
+    short = (
+        proposition if len(proposition.label) <= _LONGEST_LABEL else replace(proposition, name=next(names))
+        for proposition in automaton.propositions
+    )
+    return automaton.renamed(tuple(short))
+
+
+def meanings(automaton: Automaton) -> list[str]:
+    """Return the text of each named proposition: "p0: cup leftof plate"."""
+    return [
+        f"{proposition.name}: {proposition.text}"
+        for proposition in automaton.propositions
+        if proposition.name is not None
+    ]
+
+
+def digraph_text(automaton: Automaton, legend: Sequence[str] = ()) -> str:
+    lines = [
+        f"digraph {_quote(automaton.name)} {{",
+        "  rankdir=LR;",
+        '  node [shape=circle, style=filled, fillcolor=white, fontname="Helvetica"];',
+        '  edge [fontname="Helvetica", fontsize=10];',
+        "  start [shape=point];",
+        f"  start -> {automaton.initial};",
+    ]
+    if legend:
+        text = "".join(f"{_escape(line)}\\l" for meaning in legend for line in _legend_lines(meaning))
+        lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{text}"];')
+    moves = _by_source(automaton)
+    for state in moves:
+        shape = "doublecircle" if state in automaton.accepting else "circle"
+        colour, about = state_colour(automaton, state), _quote(state_words(automaton, state))
+        lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
+    for transition in (move for state in moves.values() for move in state):
+        label = "\\n".join(map(_escape, _broken(_guard_text(automaton, transition))))
+        lines.append(f'  {transition.source} -> {transition.target} [label="{label}"];')
+    return "\n".join([*lines, "}", ""])
+
+
+def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
+    """Return for each state that is shown, the moves from it to others that are."""
+    shown_states = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
+    ends = [
+        (state, target)
+        for state in shown_states
+        for target in automaton.successors[state]
+        if target in shown_states
+    ]
+    moves: dict[int, list[Transition]] = {state: [] for state in shown_states}
+    for source, target in ends if automaton.is_listable else ends[:MOST_MOVES]:
+        move = automaton.transition(source, target)
+        if move is not None:
+            moves[source].append(move)
+    return moves
+
+
+def _left_out(automaton: Automaton) -> str:
+    most = len(automaton.states[:MOST_STATES])
+    rest = f"{counted(len(automaton.states) - most, 'more state')}, " if len(automaton.states) > most else ""
+    return f"{rest}more transitions and the rest of long guards are left out: there are too many"
+
+
+def _guard_text(automaton: Automaton, move: Transition) -> str:
+    return automaton.guard_words(move, None if automaton.is_listable else LONGEST_GUARD)
+
+
+def _hoa_guard(transition: Transition) -> str:
+    literals = (
+        [str(number) if value else f"!{number}" for number, value in cube] for cube in transition.guard
+    )
+    return " | ".join("&".join(cube) or "t" for cube in literals)
+
+
+def _broken(text: str) -> list[str]:
+    """Return a sentence in lines, broken before `and` and `or`."""
+    lines = [""]
+    for word in text.split(" "):
+        if word in ("and", "or") and len(lines[-1]) > _WIDTH:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return lines
+
+
+def _legend_lines(text: str) -> list[str]:
+    return wrap(text, _LEGEND_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+
+
+def _escape(text: str) -> str:
+    printable = "".join(character if character.isprintable() else " " for character in text)
+    return printable.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _quote(text: str) -> str:
+    return f'"{_escape(text)}"'

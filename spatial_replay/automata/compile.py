@@ -21,18 +21,10 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from spatial_replay.automata.automaton import (
-    MAX_PROPOSITIONS,
-    MAX_ROWS,
-    Automaton,
-    Machine,
-    automaton_of,
-    least,
-    machine_of,
-    merged,
-)
+from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
 from spatial_replay.automata.guards import LEAF, NO, YES, Diagrams, Propositions, copied
 from spatial_replay.automata.ltlf import FALSE, TRUE, Kind, Node, Skeleton, counts_seconds, no_automaton
+from spatial_replay.automata.machine import Machine, least, machine_of, merged
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.spec.diagnostics import SourceText, nearest_hint
 from spatial_replay.spec.format import format_formula

@@ -453,9 +453,10 @@ def _write_automata(
         UsageError: Graphviz is not installed.
         OutputError: the file cannot be written.
     """
+    from spatial_replay.automata.automaton import Automaton, size_words
     from spatial_replay.automata.compile import automaton, chosen_spec
+    from spatial_replay.automata.drawing import svg_text
     from spatial_replay.automata.ltlf import bounds_in_samples
-    from spatial_replay.automata.text import dot_text, hoa_text, size_words, svg_text
     from spatial_replay.logs.output_file import replacing
 
     if file == _STANDARD_OUTPUT:
@@ -464,7 +465,8 @@ def _write_automata(
         return
     path = Path(file)
     graph = automaton(specification, name, rate_hz=hz)
-    text = dict(zip(_AUTOMATON_FILES, (dot_text, hoa_text, svg_text), strict=True))[path.suffix](graph)
+    writers = Automaton.to_dot, Automaton.to_hoa, svg_text
+    text = dict(zip(_AUTOMATON_FILES, writers, strict=True))[path.suffix](graph)
     with replacing(path, inputs) as stream:
         stream.write(text.encode())
     show(f"wrote {path}: {size_words(graph)}", err=quiet)
@@ -474,9 +476,9 @@ def _write_automata(
 
 
 def _print_automata(specification: Specification, names: Sequence[str], hz: float | None) -> None:
+    from spatial_replay.automata.automaton import words_text
     from spatial_replay.automata.compile import automaton, chosen_spec
     from spatial_replay.automata.ltlf import bounds_in_samples
-    from spatial_replay.automata.text import words_text
 
     faults = []
     for name in names:

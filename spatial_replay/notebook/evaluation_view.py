@@ -12,16 +12,15 @@ import numpy as np
 
 from spatial_replay.annotate.scene.scene_template import outlines_of, rings_of
 from spatial_replay.annotate.specification import unit_of, unit_words
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.text import (
+from spatial_replay.automata.automaton import (
+    Automaton,
     abbreviated,
-    layout_text,
     meanings,
     size_words,
     state_colour,
-    svg_text,
     words_text,
 )
+from spatial_replay.automata.drawing import layout_text, svg_text
 from spatial_replay.errors import OutputError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.terms import footprint_from_outline

@@ -36,8 +36,8 @@ from spatial_replay.annotate.scene.scene_frames import (
 )
 from spatial_replay.annotate.scene.scene_template import REGION
 from spatial_replay.annotate.specification import unit_of
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.text import abbreviated, draw_automaton, meanings
+from spatial_replay.automata.automaton import Automaton, abbreviated, meanings
+from spatial_replay.automata.drawing import draw_automaton
 from spatial_replay.bags.open import is_log, open_messages
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers

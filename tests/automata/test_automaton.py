@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from spatial_replay import UsageError, automaton, parse_specification
-from spatial_replay.automata import Transition, dot_text, hoa_text, words_text
+from spatial_replay.automata import Transition, words_text
 from spatial_replay.automata.automaton import Automaton
 
 TASK = """\
@@ -109,7 +109,7 @@ def test_the_description_explains_names_and_final_states(done: Automaton) -> Non
 
 
 def test_the_graphviz_text_lists_states_and_transitions() -> None:
-    text = dot_text(automaton(parse_specification('spec "a \\"b\\"" = F p >= 0')))
+    text = automaton(parse_specification('spec "a \\"b\\"" = F p >= 0')).to_dot()
     assert text.splitlines()[0] == 'digraph "a \\"b\\"" {'
     assert '  1 [shape=doublecircle, fillcolor="#b2d5e8", tooltip="accepting permanently"];' in text
     assert '  0 -> 1 [label="p >= 0"];' in text
@@ -117,7 +117,7 @@ def test_the_graphviz_text_lists_states_and_transitions() -> None:
 
 def test_the_graphviz_text_explains_long_propositions_in_a_legend() -> None:
     near = "(cup dist plate <= 0.25) and (cup dist fork <= 0.25) and (fork dist plate <= 0.25)"
-    text = dot_text(automaton(parse_specification(f"spec p0 = q >= 0\nspec t = (F ({near})) and G p0")))
+    text = automaton(parse_specification(f"spec p0 = q >= 0\nspec t = (F ({near})) and G p0")).to_dot()
     assert '[label="p1 and p0"]' in text
     below = next(line for line in text.splitlines() if "label=" in line and "p1: " in line)
     assert "p0: q >= 0\\l" in below
@@ -126,7 +126,7 @@ def test_the_graphviz_text_explains_long_propositions_in_a_legend() -> None:
 
 
 def test_the_hanoi_text_lists_states_and_transitions(done: Automaton) -> None:
-    lines = hoa_text(automaton(parse_specification("G ((p >= 0) -> F q >= 0)"))).splitlines()
+    lines = automaton(parse_specification("G ((p >= 0) -> F q >= 0)")).to_hoa().splitlines()
     assert lines == [
         "HOA: v1",
         'name: "spec"',
@@ -147,4 +147,3 @@ def test_the_hanoi_text_lists_states_and_transitions(done: Automaton) -> None:
         "--END--",
     ]
     assert "[t]" in done.to_hoa()
-    assert done.to_dot() == dot_text(done)

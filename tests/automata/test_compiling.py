@@ -9,7 +9,7 @@ import pytest
 import spatial_replay as sr
 from automata.golden import FILE, FORMULAS, as_values
 from spatial_replay import NoAutomatonError, UsageError, automaton, parse_specification
-from spatial_replay.automata import dot_text, hoa_text, stored_text, words_text
+from spatial_replay.automata import stored_text, words_text
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.simulation.tabletop import default_specification
 
@@ -227,9 +227,9 @@ def test_of_an_automaton_with_too_many_transitions_the_states_nearest_to_the_sta
         "… 196 more states, more transitions and the rest of long guards are left out: there are too many"
     )
     assert "state 59:" in words and "state 60:" not in words
-    assert "196 more states" in dot_text(machine)
+    assert "196 more states" in machine.to_dot()
     with pytest.raises(UsageError, match=r"Hanoi format has every transition .*256 states"):
-        hoa_text(machine)
+        machine.to_hoa()
 
 
 def test_a_guard_of_too_many_cubes_is_cut_and_says_so() -> None:

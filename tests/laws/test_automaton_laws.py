@@ -17,10 +17,11 @@ from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_w
 from laws.strategies_monitor import leaf_runs
 from spatial_replay import Specification, automaton
 from spatial_replay.automata import TransitionTable, automaton_from, stored_text
-from spatial_replay.automata.automaton import Automaton, automaton_of, least, merged
+from spatial_replay.automata.automaton import Automaton, automaton_of
 from spatial_replay.automata.compile import joined, progressed
 from spatial_replay.automata.guards import Propositions
 from spatial_replay.automata.ltlf import Skeleton
+from spatial_replay.automata.machine import least, merged
 from spatial_replay.spec.formula import Boolean, NamedSpec
 
 known = st.booleans()

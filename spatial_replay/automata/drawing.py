@@ -1,0 +1,214 @@
+"""Drawings of automata: by Graphviz, and as places of states and moves."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from spatial_replay.automata.automaton import (
+    LONGEST_GUARD,
+    MOST_MOVES,
+    MOST_STATES,
+    Automaton,
+    digraph_text,
+    size_words,
+    state_words,
+)
+from spatial_replay.errors import OutputError, UsageError
+
+_DRAWING_S = 120.0
+"""Seconds that Graphviz may take."""
+
+
+def svg_text(automaton: Automaton) -> str:
+    """Return the automaton drawn by Graphviz.
+
+    Raises:
+        UsageError: Graphviz is not installed.
+        OutputError: Graphviz fails, or takes too long.
+    """
+    return _graphviz(automaton, automaton.to_dot(), "svg")
+
+
+def layout_text(automaton: Automaton) -> str:
+    """Return the places of states and arrows, without a legend, as JSON.
+
+    Raises:
+        UsageError, OutputError: as `svg_text`.
+    """
+    return _graphviz(automaton, digraph_text(automaton), "json0")
+
+
+def _graphviz(automaton: Automaton, text: str, form: str) -> str:
+    executable = shutil.which("dot")
+    if executable is None:
+        raise UsageError(
+            "drawing an automaton takes Graphviz, which is not installed: apt-get install graphviz; "
+            "or write it as text to a file that ends in .dot"
+        )
+    try:
+        command = [executable, f"-T{form}"]
+        process = subprocess.run(
+            command, input=text.encode(), capture_output=True, timeout=_DRAWING_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise OutputError(
+            f"Graphviz did not draw {len(automaton.states)} states and {len(automaton.transitions)} "
+            f"transitions within {_DRAWING_S:g} s; write them as text to a file that ends in .dot"
+        ) from None
+    if process.returncode != 0:
+        reason = process.stderr.decode(errors="replace").strip()[:200]
+        raise OutputError(f"Graphviz ended with code {process.returncode}: {reason}")
+    return process.stdout.decode()
+
+
+_SWEEPS: Final = 4
+
+
+class DrawnState(NamedTuple):
+    """A state in a drawing.
+
+    Attributes:
+        about: the verdict of a run that ends there, in words.
+        is_lost: whether acceptance is out of reach from there.
+        is_won: whether rejection is.
+        distance: samples that it takes at least to reach acceptance; None if that is lost.
+    """
+
+    number: int
+    column: int
+    row: float
+    about: str
+    is_accepting: bool
+    is_lost: bool
+    is_won: bool
+    distance: int | None
+
+
+class DrawnMove(NamedTuple):
+    """A transition in a drawing, with its guard in words."""
+
+    source: int
+    target: int
+    guard: str
+
+
+class AutomatonDrawing(NamedTuple):
+    """An automaton as it is drawn.
+
+    Attributes:
+        summary: its size in words.
+        left_out: how many states are not drawn.
+    """
+
+    summary: str
+    states: tuple[DrawnState, ...]
+    moves: tuple[DrawnMove, ...]
+    left_out: int
+
+
+def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> AutomatonDrawing:
+    """Place the states of an automaton; of a large one the visited ones, then those nearest to the start.
+
+    Args:
+        visited: states whose moves come first, where there are too many.
+    """
+    first = {automaton.initial, *visited}
+    others = [state for state in automaton.states if state not in first]
+    drawn_states = sorted([*sorted(first), *others][:MOST_STATES])
+    places = _places(automaton, drawn_states)
+    distances = automaton.distances
+    ends = [(source, to) for source in drawn_states for to in automaton.successors[source] if to in places]
+    ends.sort(key=lambda move: move[0] not in first)
+    moves = [
+        move for move_ends in ends[:MOST_MOVES] if (move := automaton.transition(*move_ends)) is not None
+    ]
+    return AutomatonDrawing(
+        size_words(automaton),
+        tuple(
+            DrawnState(
+                state,
+                *places[state],
+                state_words(automaton, state),
+                state in automaton.accepting,
+                state not in automaton.can_accept,
+                state not in automaton.can_reject,
+                distances.get(state),
+            )
+            for state in drawn_states
+        ),
+        tuple(
+            DrawnMove(move.source, move.target, automaton.guard_words(move, LONGEST_GUARD)) for move in moves
+        ),
+        len(automaton.states) - len(drawn_states),
+    )
+
+
+def guard_of(automaton: Automaton, move: DrawnMove) -> str:
+    """Return the guard of a move in words, as this automaton names its propositions; it has the move."""
+    transition = automaton.transition(move.source, move.target)
+    return "" if transition is None else automaton.guard_words(transition, LONGEST_GUARD)
+
+
+def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
+    """Return column and row of each state: columns follow the transitions, rows make few of them cross."""
+    state_set = set(shown)
+    successors = {
+        state: [successor for successor in automaton.successors[state] if successor in state_set]
+        for state in shown
+    }
+    column = _columns(successors, automaton.initial)
+    layers = [
+        [state for state in shown if column[state] == number] for number in range(max(column.values()) + 1)
+    ]
+    row = {state: height for layer in layers for state, height in _heights(layer)}
+    for _ in range(_SWEEPS):
+        for layer in layers[1:]:
+            aims = {state: _middle(row, successors, state) for state in layer}
+            layer.sort(key=lambda state: (aims[state], state))
+            row |= dict(_heights(layer))
+    return {state: (column[state], row[state]) for state in shown}
+
+
+def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
+    """Return for each state the longest way there, in transitions that do not lead back."""
+    ended: list[int] = []
+    on_way: set[int] = set()
+    back: set[tuple[int, int]] = set()
+    for root in [initial, *successors]:
+        stack = [] if root in ended else [(root, iter(successors[root]))]
+        on_way.update(state for state, _ in stack)
+        while stack:
+            state, targets = stack[-1]
+            target = next(targets, None)
+            if target is None:
+                stack.pop()
+                on_way.discard(state)
+                ended.append(state)
+            elif target in on_way:
+                back.add((state, target))
+            elif target not in ended:
+                on_way.add(target)
+                stack.append((target, iter(successors[target])))
+    column = dict.fromkeys(successors, 0)
+    for state in reversed(ended):
+        for target in successors[state]:
+            if (state, target) not in back:
+                column[target] = max(column[target], column[state] + 1)
+    return column
+
+
+def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
+    """Yield the states of a column with their rows, around the middle."""
+    for place, state in enumerate(layer):
+        yield state, place - (len(layer) - 1) / 2.0
+
+
+def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
+    """Return the mean row of the states that lead to one, or its own."""
+    rows_before = [
+        row[source] for source, targets in successors.items() if source != state and state in targets
+    ]
+    return sum(rows_before) / len(rows_before) if rows_before else row[state]
