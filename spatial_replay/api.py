@@ -14,7 +14,6 @@ from spatial_replay.compare.clips import Clip, cut_clip
 from spatial_replay.compare.runs import LogDiff, diff_sources
 from spatial_replay.compare.specifications import SpecificationDiff, diff_over_source
 from spatial_replay.errors import UsageError
-from spatial_replay.learning.learned import DEFAULT_LINES, Learned, learn_runs
 from spatial_replay.logs.messages import MAPPED, MemorySource, Source
 from spatial_replay.logs.read_options import Reading
 from spatial_replay.logs.remote import LogFile, local_copy, local_files, log_file, sendable
@@ -31,6 +30,7 @@ from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.relations import DEFAULT_PROFILE
 from spatial_replay.text import refuse_unknown
 from spatial_replay.trace.trace import FOREVER, Trace
+from spatial_replay.tuning.learned import DEFAULT_LINES, Learned, learn_runs
 from spatial_replay.tuning.margins import load_runs
 from spatial_replay.tuning.tuned import Tuning, tune_runs
 

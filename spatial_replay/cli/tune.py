@@ -257,9 +257,9 @@ def learn(
       spatial-replay learn good/*.mcap --bad bad/*.mcap -o learned.spatial
     """
     # imported here so that --help stays fast
-    from spatial_replay.learning.learned import DEFAULT_LINES, learn_runs
     from spatial_replay.logs.output_file import refuse_inputs, replacing
     from spatial_replay.sources.open_log import read_trace
+    from spatial_replay.tuning.learned import DEFAULT_LINES, learn_runs
     from spatial_replay.tuning.margins import load_runs
 
     inputs = input_files(*good, *bad, reading=reading)

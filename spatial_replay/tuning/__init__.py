@@ -1,1 +1,1 @@
-"""Tuning: the constants with which good runs satisfy a specification and bad ones do not."""
+"""Tuning and learning: constants, or a whole specification, with which good runs and bad ones differ."""

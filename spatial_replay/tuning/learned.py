@@ -12,17 +12,6 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Printed
-from spatial_replay.learning.fit import (
-    ALWAYS,
-    EVENTUALLY,
-    FINALLY,
-    PATTERNS,
-    FittedLimits,
-    LimitedRelation,
-    Line,
-    Pattern,
-)
-from spatial_replay.learning.quantities import Observed, Party, Quantity, robustness_of, scope_of
 from spatial_replay.monitor.ends import Needs, trim_trace
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec import parse_specification
@@ -32,7 +21,18 @@ from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.text import counted, json_value, number_text, printable
 from spatial_replay.trace.trace import Trace
+from spatial_replay.tuning.fit import (
+    ALWAYS,
+    EVENTUALLY,
+    FINALLY,
+    PATTERNS,
+    FittedLimits,
+    LimitedRelation,
+    Line,
+    Pattern,
+)
 from spatial_replay.tuning.margins import LabelledRun
+from spatial_replay.tuning.quantities import Observed, Party, Quantity, robustness_of, scope_of
 from spatial_replay.tuning.tuned import require_comparable
 
 # -------------------------------------------------------------------------------------------------- selection

@@ -14,11 +14,11 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.learning.quantities import WITH_LIMIT, Observed, Party, Quantity, members_of, variables_of
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import quoted, written_name
 from spatial_replay.text import number_text
+from spatial_replay.tuning.quantities import WITH_LIMIT, Observed, Party, Quantity, members_of, variables_of
 
 # ------------------------------------------------------------------------------------------ relations as text
 

@@ -16,8 +16,8 @@ from examples import examples
 from replay.runs import write_tracks
 from spatial_replay import UsageError
 from spatial_replay.cli import run
-from spatial_replay.learning.learned import Learned
 from spatial_replay.spec import format_formula
+from spatial_replay.tuning.learned import Learned
 
 STEP_NS = 200_000_000
 CLEAR = (0.52, 0.54, 0.57, 0.6, 0.56)

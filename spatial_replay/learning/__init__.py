@@ -1,1 +1,0 @@
-"""Learning: a specification from relations that hold in good runs and not in bad ones."""
