@@ -15,7 +15,7 @@ from urllib.parse import quote
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.notebook.figures import Html, element
+from spatial_replay.html import Html, element
 from spatial_replay.report.panels import unpack_array
 from spatial_replay.text import number_text, with_unit
 

@@ -28,7 +28,7 @@ from spatial_replay.batch.run_table import (
     verdict_word,
     worst_rows,
 )
-from spatial_replay.notebook.figures import Html, element
+from spatial_replay.html import Html, element
 from spatial_replay.report.page import asset, html_page, text
 from spatial_replay.report.panels import sentence_parts
 from spatial_replay.text import counted, first_lines, with_unit

@@ -16,8 +16,8 @@ from spatial_replay.batch.run import BatchResult, Wanted
 from spatial_replay.batch.run_table import worst_rows
 from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
+from spatial_replay.html import element
 from spatial_replay.logs.output_file import output_error, replacing
-from spatial_replay.notebook.figures import element
 from spatial_replay.report.page import HEADER, text
 from spatial_replay.report.write import write_report
 

@@ -23,25 +23,12 @@ from spatial_replay.automata.automaton import (
 from spatial_replay.automata.drawing import layout_text, svg_text
 from spatial_replay.errors import OutputError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.html import Html, code, details, element, quiet, table, verdict_mark
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.monitor.result import RESULT_COLUMNS, RESULT_TIMES, Evaluation, SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.notebook import html, plot
-from spatial_replay.notebook.figures import (
-    INK,
-    Html,
-    code,
-    details,
-    draw_curve,
-    draw_disc,
-    element,
-    new_panel,
-    new_panels,
-    plain,
-    quiet,
-    table,
-    verdict_mark,
-)
+from spatial_replay.notebook.figures import INK, draw_curve, draw_disc, new_panel, new_panels, plain
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.spec.format import iter_branches, label_of, title_of
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operands_of

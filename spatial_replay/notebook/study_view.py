@@ -16,22 +16,11 @@ from spatial_replay.compare.specifications import SpecDiff, SpecificationDiff
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, moved_object
+from spatial_replay.html import Html, element, quiet, table, verdict_mark
 from spatial_replay.lazy import page_of
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.notebook import html, plot
-from spatial_replay.notebook.figures import (
-    INK,
-    Html,
-    element,
-    new_panel,
-    new_panels,
-    picture,
-    plain,
-    quiet,
-    signed_colours,
-    table,
-    verdict_mark,
-)
+from spatial_replay.notebook.figures import INK, new_panel, new_panels, picture, plain, signed_colours
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.planning.decision_log import decision_lines, decision_message
 from spatial_replay.planning.decisions import Candidate, Consideration, Step

@@ -14,10 +14,10 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Final
 
+from spatial_replay.html import Html, element
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.sentences import settled_time
 from spatial_replay.monitor.verdict import Verdict, counts_text
-from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import SIGNS
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
 from spatial_replay.report.panels import final_text, json_text, sentence_parts

@@ -18,6 +18,7 @@ from spatial_replay.annotate.specification import unit_of
 from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
 from spatial_replay.errors import UsageError
+from spatial_replay.html import Html, element
 from spatial_replay.logs import messages as log_topics
 from spatial_replay.logs.messages import Messages, Source
 from spatial_replay.logs.output_file import refuse_inputs, replacing
@@ -25,7 +26,6 @@ from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.notebook.figures import Html, element
 from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.data import ReportedResult, RunReport, page_data, worst_results

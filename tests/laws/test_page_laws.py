@@ -11,7 +11,7 @@ import spatial_replay as sr
 from examples import examples
 from laws.strategies_spec import specification_texts
 from pages import shown
-from spatial_replay.notebook.figures import element
+from spatial_replay.html import element
 from spatial_replay.spec.format import iter_branches, label_of
 from spatial_replay.text import printable
 
