@@ -94,7 +94,6 @@ class PlanArrays(NamedTuple):
     """Work of a plan for every sample; ragged lists come with the offsets of their rows.
 
     Attributes:
-        extent: (5,), how many samples, regions, places, signals and classes of places there are.
         region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
             parts of each, vertices of each part, radius of each part, x and y of all vertices,
             (bottom, top) of each.
@@ -110,7 +109,6 @@ class PlanArrays(NamedTuple):
         code, constants, outputs: what `run_instructions` takes.
     """
 
-    extent: Integers
     region_parts: Integers
     region_sizes: Integers
     region_radius: Floats
@@ -132,11 +130,21 @@ class PlanArrays(NamedTuple):
     outputs: Integers
 
 
+class PlanExtent(NamedTuple):
+    """How many samples, regions, places, signals, and classes of places a plan has."""
+
+    samples: int
+    regions: int
+    places: int
+    signals: int
+    coded: int
+
+
 class PackedPlan(NamedTuple):
     """A plan's arrays one after the other, so that a kernel gets two.
 
     Attributes:
-        whole: where each array begins and ends, and then those of whole numbers.
+        whole: the fields of `PlanPlaces`, and then the arrays of whole numbers.
         real: the others.
         room: for how many numbers `measure_sample` takes room, besides three for each of the objects'.
     """
@@ -151,26 +159,37 @@ class PackedPlan(NamedTuple):
         return self.whole.nbytes + self.real.nbytes
 
     @classmethod
-    def of(cls, arrays: PlanArrays) -> PackedPlan:
-        whole, real = [np.zeros(2 * len(arrays), np.int64)], [np.zeros(0)]
-        for number, array in enumerate(arrays):
-            among: list[Any] = whole if array.dtype == np.int64 else real
-            begin = sum(map(len, among))
-            whole[0][2 * number : 2 * number + 2] = begin, begin + array.size
-            among.append(array.ravel())
-        measured, closest = len(arrays.geometric) + len(arrays.yaws), len(arrays.closest_enlargement)
-        operands = len(arrays.enlargement)
-        room = 3 * measured + 4 * closest + len(arrays.is_group)
+    def of(cls, extent: PlanExtent, arrays: PlanArrays) -> PackedPlan:
+        places = extent._asdict() | {
+            "parts": len(arrays.region_radius),
+            "corners": len(arrays.region_vertices) // 2,
+            "operands": len(arrays.enlargement),
+            "geometric_count": len(arrays.geometric),
+            "yaw_count": len(arrays.yaws),
+            "pairs": len(arrays.closest_enlargement),
+            "groups": len(arrays.is_group),
+        }
+        head = np.zeros(len(PlanPlaces._fields), np.int64)
+        whole, real = [head], [np.zeros(0)]
+        for name, array in arrays._asdict().items():
+            column = whole if array.dtype == np.int64 else real
+            places[name] = sum(map(len, column))
+            places[f"{name}_end"] = places[name] + array.size
+            column.append(array.ravel())
+        head[:] = [places[name] for name in PlanPlaces._fields]
+        operands = places["operands"]
+        room = 3 * (places["geometric_count"] + places["yaw_count"]) + 4 * places["pairs"] + places["groups"]
         room += 3 * operands + 2 + int(arrays.listed_start[operands])
-        room += 6 * int(arrays.extent[:3].sum()) + 2
-        room += 2 * len(arrays.region_radius) + 3 * len(arrays.region_vertices)
+        room += 6 * (extent.samples + extent.regions + extent.places) + 2
+        room += 2 * places["parts"] + 6 * places["corners"]
         return cls(np.concatenate(whole), np.concatenate(real), room)
 
 
 class PlanPlaces(NamedTuple):
     """Where the arrays of a plan begin in `PackedPlan.whole` and `PackedPlan.real`, and counts of them.
 
-    Kernels count references to arrays, also to those in tuples; numbers cost nothing.
+    A field named after an array of `PlanArrays` is its begin; one that ends in `_end` is its end. Kernels
+    count references to arrays, also to those in tuples; numbers cost nothing.
 
     Attributes:
         samples, regions, places, signals, coded: the extent.
@@ -214,44 +233,17 @@ class PlanPlaces(NamedTuple):
 
 
 @inlined
-def _plan_at(whole: Integers) -> PlanPlaces:
-    extent = whole[0]
+def plan_at(whole: Integers) -> PlanPlaces:
+    """Return the numbers that `PackedPlan.of` writes first: one for each field, in their order.
+
+    A compiler needs as many indices as a tuple has fields; no other line knows a place by its number.
+    """
     return PlanPlaces(
-        samples=whole[extent],
-        regions=whole[extent + 1],
-        places=whole[extent + 2],
-        signals=whole[extent + 3],
-        coded=whole[extent + 4],
-        parts=whole[7] - whole[6],
-        corners=(whole[9] - whole[8]) // 2,
-        operands=whole[19] - whole[18],
-        geometric_count=whole[21] - whole[20],
-        yaw_count=(whole[29] - whole[28]) // 3,
-        pairs=whole[31] - whole[30],
-        groups=whole[33] - whole[32],
-        region_parts=whole[2],
-        region_sizes=whole[4],
-        region_radius=whole[6],
-        region_vertices=whole[8],
-        region_heights=whole[10],
-        listed_start=whole[12],
-        listed_rows=whole[14],
-        listed_classes=whole[16],
-        enlargement=whole[18],
-        geometric=whole[20],
-        quantity=whole[22],
-        first=whole[24],
-        second=whole[26],
-        yaws=whole[28],
-        closest_enlargement=whole[30],
-        is_group=whole[32],
-        code=whole[34],
-        code_end=whole[35],
-        constants=whole[36],
-        constants_end=whole[37],
-        outputs=whole[38],
-        outputs_end=whole[39],
-    )
+        whole[0], whole[1], whole[2], whole[3], whole[4], whole[5], whole[6], whole[7], whole[8], whole[9],
+        whole[10], whole[11], whole[12], whole[13], whole[14], whole[15], whole[16], whole[17], whole[18],
+        whole[19], whole[20], whole[21], whole[22], whole[23], whole[24], whole[25], whole[26], whole[27],
+        whole[28], whole[29], whole[30], whole[31], whole[32], whole[33],
+    )  # fmt: skip
 
 
 class RowPlaces(NamedTuple):
@@ -529,7 +521,7 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
     Returns:
         C, in how many channels they are.
     """
-    plan, lists = _plan_at(whole), sample.view(np.int64)
+    plan, lists = plan_at(whole), sample.view(np.int64)
     count = plan.geometric_count + plan.yaw_count
     # room for the results, then for operands, then for rows: new arrays would take as long as distances
     closest, members = end + 2 * count, end + 2 * count + 4 * plan.pairs
@@ -729,7 +721,15 @@ class LeafPlan:
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
         arrays = _arrays(frame, rows, code, outputs)
-        self.packed = PackedPlan.of(arrays)
+        place_count = len(rows.places)
+        extent = PlanExtent(
+            samples=len(frame.delays),
+            regions=len(frame.regions),
+            places=place_count,
+            signals=len(code.signals),
+            coded=place_count if frame.classes else 0,
+        )
+        self.packed = PackedPlan.of(extent, arrays)
         self.placeholders = placeholders
         terms = [place.rate for place in rows.places]
         terms += [signal.terms for signal in code.signals if isinstance(signal, ReportStep)]
@@ -860,15 +860,6 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         [each.footprint for each in frame.regions.values()], [each.height for each in frame.regions.values()]
     )
     return PlanArrays(
-        extent=_whole(
-            [
-                len(frame.delays),
-                len(frame.regions),
-                len(rows.places),
-                len(code.signals),
-                len(rows.places) if frame.classes else 0,
-            ]
-        ),
         region_parts=np.diff(regions.part_start),
         region_sizes=np.diff(regions.vertex_start),
         region_radius=regions.radius.copy(),
