@@ -150,7 +150,7 @@ class LogNumbers:
         self._ranges = {
             _key(node, bound): ThresholdRange(node, bound)
             for node, bound in bound_nodes(specification)
-            if isinstance(node, Atom) and _compared(node) is not None
+            if isinstance(node, Atom) and _compared_quantity(node) is not None
         }
 
     def add(self, trace: Trace) -> None:
@@ -183,16 +183,19 @@ class LogNumbers:
         around = trace if past is None else Trace.concatenate([past, trace])
         self._past = around
         scene = TraceScene(around, self._regions, len(around) - len(trace))
-        for key, seen in self._ranges.items():
-            number = replace(seen.atom, expression=_compared(seen.atom) or seen.atom.expression)
+        for key, threshold_range in self._ranges.items():
+            number = replace(
+                threshold_range.atom,
+                expression=_compared_quantity(threshold_range.atom) or threshold_range.atom.expression,
+            )
             # one by one, so that each has as many bindings as in a replay
             least, greatest, all_hold, any_holds = (
-                leaf_values(scene, [over_bindings(quantifier, seen.bound, atom)], {})[:, 0]
-                for atom in (number, seen.atom)
+                leaf_values(scene, [over_bindings(quantifier, threshold_range.bound, atom)], {})[:, 0]
+                for atom in (number, threshold_range.atom)
                 for quantifier in ("forall", "exists")
             )
             # low and high ends differ where something is unknown; without any object they are infinite
-            is_text = isinstance(seen.atom.parameters[-1], str)
+            is_text = isinstance(threshold_range.atom.parameters[-1], str)
             is_sure = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
             for ends in (all_hold, any_holds) if is_text else (least, greatest):
                 is_sure &= ends[0] == ends[min(1, len(ends) - 1)]
@@ -201,13 +204,13 @@ class LogNumbers:
             is_sure &= ~is_empty
             numbers = is_sure & (not is_text)
             self._ranges[key] = replace(
-                seen,
-                least=min(seen.least, float(least[0, numbers].min(initial=inf))),
-                greatest=max(seen.greatest, float(greatest[0, numbers].max(initial=-inf))),
-                known=seen.known + int(is_sure.sum()),
-                holding=seen.holding + int((all_hold[0, is_sure] >= 0.0).sum()),
-                failing=seen.failing + int((any_holds[0, is_sure] < 0.0).sum()),
-                empty=seen.empty + int(is_empty.sum()),
+                threshold_range,
+                least=min(threshold_range.least, float(least[0, numbers].min(initial=inf))),
+                greatest=max(threshold_range.greatest, float(greatest[0, numbers].max(initial=-inf))),
+                known=threshold_range.known + int(is_sure.sum()),
+                holding=threshold_range.holding + int((all_hold[0, is_sure] >= 0.0).sum()),
+                failing=threshold_range.failing + int((any_holds[0, is_sure] < 0.0).sum()),
+                empty=threshold_range.empty + int(is_empty.sum()),
             )
 
     @property
@@ -253,7 +256,7 @@ def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
     for spec in specification.results:
         reach_s, windows = _reach(spec.formula, log.rate)
         if len(windows) > 1 and any(bound.unit == "samples" for _, bound in windows):
-            lines[f"{_nested(windows)} reaches {reach_s:.3g} s ahead"] = None
+            lines[f"{_nesting_text(windows)} reaches {reach_s:.3g} s ahead"] = None
     return [f"at {log.rate:.4g} samples a second, {line}" for line in lines]
 
 
@@ -274,7 +277,7 @@ def _reach(formula: Formula, rate: float) -> tuple[float, _Windows]:
     return own_s + farthest[0], ((formula, bound), *farthest[1])
 
 
-def _nested(windows: _Windows) -> str:
+def _nesting_text(windows: _Windows) -> str:
     return " of ".join(f"{node.operator}{format_bound(bound)}" for node, bound in windows)
 
 
@@ -311,8 +314,11 @@ def plausibility_warnings(
         doubts: Iterator[tuple[str, str]] = iter(())
         key = ""
         if isinstance(node, Atom):
-            measured = log.range_of(node, bound)
-            key, doubts = measured.text if measured else node.text, _doubts(node, log, measured)
+            threshold_range = log.range_of(node, bound)
+            key, doubts = (
+                threshold_range.text if threshold_range else node.text,
+                _doubts(node, log, threshold_range),
+            )
         elif isinstance(node, Temporal) and node.bound is not None:
             key = f"{node.operator}{format_bound(node.bound)}"
             doubts = _doubts_of_window(key, node.bound, log)
@@ -327,7 +333,7 @@ def plausibility_warnings(
             warnings.setdefault(empty_class, source.diagnostic("warning", node.span, message, hint))
     for spec in specification.results:
         reach_s, windows = _reach(spec.formula, log.rate or inf)
-        name = _nested(windows)
+        name = _nesting_text(windows)
         if len(windows) > 1 and reach_s > log.seconds and name not in warnings:
             message = f"the windows {name} together are longer than this log"
             hint = (
@@ -335,7 +341,7 @@ def plausibility_warnings(
             )
             if not any(f"{node.operator}{format_bound(bound)}" in warnings for node, bound in windows):
                 warnings[name] = source.diagnostic("warning", windows[0][0].span, message, hint)
-    return tuple(sorted(warnings.values(), key=lambda each: (each.line, each.column)))
+    return tuple(sorted(warnings.values(), key=lambda warning: (warning.line, warning.column)))
 
 
 def _empty_class(group: Group | Earlier, log: LogNumbers) -> str | None:
@@ -346,7 +352,7 @@ def _empty_class(group: Group | Earlier, log: LogNumbers) -> str | None:
     return name
 
 
-def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterator[tuple[str, str]]:
+def _doubts(atom: Atom, log: LogNumbers, threshold_range: ThresholdRange | None) -> Iterator[tuple[str, str]]:
     limits = [parameter for parameter in atom.parameters if isinstance(parameter, float)]
     lengths = limits if atom.relation in _LENGTH_RELATIONS else []
     for length in lengths:
@@ -356,27 +362,34 @@ def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterat
             message = f"{format_number(length)} is far more than anything in the log is apart"
             yield message, f"all that it has lies within {log.extent:.4g}; is the unit the same?"
     is_there = all(log.missing.get(part, (0, 0))[0] < log.samples for part in named_parts(atom))
-    if taken is not None and not taken.known and atom.relation == "signal" and is_there:
+    if threshold_range is not None and not threshold_range.known and atom.relation == "signal" and is_there:
         hint = "put a text in quotes; `names` of a mapping give texts numbers, and numbers texts"
-        yield f"`{taken.text}` compares a text with a number, so it is unknown", hint
-    if taken is None or taken.holds not in ("always", "never"):
+        yield f"`{threshold_range.text}` compares a text with a number, so it is unknown", hint
+    if threshold_range is None or threshold_range.holds not in ("always", "never"):
         return
-    if not limits and atom.relation == "signal" and (taken.holds == "never") == ("==" in atom.parameters):
+    if (
+        not limits
+        and atom.relation == "signal"
+        and (threshold_range.holds == "never") == ("==" in atom.parameters)
+    ):
         name, _, text = atom.parameters
         hint = "is it spelt so? with `names` in a mapping, a misspelt text is an error"
         yield f"{name} is never {text} in this log", hint
     for limit in limits:
-        if _is_far(limit, taken, is_length=bool(lengths)):
-            below = limit < taken.least
-            end, side = (taken.least, "below") if below else (taken.greatest, "above")
+        if _is_far(limit, threshold_range, is_length=bool(lengths)):
+            below = limit < threshold_range.least
+            end, side = (threshold_range.least, "below") if below else (threshold_range.greatest, "above")
             what = "the distance is" if lengths else "its signal is" if atom.relation == "signal" else "it is"
-            message = f"`{taken.text}` {taken.holds} holds in this log: {what} never {side} {end:.4g}"
+            message = (
+                f"`{threshold_range.text}` {threshold_range.holds} holds in this log:"
+                f" {what} never {side} {end:.4g}"
+            )
             yield message, f"no value comes near {format_number(limit)}; is it the threshold you mean?"
 
 
-def _is_far(limit: float, taken: ThresholdRange, *, is_length: bool) -> bool:
+def _is_far(limit: float, threshold_range: ThresholdRange, *, is_length: bool) -> bool:
     """Return whether no number that was taken comes near a threshold."""
-    least, greatest = taken.least, taken.greatest
+    least, greatest = threshold_range.least, threshold_range.greatest
     if least <= limit <= greatest:
         return False
     if is_length and limit < 0.0:
@@ -410,7 +423,7 @@ def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float
     return max(0.0, hypot(apart_x, apart_y) - outline.radius)
 
 
-def _compared(atom: Atom) -> Expression | None:
+def _compared_quantity(atom: Atom) -> Expression | None:
     """Return the signal or distance that an atom compares with numbers; None if it is computed or not one."""
     if atom.relation == "sum":
         return None
@@ -455,7 +468,9 @@ def _binding(atom: Atom, around: tuple[Quantified, ...], parameter: str | None) 
             bound.insert(0, quantifier)
             variables = variables.difference(quantifier.variables) | _variables([quantifier.group])
     if parameter is not None and parameter in variables:
-        named = tuple(t for t in map(base_of, terms_of(atom.expression)) if isinstance(t, TrackedName))
+        named = tuple(
+            term for term in map(base_of, terms_of(atom.expression)) if isinstance(term, TrackedName)
+        )
         everything = Group("", class_name=ANY_CLASS, excluded=named)
         bound.insert(0, Quantified("forall", (parameter,), everything, atom))
     return tuple(bound)

@@ -148,12 +148,12 @@ def find_vacuous(
         return ()
     nodes = nodes_of(instance.formula)
     implications = _implications_of(instance.formula)
-    windows, held = _Windows(times_ns), _Holding(instance, leaves, times_ns)
-    scopes = _scopes(instance.formula, windows, held)
-    active = _scopes(implications.formula, windows, held, is_conditional=True)
+    windows, holding = _Windows(times_ns), _Holding(instance, leaves, times_ns)
+    scopes = _scopes(instance.formula, windows, holding)
+    active = _scopes(implications.formula, windows, holding, is_conditional=True)
     idle_parts = [
         *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), windows, evidence),
-        *_idle_implications(implications, active, held, evidence),
+        *_idle_implications(implications, active, holding, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
@@ -169,7 +169,8 @@ def find_vacuous(
         if is_idle and node not in {part.node for part in idle_parts}:
             idle_parts += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
     return tuple(
-        _part(each, nodes[each.node], evidence) for each in sorted(idle_parts, key=lambda each: each.node)
+        _part(idle_part, nodes[idle_part.node], evidence)
+        for idle_part in sorted(idle_parts, key=lambda idle_part: idle_part.node)
     )
 
 
@@ -222,10 +223,10 @@ class _Implications(NamedTuple):
 
     def by_node(self, scopes: Sequence[_Samples], count: int) -> list[_Samples]:
         """Return for each of `count` nodes as written the samples (T,) of the nodes that stand for it."""
-        joined = [np.zeros(len(scopes[0]), np.bool_) for _ in range(count)]
+        samples_by_node = [np.zeros(len(scopes[0]), np.bool_) for _ in range(count)]
         for node, scope in zip(self.nodes, scopes, strict=True):
-            joined[node] |= scope
-        return joined
+            samples_by_node[node] |= scope
+        return samples_by_node
 
 
 def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
@@ -259,11 +260,15 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
             for is_chosen_side in (True, False)
         ]
         if all(sides):
-            return _joined("->", (_joined("and", sides[0], node), _joined("or", sides[1], node)), node)
+            return _join_implications(
+                "->",
+                (_join_implications("and", sides[0], node), _join_implications("or", sides[1], node)),
+                node,
+            )
         if sides[0]:
-            both = _joined("and", sides[0], node)
+            both = _join_implications("and", sides[0], node)
             response = _Implications(Boolean("not", (both.formula,)), (node, *both.nodes))
-            return _joined("->", (_joined("or", sides[0], node), response), node)
+            return _join_implications("->", (_join_implications("or", sides[0], node), response), node)
     if not isinstance(formula, Boolean | Temporal):
         return _Implications(formula, (node,))
     signs = [_sign_below(operator, place, sign) for place in range(len(operands))]
@@ -304,7 +309,9 @@ def _sign_below(operator: str, place: int, sign: int) -> int:
     return 0 if operator in _EVERYWHERE and is_goal is (sign > 0) else sign
 
 
-def _joined(operator: Literal["and", "or", "->"], parts: Sequence[_Implications], node: int) -> _Implications:
+def _join_implications(
+    operator: Literal["and", "or", "->"], parts: Sequence[_Implications], node: int
+) -> _Implications:
     if len(parts) == 1:
         return parts[0]
     formula = Boolean(operator, tuple(part.formula for part in parts))
@@ -344,7 +351,7 @@ class _Windows:
 
 
 def _scopes(
-    formula: Formula, windows: _Windows, held: _Holding, *, is_conditional: bool = False
+    formula: Formula, windows: _Windows, holding: _Holding, *, is_conditional: bool = False
 ) -> list[_Samples]:
     """Return for each node the samples (T,) at which the number of the formula depends on it.
 
@@ -362,9 +369,9 @@ def _scopes(
                 within = _below(node, place, scope, windows)
                 read = judged(node).operands[place]
                 if operator_of(read) in ("given", "with"):
-                    within = within & held(operands_of(read)[0])
+                    within = within & holding(operands_of(read)[0])
             elif is_conditional and place and operator_of(node) == "->" and scope.any():
-                within = scope & held(operands_of(node)[0])
+                within = scope & holding(operands_of(node)[0])
             scopes[operand] = within
     return scopes
 
@@ -426,17 +433,21 @@ def _empty_windows(
 
 
 def _idle_implications(
-    implications: _Implications, active: Sequence[_Samples], held: _Holding, evidence: Evidence
+    implications: _Implications, active: Sequence[_Samples], holding: _Holding, evidence: Evidence
 ) -> Iterator[_Idle]:
     nodes = nodes_of(implications.formula)
     for identifier, node, scope in zip(implications.nodes, nodes, active, strict=True):
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
-            is_held = held(node.operands[0])
+            is_held = holding(node.operands[0])
             if not is_held[scope].any():
-                yield _untested(identifier, node, evidence, " where it counts" if is_held.any() else "")
+                yield _untested_implication(
+                    identifier, node, evidence, " where it counts" if is_held.any() else ""
+                )
 
 
-def _untested(identifier: int, implication: Boolean, evidence: Evidence, where: str = "") -> _Idle:
+def _untested_implication(
+    identifier: int, implication: Boolean, evidence: Evidence, where: str = ""
+) -> _Idle:
     antecedent = format_formula(evidence.bound(implication.operands[0]))
     what = f"was never tested: `{antecedent}` never held{where}."
     return _Idle(identifier, "antecedent never held", (what,))
@@ -450,11 +461,13 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
         inner = list(_implications(node))
         if not inner:
             continue
-        columns = evidence.columns([evidence.bound(held) for _, held, _ in inner])
+        columns = evidence.columns([evidence.bound(ever_holds) for _, ever_holds, _ in inner])
         high = columns[low_and_high(len(columns), wide=True)[1]]
         for (implication, _, is_nested), ends in zip(inner, high, strict=True):
             if not (ends[scope] >= 0.0).any():
-                yield _untested(identifier, implication, evidence, " where it counts" if is_nested else "")
+                yield _untested_implication(
+                    identifier, implication, evidence, " where it counts" if is_nested else ""
+                )
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
@@ -466,8 +479,8 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
     while stack:
         current, conditions = stack.pop()
         if isinstance(current, Quantified):
-            for implication, held, is_nested in _implications(current):
-                body = _all((*conditions, held))
+            for implication, ever_holds, is_nested in _implications(current):
+                body = _all((*conditions, ever_holds))
                 yield (
                     implication,
                     replace(node, quantifier="exists", body=body),
@@ -519,19 +532,19 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
             yield replace(term, term=whole) if isinstance(term, Earlier) else whole
 
 
-def _leaves_all_out(done: OfflineNodes, path: DecidingPath, evidence: Evidence) -> bool:
+def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence) -> bool:
     """Return whether the last operator of a path leaves out all samples of its window, or all members."""
     node, sample = path.steps[-1]
-    formula, operands = done.tree[node]
+    formula, operands = nodes.tree[node]
     if isinstance(formula, Quantified):
-        scene = evidence.scene(int(done.times_ns[sample]))
+        scene = evidence.scene(int(nodes.times_ns[sample]))
         return leaves_out(formula) and deciding_atom(scene, evidence.bound(formula), path.end) is None
     if not isinstance(formula, Temporal):
         return False
-    begin, end = windows_of(formula, done.times_ns)
+    begin, end = windows_of(formula, nodes.times_ns)
     window = range(int(begin[sample]), int(end[sample]))
     return len(window) > 0 and any(
-        all(done.is_left_out(operand, place) for place in window) for operand in operands
+        all(nodes.is_left_out(operand, place) for place in window) for operand in operands
     )
 
 
@@ -599,25 +612,30 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     known_leaves = leaves if verdict is Verdict.SATISFIED else unknown
     stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
 
-    def tested(formula: Formula, *, in_antecedent: bool = False) -> Formula:
+    def with_stand_ins(formula: Formula, *, in_antecedent: bool = False) -> Formula:
         match formula:
             case Boolean(operator="->", operands=(antecedent, consequent)):
-                known_one = tested(antecedent, in_antecedent=True)
-                return replace(formula, operands=(known_one, tested(consequent, in_antecedent=in_antecedent)))
+                new_antecedent = with_stand_ins(antecedent, in_antecedent=True)
+                return replace(
+                    formula,
+                    operands=(new_antecedent, with_stand_ins(consequent, in_antecedent=in_antecedent)),
+                )
             case Boolean(operator="given" | "with", operands=(condition, body)):
-                return replace(formula, operands=(condition, tested(body, in_antecedent=in_antecedent)))
+                return replace(
+                    formula, operands=(condition, with_stand_ins(body, in_antecedent=in_antecedent))
+                )
             case Boolean() | Temporal():
                 read = judged(formula).operands if isinstance(formula, Temporal) else formula.operands
-                operands = [tested(operand, in_antecedent=in_antecedent) for operand in read]
+                operands = [with_stand_ins(operand, in_antecedent=in_antecedent) for operand in read]
                 return replace(formula, operands=tuple(operands))
             case Atom() | Quantified() if in_antecedent:
                 return stand_ins[leaf_key(formula)]
         return formula
 
     both = joined_channels([unknown, known_leaves], axis=1)
-    formula = tested(_implications_of(instance.formula).formula)
-    done = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
-    return final_verdict(*done.interval(0)) is verdict
+    formula = with_stand_ins(_implications_of(instance.formula).formula)
+    nodes = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
+    return final_verdict(*nodes.interval(0)) is verdict
 
 
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
@@ -650,7 +668,7 @@ def _without_tests(formula: Formula) -> Formula:
         case Boolean(operator="->" | "given" | "with", operands=(antecedent, consequent)):
             return replace(formula, operands=(antecedent, _without_tests(consequent)))
         case Boolean():
-            return replace(formula, operands=tuple(_without_tests(each) for each in formula.operands))
+            return replace(formula, operands=tuple(_without_tests(operand) for operand in formula.operands))
         case _:
             return formula
 
@@ -679,7 +697,7 @@ def find_cut_window(
     cut_verdict, whole_verdict = (final_verdict(*nodes.interval(0)) for nodes in (cut_nodes, whole))
     if cut_verdict is not verdict or whole_verdict is verdict:
         return None
-    ranks = _ranked(cut_nodes, whole, is_violated=verdict is Verdict.VIOLATED)
+    ranks = _rank_by_verdict(cut_nodes, whole, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
     # 1 and -1 are where a cut window decides
@@ -703,13 +721,15 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
         is_time = bound.unit == "ns"
         # places in time or in samples: of the window's begin and end, and of the log's end
         place, last = (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
-        left = place + bound.upper - last
-        whole = bound.upper - bound.lower + (not is_time)
-        seen = max(whole - left, 0)
-        left_text, whole_text = (time_text(n) if is_time else counted(n, "sample") for n in (left, whole))
-        seen_text = time_text(seen) if is_time else f"{seen:,}"
+        missing_length = place + bound.upper - last
+        length = bound.upper - bound.lower + (not is_time)
+        seen_length = max(length - missing_length, 0)
+        left_text, whole_text = (
+            time_text(n) if is_time else counted(n, "sample") for n in (missing_length, length)
+        )
+        seen_text = time_text(seen_length) if is_time else f"{seen_length:,}"
         beyond = f"its window ends {left_text} after the log"
-        beyond += f" ({seen_text} of {whole_text} seen)" if whole else ""
+        beyond += f" ({seen_text} of {whole_text} seen)" if length else ""
     return _Idle(
         identifier,
         "cut window",
@@ -718,12 +738,12 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
     )
 
 
-def _ranked(done: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> OfflineNodes:
+def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> OfflineNodes:
     """Return nodes by verdict instead of by number: decided by whole windows, by cut ones, or not decided.
 
     Ranks go through minima, maxima and negations as numbers do, so that a path by them leads to a cut window.
     """
     holds = np.greater if is_violated else np.greater_equal
-    both = [nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (done, whole)]
+    both = [nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (cut_nodes, whole)]
     low = sum(holds(low, 0.0) * 1.0 for low, _ in both)
-    return replace(done, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in both)]))
+    return replace(cut_nodes, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in both)]))
