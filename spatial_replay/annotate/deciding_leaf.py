@@ -16,7 +16,7 @@ import numpy as np
 from spatial_replay.annotate.requirements import Requirement
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene, look_back
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_unfinished
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_prefix
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.sentences import conjuncts_of, divisor_of, find_causes
 from spatial_replay.monitor.stream import NEVER, Instance, SeriesBlock, join_blocks
@@ -288,7 +288,7 @@ class LeafHistory:
         if verdict is Verdict.VIOLATED:
             conjuncts = conjuncts_of(self._nodes[node], "", node)
             node = next(conjunct.node for conjunct in conjuncts if series[conjunct.node, 3] < 0.0)
-        evaluation = evaluate_unfinished(self._formula, self._order, samples.leaves, samples.times_ns)
+        evaluation = evaluate_prefix(self._formula, self._order, samples.leaves, samples.times_ns)
         return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
 
     def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:

@@ -18,7 +18,7 @@ from spatial_replay.logs.messages import ZERO, Source
 from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene, look_back
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_unfinished
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_prefix
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import InstanceStream
@@ -211,7 +211,7 @@ class _Part:
             settled = _path(evaluation, part)
         else:
             count = int(np.searchsorted(times_ns, settled_ns, side="right"))
-            first = evaluate_unfinished(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
+            first = evaluate_prefix(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
             settled = _path(first, part)
         numbers = (*_deciding_numbers(evaluation, self._node), *_deciding_numbers(evaluation, part))
         verdict = final_verdict(*evaluation.interval(self._node))

@@ -14,7 +14,7 @@ from spatial_replay.geometry.measure import Point
 from spatial_replay.monitor.offline import (
     OfflineNodes,
     evaluate_offline,
-    evaluate_unfinished,
+    evaluate_prefix,
     windows_of,
 )
 from spatial_replay.monitor.sentences import Conjunct, measurement_clause
@@ -112,7 +112,7 @@ def find_violated_invariants(
     invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
     if not invariants:
         return
-    evaluate = evaluate_unfinished if goes_on else evaluate_offline
+    evaluate = evaluate_prefix if goes_on else evaluate_offline
     nodes = evaluate(evidence.instance.formula, evidence.instance.program.leaves, leaves, times_ns)
     for invariant in invariants:
         violated = _intervals_of(evidence, nodes, invariant, most)

@@ -319,7 +319,7 @@ class OfflineFormula:
             stand_ins: what is computed in place of each of `computed_formulas`, if that is something else.
         """
         table, tree = OfflineTable(order), nodes_with_operands(formula)
-        rows = [table.add(each) for each in stand_ins or computed_formulas(formula)]
+        rows = [table.add(computed_formula) for computed_formula in stand_ins or computed_formulas(formula)]
         instructions = table.instructions(rows)
         conditions = dict(zip(_judged_operands(tree), range(len(tree), len(rows)), strict=True))
         return cls(
@@ -339,7 +339,10 @@ class OfflineFormula:
 def computed_formulas(formula: Formula) -> list[Formula]:
     """Return the nodes of a formula, by id, and the conditions of operands that leave samples out."""
     tree = nodes_with_operands(formula)
-    return [*(node for node, _ in tree), *(each.operands[0] for each in _judged_operands(tree).values())]
+    return [
+        *(node for node, _ in tree),
+        *(operand.operands[0] for operand in _judged_operands(tree).values()),
+    ]
 
 
 def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boolean]:
@@ -366,7 +369,7 @@ def evaluate_offline(
     return OfflineFormula.of(formula, order).evaluate(leaves, times_ns)
 
 
-def evaluate_unfinished(
+def evaluate_prefix(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
     """Evaluate every node over samples that others may follow; arguments as of `evaluate_offline`.
@@ -374,7 +377,7 @@ def evaluate_unfinished(
     Values after the last sample are unknown, [-inf, +inf], so the numbers at the first sample are those of a
     monitor. The path through them leads to the atom that settled a verdict before the log ended.
     """
-    return replace(_evaluated(formula, order, leaves, times_ns, _is_open), goes_on=True)
+    return replace(_evaluate_beyond(formula, order, leaves, times_ns, _is_open), goes_on=True)
 
 
 def evaluate_with_whole_windows(
@@ -384,21 +387,21 @@ def evaluate_with_whole_windows(
 
     Values there are unknown, and only there (see `is_cut`). Arguments as of `evaluate_offline`.
     """
-    return _evaluated(formula, order, leaves, times_ns, is_cut)
+    return _evaluate_beyond(formula, order, leaves, times_ns, is_cut)
 
 
-def _evaluated(
+def _evaluate_beyond(
     formula: Formula,
     order: Sequence[Atom | Quantified],
     leaves: Floats,
     times_ns: Integers,
     beyond: Callable[[Temporal, Integers], Booleans],
 ) -> OfflineNodes:
-    opened = _OpenFormulas(times_ns, beyond)
-    stand_ins = [opened.of(each) for each in computed_formulas(formula)]
-    is_open = np.array(opened.columns, np.bool_).reshape(-1, len(times_ns))
+    open_formulas = _OpenFormulas(times_ns, beyond)
+    stand_ins = [open_formulas.of(node_formula) for node_formula in computed_formulas(formula)]
+    is_open = np.array(open_formulas.columns, np.bool_).reshape(-1, len(times_ns))
     columns = np.stack([np.full(is_open.shape, -np.inf), np.where(is_open, np.inf, -np.inf)])
-    compiled = OfflineFormula.of(formula, (*order, *opened.leaves), stand_ins)
+    compiled = OfflineFormula.of(formula, (*order, *open_formulas.leaves), stand_ins)
     return compiled.evaluate(joined_channels([leaves, columns], axis=1), times_ns)
 
 
@@ -416,39 +419,39 @@ class _OpenFormulas:
         self.columns: list[Booleans] = []
         self._times_ns, self._beyond = times_ns, beyond
         # the formulas stay alive, so that no other one takes the id of one
-        self._known: dict[int, tuple[Formula, Formula]] = {}
+        self._stand_ins: dict[int, tuple[Formula, Formula]] = {}
 
     def of(self, formula: Formula) -> Formula:
         """Return the formula to compute in place of one."""
-        if id(formula) not in self._known:
-            self._known[id(formula)] = formula, self._made(formula)
-        return self._known[id(formula)][1]
+        if id(formula) not in self._stand_ins:
+            self._stand_ins[id(formula)] = formula, self._stand_in_of(formula)
+        return self._stand_ins[id(formula)][1]
 
-    def _made(self, formula: Formula) -> Formula:
+    def _stand_in_of(self, formula: Formula) -> Formula:
         expanded = formula if operator_of(formula) == "WX" else expand(formula)
         if expanded is not formula:
             return self.of(expanded)
         if not isinstance(formula, Boolean | Temporal):
             return formula
-        made = replace(formula, operands=tuple([self.of(each) for each in formula.operands]))
-        if not isinstance(made, Temporal):
-            return made
-        is_open = self._beyond(made, self._times_ns)
+        node = replace(formula, operands=tuple([self.of(operand) for operand in formula.operands]))
+        if not isinstance(node, Temporal):
+            return node
+        is_open = self._beyond(node, self._times_ns)
         if not is_open.any():
-            return made
+            return node
         leaf = Atom("", "signal", Signal(f"\0{len(self.leaves)}"))
         self.leaves.append(leaf)
         self.columns.append(is_open)
-        match made.operator:
+        match node.operator:
             case "F":
-                return Boolean("or", (made, leaf))
+                return Boolean("or", (node, leaf))
             case "G":
-                return Boolean("and", (made, Boolean("not", (leaf,))))
+                return Boolean("and", (node, Boolean("not", (leaf,))))
             case "U":
                 # a later sample may fulfil it, as far as the left operand has lasted up to now
-                lasting = Temporal("G", made.operands[:1])
-                return Boolean("or", (made, Boolean("and", (leaf, lasting))))
-        return Boolean("and", (Boolean("or", (made, leaf)), Boolean("not", (leaf,))))
+                lasting = Temporal("G", node.operands[:1])
+                return Boolean("or", (node, Boolean("and", (leaf, lasting))))
+        return Boolean("and", (Boolean("or", (node, leaf)), Boolean("not", (leaf,))))
 
 
 def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
@@ -494,16 +497,16 @@ def windows_of(
     is_ahead = formula.operator in FUTURE_OPERATORS
     bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX", "Y") else formula.bound
     if bound is None:
-        own = indices if samples is None else samples
-        edge = np.full(len(own), count if is_ahead else 0, np.int64)
-        return (own, edge) if is_ahead else (edge, own + 1)
+        positions = indices if samples is None else samples
+        edge = np.full(len(positions), count if is_ahead else 0, np.int64)
+        return (positions, edge) if is_ahead else (edge, positions + 1)
     # as distances from the first sample, and no further than the last: sums stay below 64 bits
     places = indices if bound.unit == "samples" else times_ns - times_ns[0]
     furthest = int(places[-1]) + 1
     near = min(bound.lower, furthest)
     far = furthest if bound.upper is None else min(bound.upper, furthest)
-    own = places if samples is None else places[samples]
-    low, high = (own + near, own + far) if is_ahead else (own - far, own - near)
+    origins = places if samples is None else places[samples]
+    low, high = (origins + near, origins + far) if is_ahead else (origins - far, origins - near)
     if bound.unit == "samples":
         return np.clip(low, 0, count), np.clip(high + 1, 0, count)
     begin = np.searchsorted(places, low, side="left").astype(np.int64)
@@ -514,7 +517,7 @@ def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
     """Compute each node's robustness at each sample, to the end of the log, (N, T); NaN: not determined."""
-    return _determined(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
+    return _determined_numbers(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
 
 
 def window_signal(
@@ -536,7 +539,7 @@ def window_signal(
     columns = np.empty((len(leaves), compiled.width, len(times_ns)))
     result = np.empty((len(leaves), compiled.nodes, len(times_ns)))
     run_windows(compiled.table, leaves, writable(times_ns), starts, columns, np.empty(len(times_ns)), result)
-    return _determined(result)
+    return _determined_numbers(result)
 
 
 def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:
@@ -546,7 +549,7 @@ def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Ato
     return table.leaves[len(order) :]
 
 
-def _determined(ends: Floats) -> Floats:
+def _determined_numbers(ends: Floats) -> Floats:
     """Reduce the ends (C, N, T) to determined numbers (N, T), in place.
 
     Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.

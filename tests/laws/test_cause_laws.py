@@ -13,7 +13,7 @@ import spatial_replay as sr
 from examples import examples
 from laws.strategies_monitor import LEAVES, formulas_of_leaves, leaf_runs, recordings, specifications
 from spatial_replay import Specification
-from spatial_replay.monitor.offline import evaluate_unfinished
+from spatial_replay.monitor.offline import evaluate_prefix
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.result import SpecResult
@@ -79,7 +79,7 @@ def test_a_log_that_may_go_on_has_the_intervals_of_a_monitor(formula, run):
     leaves, times = run.values(program.leaves), np.array(run.times_ns)
     series = OnlineRun(program).extend(leaves, times)
     for count in range(1, len(times) + 1):
-        done = evaluate_unfinished(formula, program.leaves, leaves[:, :, :count], times[:count])
+        done = evaluate_prefix(formula, program.leaves, leaves[:, :, :count], times[:count])
         for node, _, _ in iter_nodes(formula):
             low, high = done.ends(node)
             assert (low[0], high[0]) == tuple(series[node, 2:, count - 1])
@@ -96,7 +96,7 @@ def test_what_settled_a_violation_has_the_number_of_that_moment(formula, run):
         if not len(settled):
             continue
         count = int(settled[0]) + 1
-        done = evaluate_unfinished(formula, program.leaves, leaves[:, :, :count], times[:count])
+        done = evaluate_prefix(formula, program.leaves, leaves[:, :, :count], times[:count])
         path = deciding_path(done, node, End.HIGH)
         low, high = done.ends(path.steps[-1].node)
         number = (high if path.end is End.HIGH else -low)[path.steps[-1].sample]

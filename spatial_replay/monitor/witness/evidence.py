@@ -106,10 +106,10 @@ class Evidence:
 
     def _columns(self, scene: TraceScene, formulas: Sequence[Formula]) -> Floats:
         bindings = self.instance.bindings
-        if not any(isinstance(each, Quantified) for each in formulas):
+        if not any(isinstance(formula, Quantified) for formula in formulas):
             return leaf_values(scene, formulas, bindings)
         # how many bindings there may be is limited for one formula, and these are variants of one
-        return joined_channels([leaf_values(scene, [each], bindings) for each in formulas], axis=1)
+        return joined_channels([leaf_values(scene, [formula], bindings) for formula in formulas], axis=1)
 
     def first_ns(self) -> int:
         """Return the zero, or else the time of the first sample, those looked back at included."""
@@ -120,7 +120,7 @@ class Evidence:
     def times_ns(self) -> Integers:
         """Return the times of the samples, (T,)."""
         scenes = self._scenes()
-        return np.concatenate([each.trace.times_ns[each.skip :][self._inside(each)] for each in scenes])
+        return np.concatenate([scene.trace.times_ns[scene.skip :][self._inside(scene)] for scene in scenes])
 
     def gaps(self, formula: Formula, time_ns: int = -1) -> tuple[Gap, ...]:
         """Return when each object and signal that a formula names is missing, for those that ever are.
@@ -139,11 +139,11 @@ class Evidence:
             absent.update(part for part in kinds if _is_absent(trace, part)[self._inside(scene)].any())
         times_ns = self.times_ns()
         filling, *columns = np.concatenate(parts, axis=1)
-        own = ~filling
+        is_recorded = ~filling
         gaps = [_gap(None, filling, times_ns, time_ns)] if filling.any() else []
         for part, missing in zip(kinds, columns, strict=True):
-            if missing[own].any():
-                gap = _gap(part.shown, missing[own], times_ns[own])
+            if missing[is_recorded].any():
+                gap = _gap(part.shown, missing[is_recorded], times_ns[is_recorded])
                 comes_and_goes = part in members and part in absent
                 gaps.append(replace(gap, window=None) if comes_and_goes else gap)
         return tuple(gaps)
@@ -153,8 +153,10 @@ class Evidence:
         parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes() if groups else ():
             inside = self._inside(scene)
-            found = [scene.members(group) for group in groups]
-            parts.append(np.stack([(members.any(axis=1) | before)[inside] for _, members, before in found]))
+            memberships = [scene.members(group) for group in groups]
+            parts.append(
+                np.stack([(members.any(axis=1) | unknown)[inside] for _, members, unknown in memberships])
+            )
         return np.concatenate(parts, axis=1) if parts else np.empty((0, 0), np.bool_)
 
     def _inside(self, scene: TraceScene) -> slice:
@@ -194,10 +196,10 @@ class NamedPart(NamedTuple):
 def named_parts(formula: Formula) -> list[NamedPart]:
     """Return the signals and objects that a formula names, each once."""
     atoms = list(iter_atoms(formula))
-    found = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
+    parts = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
     terms = [term for atom in atoms if atom.relation != "present" for term in atom.terms]
-    found += [NamedPart(name, False) for term in terms for name in _object_names(base_of(term))]
-    return list(dict.fromkeys(found))
+    parts += [NamedPart(name, False) for term in terms for name in _object_names(base_of(term))]
+    return list(dict.fromkeys(parts))
 
 
 def _object_names(base: Term) -> tuple[str, ...]:

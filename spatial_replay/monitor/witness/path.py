@@ -140,7 +140,7 @@ def _normal_form(formula: Formula, numbers: Mapping[int, int], *, negated: bool)
     return Extremum((operator == "and") != negated, operands)
 
 
-def chosen(
+def attaining_operands(
     part: SignedOperand | Extremum, end: End, interval: Callable[[int], Interval]
 ) -> list[SignedOperand]:
     """Return the operands that attain an extremum: one, or several equal ones in their order.
@@ -154,7 +154,7 @@ def chosen(
     keys = [choose(*_interval(operand, interval)) for operand in part.operands]
     best = min(keys) if part.is_minimum else max(keys)
     best_parts = [operand for operand, key in zip(part.operands, keys, strict=True) if key == best]
-    return [operand for best_part in best_parts for operand in chosen(best_part, end, interval)]
+    return [operand for best_part in best_parts for operand in attaining_operands(best_part, end, interval)]
 
 
 def _interval(part: SignedOperand | Extremum, interval: Callable[[int], Interval]) -> Interval:
@@ -190,36 +190,38 @@ class DecidingPath(NamedTuple):
     end: End
 
 
-def deciding_path(done: OfflineNodes, node: int, end: End, *, sample: int = 0) -> DecidingPath:
+def deciding_path(nodes: OfflineNodes, node: int, end: End, *, sample: int = 0) -> DecidingPath:
     """Return the path to what decides a node at a sample.
 
     Ties go to the operand that leads to the earliest sample, then to the first operand; in a window, to the
     earliest sample.
     """
-    return _Walk(done).follow(node, sample, end)
+    return _Walk(nodes).follow(node, sample, end)
 
 
 class _Walk:
     """The tree of a formula with every node's numbers."""
 
-    def __init__(self, done: OfflineNodes) -> None:
-        self._done = done
+    def __init__(self, nodes: OfflineNodes) -> None:
+        self._nodes = nodes
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
         """Return the path from a node at a sample."""
-        step, (formula, operands) = PathNode(node, sample), self._done.tree[node]
+        step, (formula, operands) = PathNode(node, sample), self._nodes.tree[node]
         match formula:
             case Boolean():
                 extremum = extremum_of(formula.operator, operands)
                 paths = [
                     self.follow(operand.index, sample, end.turned if operand.negated else end)
-                    for operand in chosen(extremum, end, lambda index: self._done.interval(index, sample))
+                    for operand in attaining_operands(
+                        extremum, end, lambda index: self._nodes.interval(index, sample)
+                    )
                 ]
                 below = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal():
-                lasting = self._lasting(node, sample, end) if self._done.goes_on else None
-                next_step = lasting or self._taken(formula, operands, sample, end)
-                if next_step is None or self._done.is_left_out(next_step.node, next_step.sample):
+                lasting = self._lasting(node, sample, end) if self._nodes.goes_on else None
+                next_step = lasting or self._deciding_operand(formula, operands, sample, end)
+                if next_step is None or self._nodes.is_left_out(next_step.node, next_step.sample):
                     return DecidingPath((step,), end)
                 below = self.follow(next_step.node, next_step.sample, end)
                 if end is End.OPEN and not self._is_open(below.steps[-1]):
@@ -230,12 +232,12 @@ class _Walk:
         return DecidingPath((step, *below.steps), below.end)
 
     def _is_open(self, step: PathNode) -> bool:
-        low, high = self._done.interval(step.node, step.sample)
+        low, high = self._nodes.interval(step.node, step.sample)
         return low < 0.0 <= high
 
     def _unknown_rates(self, node: int, sample: int) -> Iterator[DecidingPath]:
         """Iterate over the paths to rates that an operator asks of its operand and that are unknown."""
-        step, (formula, operands) = PathNode(node, sample), self._done.tree[node]
+        step, (formula, operands) = PathNode(node, sample), self._nodes.tree[node]
         match formula:
             case Atom() if rate_conditions(formula) and self._is_open(step):
                 yield DecidingPath((step,), End.OPEN)
@@ -246,16 +248,18 @@ class _Walk:
                 sample -= 1
             case Temporal() | Quantified():
                 return
-        if 0 <= sample < len(self._done.times_ns):
+        if 0 <= sample < len(self._nodes.times_ns):
             for operand in operands:
                 for below in self._unknown_rates(operand, sample):
                     yield DecidingPath((step, *below.steps), End.OPEN)
 
     def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
-        low, high = (column[samples] for column in self._done.judged_ends(operand.index))
+        low, high = (column[samples] for column in self._nodes.judged_ends(operand.index))
         return (-high, -low) if operand.negated else (low, high)
 
-    def _taken(self, formula: Temporal, operands: Sequence[int], sample: int, end: End) -> PathNode | None:
+    def _deciding_operand(
+        self, formula: Temporal, operands: Sequence[int], sample: int, end: End
+    ) -> PathNode | None:
         """Return the operand and sample that an operator takes its number from; None for an empty window."""
         *_, right = operands
         window = self._window(formula, sample)
@@ -282,20 +286,20 @@ class _Walk:
 
         None if the samples so far decide the until.
         """
-        formula, operands = self._done.tree[node]
+        formula, operands = self._nodes.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
             return None
-        left, (low, high) = SignedOperand(operands[0]), self._done.interval(node, sample)
+        left, (low, high) = SignedOperand(operands[0]), self._nodes.interval(node, sample)
         if formula.operator == "R":
             left, end, high = SignedOperand(left.index, True), end.turned, -low
-        if end is End.LOW or is_closed(formula.bound, self._done.times_ns)[sample]:
+        if end is End.LOW or is_closed(formula.bound, self._nodes.times_ns)[sample]:
             return None
         lasting = self._ends(left, slice(sample, None))[1]
         return PathNode(left.index, sample + int(np.argmin(lasting))) if lasting.min() == high else None
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples that an operator looks at."""
-        begin, end = windows_of(formula, self._done.times_ns, np.array([sample]))
+        begin, end = windows_of(formula, self._nodes.times_ns, np.array([sample]))
         return range(int(begin[0]), int(end[0]))
 
     def _extreme(self, operand: SignedOperand, window: range, end: End, *, is_minimum: bool) -> PathNode:
@@ -320,8 +324,8 @@ class _Walk:
         left_so_far = [_least_between(numbers, is_ahead=is_ahead) for numbers in lefts]
         inside = slice(window.start - span.start, window.stop - span.start)
         low, high = (
-            np.minimum(right_numbers, then[inside])
-            for right_numbers, then in zip(rights, left_so_far, strict=True)
+            np.minimum(right_numbers, left_least[inside])
+            for right_numbers, left_least in zip(rights, left_so_far, strict=True)
         )
         at = window[int(np.argmax(end.of_maximum(low, high)))]
         right_key = float(end.of_minimum(*rights)[at - window.start])
@@ -376,7 +380,7 @@ def short_title(formula: Formula) -> str:
 
 
 def missed_response(
-    path: DecidingPath, done: OfflineNodes, bindings: Bindings = MappingProxyType({})
+    path: DecidingPath, nodes: OfflineNodes, bindings: Bindings = MappingProxyType({})
 ) -> tuple[MissedResponse | None, DecidingPath | None]:
     """Return the outermost implication that failed on the path to what violates a formula, if there is one.
 
@@ -386,13 +390,15 @@ def missed_response(
         bindings: the objects that variables stand for.
     """
     for step, below in pairwise(path.steps):
-        node, operands = done.tree[step.node]
-        if operator_of(node) == "->" and done.ends(step.node)[1][step.sample] < 0.0:
+        node, operands = nodes.tree[step.node]
+        if operator_of(node) == "->" and nodes.ends(step.node)[1][step.sample] < 0.0:
             condition, response = (
                 short_title(substitute(operand, bindings)) for operand in operands_of(node)
             )
-            time_ns, is_condition = int(done.times_ns[step.sample]), below.node == operands[0]
-            closest = deciding_path(done, operands[1], End.HIGH, sample=step.sample) if is_condition else None
+            time_ns, is_condition = int(nodes.times_ns[step.sample]), below.node == operands[0]
+            closest = (
+                deciding_path(nodes, operands[1], End.HIGH, sample=step.sample) if is_condition else None
+            )
             return MissedResponse(condition, response, time_ns, is_condition), closest
     return None, None
 
@@ -555,7 +561,7 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
     value = nominal[0] if nominal[0] == nominal[1] else float("nan")
     unknown = unknowns_of(scene, leaf)
     branch = () if unknown else tuple(_branch(scene, leaf.expression, end, 1))
-    measurements = tuple(_measured(scene, part) for _, part in branch if not isinstance(part, Number))
+    measurements = tuple(_measurement_of(scene, part) for _, part in branch if not isinstance(part, Number))
     return DecidingAtom(leaf, end, value, lower, upper, branch, measurements, unknown)
 
 
@@ -596,7 +602,7 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
     if not formulas:
         return None
     intervals = _intervals(scene, formulas)
-    first, *_ = chosen(extremum, end, intervals.__getitem__)
+    first, *_ = attaining_operands(extremum, end, intervals.__getitem__)
     return formulas[first.index], end.turned if first.negated else end
 
 
@@ -655,7 +661,7 @@ def _branch(
             extremum = Extremum(
                 isinstance(expression, Minimum), tuple(map(SignedOperand, range(len(operands))))
             )
-            first, *_ = chosen(extremum, end, intervals.__getitem__)
+            first, *_ = attaining_operands(extremum, end, intervals.__getitem__)
             yield from _branch(scene, operands[first.index], end, weight)
         case _:
             yield weight, expression
@@ -668,7 +674,7 @@ def _as_atom(expression: Expression) -> Atom:
 # ----------------------------------------------------------------------------------------- measurements
 
 
-def _measured(scene: TraceScene, part: Expression) -> Measured:
+def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
     """Return a signal or a measurement of single objects: of groups, the members that attain it."""
     match part:
         case Rate():

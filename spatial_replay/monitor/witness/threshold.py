@@ -14,7 +14,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import evaluate_offline, evaluate_unfinished, new_leaves
+from spatial_replay.monitor.offline import evaluate_offline, evaluate_prefix, new_leaves
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
@@ -103,7 +103,7 @@ class Dial:
             return isinstance(number, NamedNumber) and self.constant in number.constants
         return kind == self.kind and number == self.value
 
-    def turned(self, expression: Expression, value: float) -> Expression:
+    def turn(self, expression: Expression, value: float) -> Expression:
         """Return the expression with another number in its place."""
         if self.kind == "margin":
             divisor = expression.divisor if isinstance(expression, Scaled) else 1.0
@@ -288,7 +288,7 @@ class _Search:
         goes_on: bool,
     ) -> None:
         self._evidence = evidence
-        self._evaluate = evaluate_unfinished if goes_on else evaluate_offline
+        self._evaluate = evaluate_prefix if goes_on else evaluate_offline
         self._verdict_of = online_verdict if goes_on else final_verdict
         self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
         self._leaves, self._times, self._node = leaves, times_ns, node
@@ -332,11 +332,11 @@ class _Search:
         dial = self._dial
         nearest = [number for side in self._directions if (number := self._nearest(side)) is not None]
         for number in sorted(nearest, key=lambda number: abs(number - dial.value)):
-            candidates = list(filter(self._is_possible, _rounded(number, dial.value)))
+            candidates = list(filter(self._is_possible, _short_numbers(number, dial.value)))
             # one of the first two flips it nearly always; each measures all bindings of a quantifier again
-            for some in filter(None, (candidates[:2], candidates[2:])):
-                verdicts = self._verdicts(some, is_shifted=False)
-                for candidate, verdict in zip(some, verdicts, strict=True):
+            for batch in filter(None, (candidates[:2], candidates[2:])):
+                verdicts = self._verdicts(batch, is_shifted=False)
+                for candidate, verdict in zip(batch, verdicts, strict=True):
                     if self._is_flipped(verdict):
                         is_exact = dial.is_exact or len(self._directions) > 1
                         is_written = dial.kind != "margin"
@@ -350,10 +350,10 @@ class _Search:
         """Return the deciding atom with a number that makes it hold by a margin; "" if none does."""
         atom = self._deciding.atom
         for variant in _variants(atom, margin):
-            formula = self._changed(variant)
+            formula = self._change_atoms(variant)
             added = new_leaves(formula, self._order)
             # heights, or rounding, may decide instead
-            if self._is_flipped(self._evaluated(formula, added, self._columns(added))):
+            if self._is_flipped(self._verdict_with(formula, added, self._columns(added))):
                 changed = variant(atom)
                 return format_atom(changed.relation, changed.expression, changed.terms, changed.parameters)
         return ""
@@ -365,9 +365,9 @@ class _Search:
         def change(atom: Atom) -> Atom:
             return replace(atom, expression=Sum(atom.expression, Number(far)))
 
-        formula = self._changed(change)
+        formula = self._change_atoms(change)
         added = new_leaves(formula, self._order)
-        verdict = self._evaluated(formula, added, self._columns(added))
+        verdict = self._verdict_with(formula, added, self._columns(added))
         if self._is_flipped(verdict):
             return "limits"
         return "others" if verdict is self._verdict else "unknown"
@@ -383,7 +383,7 @@ class _Search:
         """Return the nearest number in one direction that flips the verdict, perhaps a little beyond."""
         find = self._size_by_samples if self._is_uniform else self._size_by_rounds
         size = find(direction)
-        return None if size is None else self._moved(size, direction)
+        return None if size is None else self._number_beyond(size, direction)
 
     def _size_by_samples(self, direction: float) -> float | None:
         """Where the dial moves an atom alike in every sample, one of them decides when the verdict flips."""
@@ -421,12 +421,12 @@ class _Search:
         return sizes[-1]
 
     def _flips(self, sizes: Sequence[float], direction: float) -> list[bool]:
-        numbers = [self._moved(size, direction) for size in sizes]
+        numbers = [self._number_beyond(size, direction) for size in sizes]
         possible = [number for number in numbers if self._is_possible(number)]
         verdicts = dict(zip(possible, self._verdicts(possible), strict=True))
         return [self._is_flipped(verdicts.get(number, self._verdict)) for number in numbers]
 
-    def _moved(self, size: float, direction: float) -> float:
+    def _number_beyond(self, size: float, direction: float) -> float:
         """Return the number that is further by `size` and a little more, so that rounding cannot undo it.
 
         A radius goes no lower than 0.
@@ -442,17 +442,19 @@ class _Search:
         Args:
             is_shifted: whether numbers of atoms may be shifted, but for rounding, instead of measured again.
         """
-        formulas = [self._turned(number) for number in numbers]
+        formulas = [self._formula_at(number) for number in numbers]
         added = [new_leaves(formula, self._order) for formula in formulas]
         if self._is_uniform and is_shifted:
-            columns = [self._shifted(leaves, number) for leaves, number in zip(added, numbers, strict=True)]
+            columns = [
+                self._shift_columns(leaves, number) for leaves, number in zip(added, numbers, strict=True)
+            ]
         elif numbers:
             every = self._columns([leaf for leaves in added for leaf in leaves])
             ends = np.cumsum([0, *map(len, added)]).tolist()
             columns = [every[:, begin:end] for begin, end in pairwise(ends)]
         else:
             columns = []
-        return [self._evaluated(*arguments) for arguments in zip(formulas, added, columns, strict=True)]
+        return [self._verdict_with(*arguments) for arguments in zip(formulas, added, columns, strict=True)]
 
     def _is_meant(self, atom: Atom) -> bool:
         """Return whether the constant is in an atom or, of another number, it was written where that was."""
@@ -463,19 +465,19 @@ class _Search:
             return atom.expression == meant.expression
         return (atom.span, atom.relation, atom.parameters) == (meant.span, meant.relation, meant.parameters)
 
-    def _turned(self, number: float) -> Formula:
-        return self._changed(lambda atom: self._turned_atom(atom, number))
+    def _formula_at(self, number: float) -> Formula:
+        return self._change_atoms(lambda atom: self._atom_at(atom, number))
 
-    def _changed(self, change: Callable[[Atom], Atom]) -> Formula:
+    def _change_atoms(self, change: Callable[[Atom], Atom]) -> Formula:
         return rewritten(self._formula, lambda atom: change(atom) if self._is_meant(atom) else atom)
 
-    def _turned_atom(self, atom: Atom, number: float) -> Atom:
-        return replace(atom, expression=self._dial.turned(atom.expression, number))
+    def _atom_at(self, atom: Atom, number: float) -> Atom:
+        return replace(atom, expression=self._dial.turn(atom.expression, number))
 
-    def _shifted(self, added: Sequence[Formula], number: float) -> Floats:
-        """Return columns of turned atoms, shifted from those of the original ones."""
+    def _shift_columns(self, added: Sequence[Formula], number: float) -> Floats:
+        """Return columns of atoms at a number, shifted from those of the original ones."""
         indices = {
-            leaf_key(rewritten(leaf, lambda atom: self._turned_atom(atom, number))): index
+            leaf_key(rewritten(leaf, lambda atom: self._atom_at(atom, number))): index
             for index, leaf in self._moving.items()
         }
         places = [indices[leaf_key(leaf)] for leaf in added]
@@ -486,7 +488,7 @@ class _Search:
     def _columns(self, formulas: Sequence[Formula]) -> Floats:
         return self._evidence.columns(formulas)[:, :, : len(self._times)]
 
-    def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
+    def _verdict_with(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
         leaves = joined_channels([self._leaves, columns], axis=1)
         nodes = self._evaluate(formula, (*self._order, *added), leaves, self._times)
         return self._verdict_of(*nodes.interval(self._node))
@@ -520,14 +522,14 @@ def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
     radius, slope = abs(margin), -math.copysign(1.0, margin)
     dial = Dial("radius", radius, is_exact=False)
     for place in range(len(atom.terms)):
-        variant = partial(_with_enlarged, place=place, radius=radius)
+        variant = partial(_enlarge_term, place=place, radius=radius)
         if dial.slopes(variant(atom).expression) == {slope}:
             yield variant
 
 
 def _as_distance(atom: Atom, margin: float) -> Atom:
     """Return `a ovlp b` as `a dist b <= -margin`."""
-    expression = Dial("margin", 0.0, is_exact=False).turned(atom.expression, margin)
+    expression = Dial("margin", 0.0, is_exact=False).turn(atom.expression, margin)
     return replace(atom, relation="dist", parameters=("<=", -margin), expression=expression)
 
 
@@ -548,7 +550,7 @@ def _plus(expression: Expression, number: float) -> Expression:
     return Sum(expression, summand if number >= 0.0 else Negative(summand))
 
 
-def _with_enlarged(atom: Atom, place: int, radius: float) -> Atom:
+def _enlarge_term(atom: Atom, place: int, radius: float) -> Atom:
     """Return an atom with one of its terms enlarged."""
     enlarged = Enlarged(atom.terms[place], radius)
 
@@ -561,11 +563,11 @@ def _with_enlarged(atom: Atom, place: int, radius: float) -> Atom:
     return replace(atom, expression=map_leaves(atom.expression, leaf), terms=terms)
 
 
-def _rounded(number: float, value: float) -> Iterator[float]:
+def _short_numbers(number: float, value: float) -> Iterator[float]:
     """Iterate over short numbers near one, and beyond it as seen from a value; the number itself is last."""
     exact, change = Decimal(number), Decimal(number) - Decimal(value)
     beyond = ROUND_CEILING if change > 0 else ROUND_FLOOR
-    # a rounding error, or the step that `_moved` adds near 0, has no digits of its own
+    # a rounding error, or the step that `_number_beyond` adds near 0, has no digits of its own
     leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
     last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):

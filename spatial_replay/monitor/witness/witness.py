@@ -14,7 +14,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.offline import (
     OfflineNodes,
     evaluate_offline,
-    evaluate_unfinished,
+    evaluate_prefix,
     windows_of,
 )
 from spatial_replay.monitor.online.codes import joined_channels
@@ -184,9 +184,7 @@ def find_witness(
         flips: whether that number is sought at all.
     """
     instance = evidence.instance
-    evaluate, verdict_of = (
-        (evaluate_unfinished, online_verdict) if goes_on else (evaluate_offline, final_verdict)
-    )
+    evaluate, verdict_of = (evaluate_prefix, online_verdict) if goes_on else (evaluate_offline, final_verdict)
     nodes = evaluate(instance.formula, instance.program.leaves, leaves, times_ns)
     lower, upper = nodes.interval(node)
     verdict = verdict_of(lower, upper)
@@ -366,8 +364,8 @@ def time_of_least(
 
     def is_reached(sample: int) -> bool:
         until = slice(sample + 1)
-        then = evaluate_unfinished(instance.formula, order, leaves[..., until], times_ns[until])
-        return bool(then.ends(node)[1][0] <= least)
+        prefix = evaluate_prefix(instance.formula, order, leaves[..., until], times_ns[until])
+        return bool(prefix.ends(node)[1][0] <= least)
 
     # most often no more samples are needed than decide it
     later = range(earliest, earliest if is_reached(earliest) else len(times_ns) - 1)
