@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
-from spatial_replay.monitor.atoms.measurements import measured
+from spatial_replay.monitor.atoms.measurements import measurement_values
 from spatial_replay.monitor.atoms.terms import Reach, TraceScene, tail
 from spatial_replay.monitor.stream import Instance
 from spatial_replay.spec.format import format_term
@@ -186,7 +186,7 @@ class Departures:
             signals_reported_ns={},
         )
         watches = self._watches[visitors]
-        values, _ = measured(
+        values, _ = measurement_values(
             TraceScene(stand_in, self._regions), [watch.distance(_STAND_IN) for watch in watches]
         )
         by_member: Floats = values.reshape(len(watches), *samples.shape).swapaxes(0, 1)

@@ -79,8 +79,8 @@ class ClosestPair:
 
 def closest_pair_of(formula: Quantified) -> ClosestPair | None:
     """Return the pair whose distance decides a quantifier; None if it takes more."""
-    found = number_of_closest(formula)
-    return None if found is None else found[0]
+    closest = number_of_closest(formula)
+    return None if closest is None else closest[0]
 
 
 def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | None:
@@ -92,14 +92,14 @@ def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | N
         is_negated = not is_negated
     if len(formula.variables) != 2 or not isinstance(formula.group, Group) or not isinstance(body, Atom):
         return None
-    found = {
+    leaf_effects = {
         (effect, _enlargement(leaf, formula.variables))
         for effect, leaf in _leaves(body.expression, -sign if is_negated else sign)
         if not isinstance(leaf, Number)
     }
-    if len(found) != 1:
+    if len(leaf_effects) != 1:
         return None
-    ((effect, enlargement),) = found
+    ((effect, enlargement),) = leaf_effects
     if effect < 0 or enlargement is None:
         return None
     pair: Any = ClosestPair(formula.group, enlargement)
@@ -129,16 +129,16 @@ def _enlargement(leaf: Expression, variables: tuple[str, ...]) -> float | None:
     """Return the enlargement of both terms of a distance between two variables; None of anything else."""
     if not isinstance(leaf, SignedDistance):
         return None
-    names, radii = zip(*(_grown(term) for term in (leaf.first, leaf.second)), strict=True)
+    names, radii = zip(*(_variable_and_radius(term) for term in (leaf.first, leaf.second)), strict=True)
     return sum(radii) if set(names) == set(variables) else None
 
 
-def _grown(term: Term) -> tuple[str | None, float]:
+def _variable_and_radius(term: Term) -> tuple[str | None, float]:
     """Return the name of a variable, and by how much it is enlarged; no name for anything else."""
     match term:
         case Enlarged(inner, radius):
-            name, own = _grown(inner)
-            return name, own + radius
+            name, inner_radius = _variable_and_radius(inner)
+            return name, inner_radius + radius
         case Variable(name):
             return name, 0.0
     return None, 0.0
@@ -308,15 +308,15 @@ class OpenGroups(Protocol):
 
 
 class Membership(NamedTuple):
-    """A binding of an open quantifier: 1 in samples where all of `chosen` are members, 0 elsewhere.
+    """A binding of an open quantifier: 1 in samples where all of `candidates` are members, 0 elsewhere.
 
     Attributes:
-        chosen: which of the group's candidates. With none it stands for the group itself: -1 in samples
+        candidates: their places among the group's. With none it stands for the group itself: -1 in samples
             where that is unknown, 0 elsewhere.
     """
 
     group: Group | Earlier
-    chosen: tuple[int, ...]
+    candidates: tuple[int, ...]
 
 
 class LeafCode:
@@ -355,10 +355,10 @@ class LeafCode:
             case Atom():
                 return self._row(HOLDS, self._expression(formula.expression, bindings))
             case Quantified():
-                return self._quantified(formula, bindings)
+                return self._quantifier(formula, bindings)
             case Boolean():
-                rows = {id(each): self._add(each, bindings) for each in formula.operands}
-                return self._joined(formula.expansion or formula, rows)
+                rows = {id(operand): self._add(operand, bindings) for operand in formula.operands}
+                return self._expansion_row(formula.expansion or formula, rows)
             case Temporal():
                 raise TypeError("a temporal operator in the body of an open quantifier")
 
@@ -402,9 +402,9 @@ class LeafCode:
                 return self._row(DIVIDE, self._expression(operand, bindings), constant)
             case Minimum() | Maximum():
                 op = LEAST if isinstance(expression, Minimum) else GREATEST
-                row, *others = [self._expression(each, bindings) for each in expression.operands]
-                for other in others:
-                    row = self._row(op, row, other)
+                row, *other_rows = [self._expression(operand, bindings) for operand in expression.operands]
+                for other_row in other_rows:
+                    row = self._row(op, row, other_row)
                 return row
         measurement = expression.with_terms(*(substitute_term(term, bindings) for term in expression.terms))
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
@@ -413,51 +413,51 @@ class LeafCode:
         """Return a row that is a number where all objects of a rate, or its signal, are in the sample."""
         if rate.signal is not None:
             return self._expression(rate.signal, bindings)
-        first, *others = [self._expression(Projection(each, "x", "min"), bindings) for each in rate.terms]
-        for other in others:
-            first = self._row(ADD, first, other)
+        first, *other_rows = [self._expression(Projection(term, "x", "min"), bindings) for term in rate.terms]
+        for other_row in other_rows:
+            first = self._row(ADD, first, other_row)
         return first
 
-    def _joined(self, formula: Formula, rows: Mapping[int, int]) -> int:
+    def _expansion_row(self, formula: Formula, rows: Mapping[int, int]) -> int:
         """Return the row of an expansion, given the rows of the operands that were written, by `id`.
 
         An expansion holds an operand more than once: compiling it each time would take 2**depth steps.
         """
         if id(formula) in rows:
             return rows[id(formula)]
-        first, *rest = [self._joined(each, rows) for each in operands_of(formula)]
+        first, *other_rows = [self._expansion_row(operand, rows) for operand in operands_of(formula)]
         operator = operator_of(formula)
         if operator == "not":
             return self._row(NEGATE, first)
-        for other in rest:
-            first = self._row(AND if operator == "and" else OR, first, other)
+        for other_row in other_rows:
+            first = self._row(AND if operator == "and" else OR, first, other_row)
         return first
 
-    def _quantified(self, formula: Quantified, bindings: Bindings) -> int:
+    def _quantifier(self, formula: Quantified, bindings: Bindings) -> int:
         is_forall = formula.quantifier == "forall"
         group: Any = substitute_term(formula.group, bindings)
-        if (found := number_of_closest(replace(formula, group=group))) is not None:
+        if (closest := number_of_closest(replace(formula, group=group))) is not None:
             if (count := len(self._groups.candidates(group))) > MAX_CLOSEST:
                 what = f"{formula.quantifier} {', '.join(formula.variables)} looks for the closest two"
                 raise UsageError(
                     f"{what} of {count} objects; {MAX_CLOSEST} is the limit: use a smaller group"
                 )
-            return self._row(HOLDS, self._expression(found[1], bindings))
+            return self._row(HOLDS, self._expression(closest[1], bindings))
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER
         result = self._constant(inf if is_forall else -inf)
         if self._groups.may_be_unknown(group):
             result = self._row(op, result, result, self._member(group, ()))
-        for chosen in permutations(range(len(names)), len(formula.variables)):
-            members = [TrackedName(names[n]) for n in chosen]
+        for candidates in permutations(range(len(names)), len(formula.variables)):
+            members = [TrackedName(names[n]) for n in candidates]
             inner = {**bindings, **dict(zip(formula.variables, members, strict=True))}
             body = self._add(formula.judged, inner)
-            result = self._row(op, result, body, self._member(group, chosen))
+            result = self._row(op, result, body, self._member(group, candidates))
         return result
 
-    def _member(self, group: Group | Earlier, chosen: tuple[int, ...]) -> int:
-        return self.members.setdefault(Membership(group, chosen), len(self.members))
+    def _member(self, group: Group | Earlier, candidates: tuple[int, ...]) -> int:
+        return self.members.setdefault(Membership(group, candidates), len(self.members))
 
     def _check_bindings(self, formula: Quantified, member_count: int) -> None:
         self._bindings += perm(member_count, len(formula.variables))

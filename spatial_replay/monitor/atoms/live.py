@@ -346,8 +346,8 @@ def _fill_rows(
 
 
 @inlined
-def _is_there(lists: Integers, classes: int, row: int, wanted: int) -> bool:
-    return lists[classes + row] != ABSENT and wanted in (ANY, lists[classes + row])
+def _is_there(lists: Integers, classes: int, row: int, class_code: int) -> bool:
+    return lists[classes + row] != ABSENT and class_code in (ANY, lists[classes + row])
 
 
 @inlined
@@ -362,19 +362,19 @@ def _measure(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     values: int, begin: int,
 ) -> None:  # fmt: skip
-    """Fill K `values` and the spreads after them, as `measurements.measured` gives them.
+    """Fill K `values` and the spreads after them, as `measurements.measurement_values` gives them.
 
     Args:
         begin: of the room for operands.
     """
     operands, count = plan.operands, plan.geometric_count + plan.yaw_count
-    spreads, listed = values + count, plan.listed_start
-    of_operands, measured = begin, begin + operands + 1
-    widths = measured + plan.geometric_count
+    spreads, starts = values + count, plan.listed_start
+    of_operands, measured_at = begin, begin + operands + 1
+    widths = measured_at + plan.geometric_count
     hidden, members = widths + operands, widths + 2 * operands + 1
     sample[of_operands + operands], lists[hidden + operands] = 0.0, 0  # for no operand, -1
     for operand in range(operands):
-        first, last = whole[listed + operand], whole[listed + operand + 1]
+        first, last = whole[starts + operand], whole[starts + operand + 1]
         lists[widths + operand], lists[hidden + operand], spread = last - first, 0, 0.0
         for k in range(first, last):
             row, lists[members + k] = whole[plan.listed_rows + k], ABSENT
@@ -395,15 +395,15 @@ def _measure(
         sample[rows.radius : rows.vertices],
         sample[rows.bottom : rows.top],
         sample[rows.top : rows.yaw],
-        lists[members : members + whole[listed + operands]],
-        whole[listed : listed + operands + 1],
+        lists[members : members + whole[starts + operands]],
+        whole[starts : starts + operands + 1],
         lists[widths:hidden],
         real[plan.enlargement : plan.enlargement + operands],
         whole[plan.quantity : plan.quantity + plan.geometric_count],
         whole[plan.first : plan.first + plan.geometric_count],
         whole[plan.second : plan.second + plan.geometric_count],
         sample[rows.edges : rows.classes].reshape((-1, 4)),
-        sample[measured:widths].reshape((-1, 1)),
+        sample[measured_at:widths].reshape((-1, 1)),
         zero,
         zero + 1,
     )
@@ -411,16 +411,16 @@ def _measure(
         k, a, b = whole[plan.geometric + g], whole[plan.first + g], whole[plan.second + g]
         a, b = (a, b if b >= 0 else operands)
         is_hidden = lists[hidden + a] != 0 or lists[hidden + b] != 0
-        sample[values + k] = np.nan if is_hidden else sample[measured + g]
+        sample[values + k] = np.nan if is_hidden else sample[measured_at + g]
         sample[spreads + k] = sample[of_operands + a] + sample[of_operands + b]
     for y in range(plan.yaw_count):
         at = plan.yaws + 3 * y
         k, a, b = whole[at], whole[at + 1], whole[at + 2]
         sample[values + k] = misalignment_of(sample[rows.yaw + a], sample[rows.yaw + b])
         sample[spreads + k] = 0.0
-    required = listed + operands + plan.pairs + plan.groups
+    required_starts = starts + operands + plan.pairs + plan.groups
     for k in range(count):
-        for at in range(whole[required + k], whole[required + k + 1]):
+        for at in range(whole[required_starts + k], whole[required_starts + k + 1]):
             if lists[rows.classes + whole[plan.listed_rows + at]] == ABSENT:
                 sample[values + k] = np.nan
 
@@ -474,8 +474,8 @@ def _members(plan: PlanPlaces, classes: int, whole: Integers, lists: Integers, m
         is_group = whole[plan.is_group + m] != 0
         lists[members + m] = 0 if is_group else 1
         for k in range(whole[first + m], whole[first + m + 1]):
-            row, wanted = whole[plan.listed_rows + k], whole[plan.listed_classes + k]
-            if not _is_there(lists, classes, row, wanted):
+            row, class_code = whole[plan.listed_rows + k], whole[plan.listed_classes + k]
+            if not _is_there(lists, classes, row, class_code):
                 lists[members + m] = -1 if is_group else 0
 
 
@@ -653,8 +653,8 @@ class PlanRows:
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
         base = open_group(group)
-        wanted = self._class_wanted(base)
-        fitting = {name for name, code in self._members if wanted in (ANY, code)}
+        class_code = self._required_class(base)
+        fitting = {name for name, code in self._members if class_code in (ANY, code)}
         return tuple(sorted(fitting - left_out_of(base)))
 
     def may_be_unknown(self, group: Group | Earlier) -> bool:
@@ -662,10 +662,13 @@ class PlanRows:
 
     def of_membership(self, membership: Membership) -> list[Row]:
         sample = self._sample_of(membership.group)
-        if not membership.chosen:
+        if not membership.candidates:
             return [Row(sample)]
-        names, wanted = self.candidates(membership.group), self._class_wanted(open_group(membership.group))
-        return [Row(self._place(sample, names[each]), wanted) for each in membership.chosen]
+        names, class_code = (
+            self.candidates(membership.group),
+            self._required_class(open_group(membership.group)),
+        )
+        return [Row(self._place(sample, names[candidate]), class_code) for candidate in membership.candidates]
 
     def of_term(self, term: Term) -> list[Row]:
         """Return the rows whose union a term is."""
@@ -678,11 +681,11 @@ class PlanRows:
         if not isinstance(base, Group):
             return [Row(place(base.name))]
         if base.members is None:
-            wanted = self._class_wanted(base)
-            return [Row(place(name), wanted) for name in self.candidates(base)]
+            class_code = self._required_class(base)
+            return [Row(place(name), class_code) for name in self.candidates(base)]
         return [Row(place(name)) for name in named_members(base)]
 
-    def required(self, term: Term) -> list[Row]:
+    def required_rows(self, term: Term) -> list[Row]:
         """Return the rows, its sample's among them, without which a term is unknown."""
         then, base = standing(term), base_of(term)
         sample = [Row(self._sample_of(then))] if isinstance(then, Earlier) else []
@@ -693,7 +696,7 @@ class PlanRows:
     def _sample_of(self, term: Term) -> int:
         return self._sample[Delay.of(term) if isinstance(term, Earlier) else NO_DELAY]
 
-    def _class_wanted(self, group: Group) -> int:
+    def _required_class(self, group: Group) -> int:
         if group.class_name == ANY_CLASS:
             return ANY
         return self._frame.classes[(group.class_name or "").casefold()]
@@ -826,7 +829,7 @@ def _step(
 ) -> float:
     """Return the shortest time between two reports of what moves in some terms."""
     if stands_for:
-        names = {name: TrackedName(other) for name, other in stands_for.items()}
+        names = {placeholder: TrackedName(name) for placeholder, name in stands_for.items()}
         terms = [names.get(term.name, term) if isinstance(term, TrackedName) else term for term in terms]
     return reports.step(terms, sample)
 
@@ -850,14 +853,16 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         for number, measurement in enumerate(measurements)
         if measurement.needs_orientation
     ]
-    listed = [rows.of_term(term) for term in operands]
-    listed += [rows.of_term(each.group) for each in code.closest]
-    listed += [rows.of_membership(each) for each in code.members]
-    listed += [
-        [row for term in measurement.terms for row in rows.required(term)] for measurement in measurements
+    row_lists = [rows.of_term(term) for term in operands]
+    row_lists += [rows.of_term(pair.group) for pair in code.closest]
+    row_lists += [rows.of_membership(membership) for membership in code.members]
+    row_lists += [
+        [row for term in measurement.terms for row in rows.required_rows(term)]
+        for measurement in measurements
     ]
     regions = FootprintBatch.from_footprints(
-        [each.footprint for each in frame.regions.values()], [each.height for each in frame.regions.values()]
+        [region.footprint for region in frame.regions.values()],
+        [region.height for region in frame.regions.values()],
     )
     return PlanArrays(
         region_parts=np.diff(regions.part_start),
@@ -865,17 +870,17 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         region_radius=regions.radius.copy(),
         region_vertices=regions.vertices.ravel(),
         region_heights=np.stack((regions.bottom, regions.top), axis=1),
-        listed_start=starts_from_counts(list(map(len, listed))),
-        listed_rows=_whole(each.row for among in listed for each in among),
-        listed_classes=_whole(each.class_code for among in listed for each in among),
+        listed_start=starts_from_counts(list(map(len, row_lists))),
+        listed_rows=_whole(row.row for row_list in row_lists for row in row_list),
+        listed_classes=_whole(row.class_code for row_list in row_lists for row in row_list),
         enlargement=np.array([_enlargement(term) for term in operands], np.float64),
         geometric=_whole(geometric),
         quantity=_whole(QUANTITY_CODES[measurements[number].quantity] for number in geometric),
         first=_whole(pair[0] for pair in pairs),
         second=_whole(pair[1] if len(pair) > 1 else ABSENT for pair in pairs),
         yaws=np.array(yaws, np.int64).reshape(len(yaws), 3),
-        closest_enlargement=np.array([each.enlargement for each in code.closest], np.float64),
-        is_group=_whole(not each.chosen for each in code.members),
+        closest_enlargement=np.array([pair.enlargement for pair in code.closest], np.float64),
+        is_group=_whole(not membership.candidates for membership in code.members),
         code=np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
         constants=np.array(list(code.constants), np.float64),
         outputs=_whole(outputs),
@@ -928,7 +933,7 @@ class SampleLeaves:
             tuple(dict.fromkeys((NO_DELAY, *iter_delays(formulas)))),
             {name: code for code, name in enumerate(classes, start=1)},
             {
-                **{RegionName(name): each for name, each in named.items()},
+                **{RegionName(name): region for name, region in named.items()},
                 **{
                     Centre(base): centre_object(named[base.name])
                     for base in map(base_of, filter(is_centre, terms))
@@ -938,13 +943,13 @@ class SampleLeaves:
         )
         self._regions = regions
         self._recent = RecentSamples(self._frame.delays)
-        self._reports = _reports_needed(formulas)
+        self._reports = _empty_reports(formulas)
         self._takes_any = ANY_CLASS in open_classes
-        self._own_names = _names(bases)
+        self._spec_names = _names(bases)
         self._prefix = "?"
-        while any(name.startswith(self._prefix) for name in self._own_names):
+        while any(name.startswith(self._prefix) for name in self._spec_names):
             self._prefix += "?"
-        self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
+        self._spec_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
         self._code_of = lru_cache(_MOST_CLASSES)(partial(_class_code, self._frame.classes))
         self._plans: dict[tuple[frozenset[Member], _Counts], LeafPlan] = {}
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
@@ -989,32 +994,32 @@ class SampleLeaves:
 
     def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
         """Return the members of open groups that the specification does not name, by their classes."""
-        found: dict[str, _Classes] = {}
-        own: list[Member] = []
-        code_of, takes_any, own_names = self._code_of, self._takes_any, self._own_names
+        classes_by_name: dict[str, _Classes] = {}
+        spec_members: list[Member] = []
+        code_of, takes_any, spec_names = self._code_of, self._takes_any, self._spec_names
         for sample in filter(None, samples):
             objects: Any = sample.objects
-            coded = [code_of(each.class_name) for each in objects.values()]
+            coded = [code_of(tracked.class_name) for tracked in objects.values()]
             coded += map(code_of, sample.unknown.values())
             for name, code in zip(chain(objects, sample.unknown), coded, strict=True):
                 if not (code or takes_any):
                     continue
-                if name in own_names:
-                    own.append(Member(name, code))
-                elif name not in found:
-                    found[name] = (code,)
-                elif code not in found[name]:
-                    found[name] = tuple(sorted((*found[name], code)))
-        if not self._own_members.issuperset(own):
-            self._own_members |= frozenset(own)
+                if name in spec_names:
+                    spec_members.append(Member(name, code))
+                elif name not in classes_by_name:
+                    classes_by_name[name] = (code,)
+                elif code not in classes_by_name[name]:
+                    classes_by_name[name] = tuple(sorted((*classes_by_name[name], code)))
+        if not self._spec_members.issuperset(spec_members):
+            self._spec_members |= frozenset(spec_members)
         kinds: dict[_Classes, list[str]] = {}
-        for name, kind in found.items():
+        for name, kind in classes_by_name.items():
             kinds.setdefault(kind, []).append(name)
         return kinds
 
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
         """Return the plan for the given number of unnamed members of each kind."""
-        key, plans = (self._own_members, tuple(sorted(counts.items()))), self._plans
+        key, plans = (self._spec_members, tuple(sorted(counts.items()))), self._plans
         plan = plans.pop(key, None)
         if plan is None:
             plan = _plan(self._frame, self._prefix, *key)
@@ -1025,7 +1030,7 @@ class SampleLeaves:
         return plan
 
 
-def _reports_needed(formulas: Sequence[Formula]) -> RecentReports:
+def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
     """Return an empty memory of the reports that the rates in some formulas compare."""
     rates = [rate for formula in formulas for rate in rates_of(formula)]
     bases = [base_of(term) for rate in rates for term in rate.terms]
@@ -1065,5 +1070,5 @@ def _names(bases: Sequence[Term]) -> frozenset[str]:
             names.add(base.name)
         elif isinstance(base, Group):
             names.update(base.members or ())
-            names.update(each.name for each in base.excluded if isinstance(each, TrackedName))
+            names.update(term.name for term in base.excluded if isinstance(term, TrackedName))
     return frozenset(names)

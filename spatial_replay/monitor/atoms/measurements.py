@@ -36,7 +36,7 @@ _SHARE = 200_000
 """So many instructions, each over one sample, pay for a thread of their own."""
 
 
-def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
+def measurement_values(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
     """Compute each measurement in each sample of a scene, or take it from the trace's cache.
 
     Returns:
@@ -44,20 +44,20 @@ def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Fl
     """
     keys = [_key(scene, measurement) for measurement in measurements]
     cache = scene.trace.cache
-    found = {key: array for key in keys if (array := cache.get(key)) is not None}
+    arrays = {key: array for key in keys if (array := cache.get(key)) is not None}
     missing = {
-        key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in found
+        key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in arrays
     }
     if missing:
         for key, array in zip(missing, _measure(scene, list(missing.values())), strict=True):
             cache.put(key, array)
-            found[key] = array
+            arrays[key] = array
     if not keys:
         return np.empty((0, len(scene))), np.empty((0, len(scene)))
-    values = np.array([found[key][0] for key in keys])
+    values = np.array([arrays[key][0] for key in keys])
     if scene.is_sure:
         return values, np.zeros(values.shape)
-    return values, np.array([found[key][1] for key in keys])
+    return values, np.array([arrays[key][1] for key in keys])
 
 
 def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Floats]:
@@ -102,7 +102,7 @@ def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     shapes = tuple(scene.regions[name] for name in map(_region, measurement.terms) if name is not None)
     if not shapes:
         return scene.skip, measurement
-    return scene.skip, measurement.with_terms(*map(_unnamed, measurement.terms)), shapes
+    return scene.skip, measurement.with_terms(*map(_without_region_name, measurement.terms)), shapes
 
 
 def _region(term: Term) -> str | None:
@@ -110,9 +110,9 @@ def _region(term: Term) -> str | None:
     return base.name if isinstance(base, RegionName) else None
 
 
-def _unnamed(term: Term) -> Term:
+def _without_region_name(term: Term) -> Term:
     if isinstance(term, Enlarged | Centre):
-        inner: Any = _unnamed(term.term)
+        inner: Any = _without_region_name(term.term)
         return replace(term, term=inner)
     return RegionName("") if _region(term) is not None else term
 
@@ -129,12 +129,12 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     """
     code = LeafCode(scene)
     outputs = np.array(code.add_leaves(leaves, bindings), np.int64)
-    values, spreads = measured(scene, list(code.measurements))
+    values, spreads = measurement_values(scene, list(code.measurements))
     count = len(scene)
-    signals = np.array([scene.signal(each) for each in code.signals]).reshape(len(code.signals), count)
-    members = np.array([_flags(scene, each) for each in code.members], np.int8)
+    signals = np.array([scene.signal(signal) for signal in code.signals]).reshape(len(code.signals), count)
+    members = np.array([_flags(scene, membership) for membership in code.members], np.int8)
     members = members.reshape(len(code.members), count)
-    closest = np.array([_closest(scene, each) for each in code.closest]).reshape(len(code.closest), 4, count)
+    closest = np.array([_closest(scene, pair) for pair in code.closest]).reshape(len(code.closest), 4, count)
     rows = np.array(list(code.rows), np.int64).reshape(len(code.rows), 4)
     constants = np.array(list(code.constants), np.float64)
     # whether a number is equal to a text is not known
@@ -160,22 +160,22 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
 def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:
     """Compute the ends of a closest pair's distance, (4, T), or take them from the trace's cache."""
     cache, key = scene.trace.cache, (scene.skip, pair)
-    found = cache.get(key)
-    if found is None:
+    ends = cache.get(key)
+    if ends is None:
         rows, uncertainty = scene.resolve(pair.group).operand.rows, scene.trace.uncertainty
         least, low, high = closest_pairs(scene.batch, rows, uncertainty, pair.enlargement).T
         # one that cannot be read may be anywhere, and so may be the closest
         is_hidden = (rows < ABSENT).any(axis=1) & ((rows != ABSENT).sum(axis=1) > 1)
-        surely, at_least = (np.where(is_hidden, -np.inf, each) for each in (least, low))
-        found = np.stack((surely, least, at_least, high))
-        found.flags.writeable = False
-        cache.put(key, found)
-    return found
+        nominal_low, wide_low = (np.where(is_hidden, -np.inf, distances) for distances in (least, low))
+        ends = np.stack((nominal_low, least, wide_low, high))
+        ends.flags.writeable = False
+        cache.put(key, ends)
+    return ends
 
 
 def _flags(scene: TraceScene, membership: Membership) -> Flags:
     """Return the state of a binding in each sample, (T,) (see `Membership`)."""
     _, members, unknown = scene.members(membership.group)
-    if not membership.chosen:
+    if not membership.candidates:
         return np.where(unknown, -1, 0).astype(np.int8)
-    return np.asarray(members[:, membership.chosen].min(axis=1))
+    return np.asarray(members[:, membership.candidates].min(axis=1))

@@ -155,20 +155,20 @@ class RecentReports:
         if latest is None:
             return None
         before, seconds = latest.before, latest.seconds
-        now: TrackedObject = latest.value
+        current: TrackedObject = latest.value
         if before is None or seconds != seconds:
-            return now if name in sample.lasting else None
-        then: TrackedObject = before.value
+            return current if name in sample.lasting else None
+        previous: TrackedObject = before.value
         if seconds == shortest:
-            return then
+            return previous
         if not seconds > shortest:
             return None
-        (x, y), (then_x, then_y) = (centre_of(tracked.footprint) for tracked in (now, then))
+        (x, y), (previous_x, previous_y) = (centre_of(tracked.footprint) for tracked in (current, previous))
         share = shortest / seconds
-        shift = np.array([[(then_x - x) * share, (then_y - y) * share]])
-        moved = shifted(FootprintBatch.from_footprints([now.footprint]), shift)
-        uncertainty = max(now.uncertainty, then.uncertainty)
-        return replace(now, footprint=moved.footprint(0), uncertainty=uncertainty)
+        shift = np.array([[(previous_x - x) * share, (previous_y - y) * share]])
+        moved = shifted(FootprintBatch.from_footprints([current.footprint]), shift)
+        uncertainty = max(current.uncertainty, previous.uncertainty)
+        return replace(current, footprint=moved.footprint(0), uncertainty=uncertainty)
 
 
 def _members_in(term: Term, sample: Sample) -> Iterable[str]:
@@ -177,14 +177,15 @@ def _members_in(term: Term, sample: Sample) -> Iterable[str]:
         return (term.name,)  # type: ignore[union-attr]
     if not term.is_open:
         return named_members(term)
-    wanted, left_out = (term.class_name or "").casefold(), left_out_of(term)
+    group_class, left_out = (term.class_name or "").casefold(), left_out_of(term)
     classes = {name: tracked.class_name for name, tracked in sample.objects.items()} | dict(sample.unknown)
     return [
         name
         for name, class_name in classes.items()
-        if name not in left_out and (term.class_name == ANY_CLASS or (class_name or "").casefold() == wanted)
+        if name not in left_out
+        and (term.class_name == ANY_CLASS or (class_name or "").casefold() == group_class)
     ]
 
 
 def left_out_of(group: Group) -> frozenset[str]:
-    return frozenset(each.name for each in group.excluded)
+    return frozenset(term.name for term in group.excluded)

@@ -338,7 +338,7 @@ class TraceScene:
             return self._moved_back(term)
         base, source = self._base_and_source(term)
         if isinstance(base, RegionName):
-            return self._found_region(base, source < 0)
+            return self._resolve_region(base, source < 0)
         at = np.maximum(source, 0) if isinstance(term, Earlier) else slice(self.skip, None)
         if isinstance(base, Group):
             is_open = base.members is None
@@ -347,7 +347,7 @@ class TraceScene:
         else:
             rows = self._rows_of(base.name)[at, None]
             unknown = rows[:, 0] < 0
-        return self._found_rows(rows, unknown | (source < 0))
+        return self._resolve_rows(rows, unknown | (source < 0))
 
     def _moved_back(self, term: Earlier) -> ResolvedTerm:
         """Resolve a term as a rate looks back at it."""
@@ -384,11 +384,11 @@ class TraceScene:
         between = np.flatnonzero(is_there & (seconds > shortest))
         if len(between):
             now, then = current[between], before_rows[between]
-            rows[between] = self._add_moved(now, then, shortest[between] / seconds[between])
+            rows[between] = self._add_moved_rows(now, then, shortest[between] / seconds[between])
             spread[between] = np.maximum(uncertainty[now], uncertainty[then])
         return rows, spread
 
-    def _add_moved(self, now: Integers, then: Integers, share: Floats) -> Integers:
+    def _add_moved_rows(self, now: Integers, then: Integers, share: Floats) -> Integers:
         """Move some rows by a share of the way back to others; return their new rows."""
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
@@ -418,10 +418,10 @@ class TraceScene:
         if term.samples is not None:
             return term.term, np.asarray(np.maximum(now - term.samples, -1), np.int64)
         times = self.trace.times_ns
-        wanted = times[self.skip :] - (term.duration_ns or 0)
-        return term.term, np.searchsorted(times, wanted, side="right").astype(np.int64) - 1
+        source_times = times[self.skip :] - (term.duration_ns or 0)
+        return term.term, np.searchsorted(times, source_times, side="right").astype(np.int64) - 1
 
-    def _found_rows(self, rows: Integers, unknown: Booleans) -> ResolvedTerm:
+    def _resolve_rows(self, rows: Integers, unknown: Booleans) -> ResolvedTerm:
         seen = rows >= 0
         at = np.maximum(rows, 0)
         if len(self.trace.uncertainty) and seen.shape[1]:
@@ -435,7 +435,7 @@ class TraceScene:
             spread, yaw = np.zeros(len(rows)), np.full(len(rows), np.nan)
         return ResolvedTerm(Operand(rows), unknown, spread, yaw)
 
-    def _found_region(self, region: RegionName, unknown: Booleans) -> ResolvedTerm:
+    def _resolve_region(self, region: RegionName, unknown: Booleans) -> ResolvedTerm:
         row = len(self.trace.footprints) + list(self.regions).index(region.name)
         count = len(self)
         return ResolvedTerm(
@@ -461,15 +461,15 @@ class TraceScene:
         rows = self.trace.rows[:, [self._column[name] for name in names]]
         if group.class_name == ANY_CLASS or not names:
             return names, rows
-        wanted = (group.class_name or "").casefold()
-        fits = np.array([(name or "").casefold() == wanted for name in self.trace.classes], np.bool_)
+        group_class = (group.class_name or "").casefold()
+        fits = np.array([(name or "").casefold() == group_class for name in self.trace.classes], np.bool_)
         observation = np.where(rows < ABSENT, -2 - rows, np.maximum(rows, 0))
         if len(self.trace.class_code) == 0:
             return names, rows
         is_member = (rows != ABSENT) & fits[self.trace.class_code[observation]]
         ever = is_member.any(axis=0)
-        kept = tuple(name for name, is_kept in zip(names, ever.tolist(), strict=True) if is_kept)
-        return kept, np.where(is_member, rows, ABSENT)[:, ever]
+        member_names = tuple(name for name, is_kept in zip(names, ever.tolist(), strict=True) if is_kept)
+        return member_names, np.where(is_member, rows, ABSENT)[:, ever]
 
 
 def footprint_from_outline(outline: Outline) -> Footprint:

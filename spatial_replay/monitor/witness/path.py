@@ -19,7 +19,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import Contact, candidate_pairs, contact, enlarged, protrusion_contact
 from spatial_replay.monitor.atoms.instructions import closest_pair_of
-from spatial_replay.monitor.atoms.measurements import leaf_values, measured
+from spatial_replay.monitor.atoms.measurements import leaf_values, measurement_values
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.monitor.offline import OfflineNodes, is_closed, windows_of
 from spatial_replay.monitor.online.codes import low_and_high
@@ -690,7 +690,7 @@ def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
             single = _attaining(scene, part)
         case _:
             raise TypeError(f"{part!r} is no measurement")
-    (value,), (spread,) = (column[:, 0].tolist() for column in measured(scene, [single]))
+    (value,), (spread,) = (column[:, 0].tolist() for column in measurement_values(scene, [single]))
     return Measured(
         single.quantity, tuple(map(format_term, single.terms)), value, spread, _contact(scene, single)
     )
@@ -700,7 +700,7 @@ def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
     """Return the measurement of the members of groups that decide it."""
     singles = [_singles(scene, term) for term in part.terms]
     candidates = [part.with_terms(*terms) for terms in product(*singles)]
-    values, places = measured(scene, candidates)[0][:, 0], np.arange(len(candidates))
+    values, places = measurement_values(scene, candidates)[0][:, 0], np.arange(len(candidates))
     for members, side in zip(reversed(singles), reversed(part.extrema), strict=True):
         rows = values.reshape(-1, len(members))
         columns = (np.argmin if side == "min" else np.argmax)(rows, axis=1)
