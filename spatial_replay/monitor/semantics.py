@@ -77,13 +77,13 @@ def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: 
     if code == NEXT or (code > NEXT and rows[n, LOW] > 0):
         numbers[n], lost[n] = np.nan, 0
         return
-    operand = operands[first]
+    left = operands[first]
     if code in (EVENTUALLY, ALWAYS):
-        numbers[n], lost[n] = numbers[operand], lost[operand]
+        numbers[n], lost[n] = numbers[left], lost[left]
         return
     if code > ALWAYS:
-        other = operands[end - 1]
-        numbers[n], lost[n] = least(numbers[operand], numbers[other]), lost[operand] | lost[other]
+        right = operands[end - 1]
+        numbers[n], lost[n] = least(numbers[left], numbers[right]), lost[left] | lost[right]
         return
     _fold(code, operands[first:end], numbers, lost, n)
 
@@ -93,9 +93,9 @@ def _fold(code: int, operands: Integers, numbers: Floats, lost: Flags, n: int) -
     """Compute a Boolean node from its operands."""
     number, is_lost = numbers[operands[0]], lost[operands[0]]
     number = combine(code, number, number) if len(operands) == 1 else number
-    for each in operands[1:]:
-        number = combine(code, number, numbers[each])
-        is_lost |= lost[each]
+    for operand in operands[1:]:
+        number = combine(code, number, numbers[operand])
+        is_lost |= lost[operand]
     numbers[n], lost[n] = number, is_lost
 
 
@@ -104,18 +104,18 @@ def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: P
     """Compute a Boolean node at every sample, from its operands."""
     code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
     row = rows[n, COLUMN]
-    into, lost = memory.columns[row], memory.lost_columns[row]
-    other_row = rows[operands[first], COLUMN]
-    other, other_lost = memory.columns[other_row], memory.lost_columns[other_row]
+    target, target_lost = memory.columns[row], memory.lost_columns[row]
+    source_row = rows[operands[first], COLUMN]
+    source, source_lost = memory.columns[source_row], memory.lost_columns[source_row]
     for t in range(last + 1):
-        into[t] = combine(code, other[t], other[t]) if end - first == 1 else other[t]
-        lost[t] = other_lost[t]
-    for each in range(first + 1, end):
-        other_row = rows[operands[each], COLUMN]
-        other, other_lost = memory.columns[other_row], memory.lost_columns[other_row]
+        target[t] = combine(code, source[t], source[t]) if end - first == 1 else source[t]
+        target_lost[t] = source_lost[t]
+    for place in range(first + 1, end):
+        source_row = rows[operands[place], COLUMN]
+        source, source_lost = memory.columns[source_row], memory.lost_columns[source_row]
         for t in range(last + 1):
-            into[t] = combine(code, into[t], other[t])
-            lost[t] |= other_lost[t]
+            target[t] = combine(code, target[t], source[t])
+            target_lost[t] |= source_lost[t]
 
 
 @piece
@@ -184,13 +184,13 @@ def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: 
     """Update a temporal node that is needed at every sample, where its window was still open."""
     code = rows[n, CODE]
     row, inner = rows[n, COLUMN], rows[n, INNER]
-    into, into_lost = memory.columns[row], memory.lost_columns[row]
+    target, target_lost = memory.columns[row], memory.lost_columns[row]
     right_row = rows[operands[rows[n, END] - 1], COLUMN]
     right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
     if code == NEXT:
         for t in range(last):
-            into[t], into_lost[t] = right[t + 1], right_lost[t + 1]
-        into[last], into_lost[last] = np.nan, 0
+            target[t], target_lost[t] = right[t + 1], right_lost[t + 1]
+        target[last], target_lost[last] = np.nan, 0
         return
     low, high = rows[n, LOW], rows[n, HIGH]
     while high >= 0 and _apart(rows, n, memory.opens[n], last, memory) > high:
@@ -207,9 +207,9 @@ def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: 
         while start <= last and _apart(rows, n, t, start, memory) < low:
             start += 1
         if start <= last:
-            into[t], into_lost[t] = memory.columns[inner, start], memory.lost_columns[inner, start]
+            target[t], target_lost[t] = memory.columns[inner, start], memory.lost_columns[inner, start]
         else:
-            into[t], into_lost[t] = np.nan, 0
+            target[t], target_lost[t] = np.nan, 0
 
 
 @piece
@@ -218,17 +218,17 @@ def _scan_node(
 ) -> None:
     """Run the unbounded operator from each sample, from `start` on, to the last one."""
     code, inner = rows[n, CODE], rows[n, INNER]
-    into, into_lost = memory.columns[inner], memory.lost_columns[inner]
+    target, target_lost = memory.columns[inner], memory.lost_columns[inner]
     right_node, left_node = operands[rows[n, END] - 1], operands[rows[n, FIRST]]
     right_row, left_row = rows[right_node, COLUMN], rows[left_node, COLUMN]
     right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
     left, left_lost = memory.columns[left_row], memory.lost_columns[left_row]
     if code in (EVENTUALLY, ALWAYS):
-        scan(code == ALWAYS, right, right_lost, start, last, into, into_lost)
+        scan(code == ALWAYS, right, right_lost, start, last, target, target_lost)
     elif rows[left_node, IS_PLAIN]:
-        scan_until(left, left_lost, right, right_lost, start, last, into, into_lost)
+        scan_until(left, left_lost, right, right_lost, start, last, target, target_lost)
     elif rows[right_node, IS_PLAIN]:
-        scan_until_by_last(left, left_lost, right[last], right_lost[last], start, last, into, into_lost)
+        scan_until_by_last(left, left_lost, right[last], right_lost[last], start, last, target, target_lost)
     else:
         pair_starts, end = memory.pair_starts[rows[n, PAIRS]], memory.pair_end[0]
         pair_starts[last] = end - start
@@ -236,7 +236,7 @@ def _scan_node(
         row, lost_row = memory.pairs[end:], memory.lost_pairs[end:]
         scan(True, left[start:], left_lost[start:], 0, last - start, row, lost_row)
         scan_until_by_pairs(
-            memory.pairs, memory.lost_pairs, pair_starts, right, right_lost, start, last, into, into_lost
+            memory.pairs, memory.lost_pairs, pair_starts, right, right_lost, start, last, target, target_lost
         )
 
 
@@ -283,8 +283,8 @@ def step_paper(
             elif code >= NEXT:
                 _step_first(rows, operands, n, last, times_ns[k], memory)
             else:
-                own = operands[rows[n, FIRST] : rows[n, END]]
-                _fold(code, own, memory.value, memory.lost_value, n)
+                node_operands = operands[rows[n, FIRST] : rows[n, END]]
+                _fold(code, node_operands, memory.value, memory.lost_value, n)
             # adding zero turns -0.0 into 0.0, so that equal numbers are equal bits
             series[n, 0, k] = np.nan if memory.lost_value[n] else memory.value[n] + 0.0
             series[n, 1, k] = np.nan if memory.lost_now[n] else memory.now[n] + 0.0
@@ -333,39 +333,44 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
     has_column = _columns(nodes, is_plain)
     rows = np.zeros((len(nodes), WIDTH), np.int64)
     columns = pairs = begin = 0
-    for identifier, (node, own) in enumerate(nodes):
+    for identifier, (node, operand_ids) in enumerate(nodes):
         row = rows[identifier]
         row[[CODE, LEAF]] = _code(node, numbers)
-        row[[FIRST, END]] = begin, begin + len(own)
+        row[[FIRST, END]] = begin, begin + len(operand_ids)
         row[IS_PLAIN] = is_plain[identifier]
         row[[HIGH, COLUMN, INNER, PAIRS]] = NOTHING
-        begin += len(own)
+        begin += len(operand_ids)
         if has_column[identifier]:
             row[COLUMN], columns = columns, columns + 1
         if isinstance(node, Temporal):
             if node.bound is not None:
                 upper = NOTHING if node.bound.upper is None else node.bound.upper
                 row[[IS_IN_NS, LOW, HIGH]] = node.bound.unit == "ns", node.bound.lower, upper
-            is_until_nested = node.operator == "U" and not is_plain[own[-1]]
+            is_until_nested = node.operator == "U" and not is_plain[operand_ids[-1]]
             if has_column[identifier] and row[LOW] == 0 and row[HIGH] == NOTHING:
                 row[INNER] = row[COLUMN]
             elif has_column[identifier] or is_until_nested:
                 row[INNER], columns = columns, columns + 1
-            if has_column[identifier] and is_until_nested and not is_plain[own[0]]:
+            if has_column[identifier] and is_until_nested and not is_plain[operand_ids[0]]:
                 row[PAIRS], pairs = pairs, pairs + 1
-    return PaperTable(rows, np.array([i for _, own in nodes for i in own], np.int64), columns, pairs)
+    return PaperTable(
+        rows,
+        np.array([operand_id for _, operand_ids in nodes for operand_id in operand_ids], np.int64),
+        columns,
+        pairs,
+    )
 
 
 def _columns(nodes: Sequence[tuple[Formula, Sequence[int]]], is_plain: Sequence[bool]) -> list[bool]:
     """Return which nodes are needed at all samples; parents come before their operands."""
-    wanted = [False] * len(nodes)
+    needs_column = [False] * len(nodes)
     for identifier, (node, operands) in enumerate(nodes):
         for operand in operands:
             if isinstance(node, Temporal):
-                wanted[operand] = wanted[identifier] or not is_plain[operand]
+                needs_column[operand] = needs_column[identifier] or not is_plain[operand]
             else:
-                wanted[operand] = wanted[identifier] and not is_plain[identifier]
-    return wanted
+                needs_column[operand] = needs_column[identifier] and not is_plain[identifier]
+    return needs_column
 
 
 def _code(node: Formula, leaves: Mapping[object, int]) -> tuple[int, int]:
@@ -382,47 +387,47 @@ def _code(node: Formula, leaves: Mapping[object, int]) -> tuple[int, int]:
 
 
 @inlined
-def least(one: float, other: float) -> float:
+def least(first: float, second: float) -> float:
     """Return the lesser number, of those not left out; NaN if both are."""
-    if np.isnan(one):
-        return other
-    if np.isnan(other):
-        return one
-    return min(one, other)
+    if np.isnan(first):
+        return second
+    if np.isnan(second):
+        return first
+    return min(first, second)
 
 
 @inlined
-def most(one: float, other: float) -> float:
+def most(first: float, second: float) -> float:
     """Return the greater number, of those not left out; NaN if both are."""
-    if np.isnan(one):
-        return other
-    if np.isnan(other):
-        return one
-    return max(one, other)
+    if np.isnan(first):
+        return second
+    if np.isnan(second):
+        return first
+    return max(first, second)
 
 
 @inlined
-def pick(is_least: bool, one: float, other: float) -> float:
+def pick(is_least: bool, first: float, second: float) -> float:
     """Return `least` or `most` of two numbers."""
-    return least(one, other) if is_least else most(one, other)
+    return least(first, second) if is_least else most(first, second)
 
 
 @inlined
-def combine(code: int, one: float, other: float) -> float:
+def combine(code: int, first: float, second: float) -> float:
     """Apply a Boolean operator; for one operand, both are that operand."""
     if code == codes.REPORT_AND:
-        return least(one, other)
+        return least(first, second)
     if code == codes.REPORT_OR:
-        return most(one, other)
+        return most(first, second)
     if code == codes.REPORT_NOT:
-        return -one
+        return -first
     if code == codes.REPORT_IMPLIES:
-        return most(-one, other)
+        return most(-first, second)
     if code == codes.REPORT_XOR:
-        return most(least(one, -other), least(-one, other))
+        return most(least(first, -second), least(-first, second))
     if code == codes.REPORT_IFF:
-        return least(most(-one, other), most(-other, one))
-    return one
+        return least(most(-first, second), most(-second, first))
+    return first
 
 
 @piece
@@ -439,20 +444,20 @@ def total(
 
 @piece
 def scan(
-    is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, into: Floats, into_lost: Flags
+    is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, target: Floats, target_lost: Flags
 ) -> None:
     """Compute, from each sample from `first` on, the least or greatest number up to `last`."""
     result, is_lost = np.nan, 0
     for t in range(last, first - 1, -1):
         result = pick(is_least, result, numbers[t])
         is_lost |= lost[t]
-        into[t], into_lost[t] = result, is_lost
+        target[t], target_lost[t] = result, is_lost
 
 
 @piece
 def scan_until(
     left: Floats, left_lost: Flags, right: Floats, right_lost: Flags,
-    first: int, last: int, into: Floats, into_lost: Flags,
+    first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
     """Run until from each sample from `first` on to `last`; the left operand depends on no later sample.
 
@@ -461,47 +466,47 @@ def scan_until(
     """
     best, is_lost, is_any_left_out = np.nan, 0, False
     for t in range(last, first - 1, -1):
-        here = least(right[t], left[t])
+        end_value = least(right[t], left[t])
         if not np.isnan(left[t]):
             if is_any_left_out:
                 best = left[t]
             elif not np.isnan(best):
                 best = min(left[t], best)
             is_any_left_out = False
-        if np.isnan(here):
+        if np.isnan(end_value):
             is_any_left_out = True
-        best = most(best, here)
+        best = most(best, end_value)
         is_lost |= left_lost[t] | right_lost[t]
-        into[t], into_lost[t] = best, is_lost
+        target[t], target_lost[t] = best, is_lost
 
 
 @piece
 def scan_until_by_last(
     left: Floats, left_lost: Flags, right: float, right_lost: int,
-    first: int, last: int, into: Floats, into_lost: Flags,
+    first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
     """Run until from each sample to `last`, given until to the sample before it."""
-    still, is_lost = np.nan, right_lost
-    into[last], into_lost[last] = np.nan, 0
+    least_left, is_lost = np.nan, right_lost
+    target[last], target_lost[last] = np.nan, 0
     for t in range(last, first - 1, -1):
-        still = least(still, left[t])
+        least_left = least(least_left, left[t])
         is_lost |= left_lost[t]
-        into[t] = most(into[t], least(right, still))
-        into_lost[t] |= is_lost
+        target[t] = most(target[t], least(right, least_left))
+        target_lost[t] |= is_lost
 
 
 @piece
 def scan_until_by_pairs(
-    still: Floats, still_lost: Flags, starts: Integers, right: Floats, right_lost: Flags,
-    first: int, last: int, into: Floats, into_lost: Flags,
+    least_left: Floats, least_left_lost: Flags, starts: Integers, right: Floats, right_lost: Flags,
+    first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
     """Run until from each sample to `last`, given the least left operand for each beginning and end."""
-    into[first : last + 1], into_lost[first : last + 1] = np.nan, 0
+    target[first : last + 1], target_lost[first : last + 1] = np.nan, 0
     for end in range(first, last + 1):
         for t in range(first, end + 1):
-            at = starts[end] + t
-            into[t] = most(into[t], least(right[end], still[at]))
-            into_lost[t] |= right_lost[end] | still_lost[at]
+            place = starts[end] + t
+            target[t] = most(target[t], least(right[end], least_left[place]))
+            target_lost[t] |= right_lost[end] | least_left_lost[place]
 
 
 _TILE = 256
@@ -590,10 +595,10 @@ class PaperRun:
             )
         if pairs:
             used = int(memory.pair_end[0])
-            wanted = used + pairs * samples * (samples - self._position)
+            required_length = used + pairs * samples * (samples - self._position)
             self._check_pairs(used, self._position)
-            if wanted > len(memory.pairs):
-                more = max(wanted, min(2 * used, self._max_pairs)) - len(memory.pairs)
+            if required_length > len(memory.pairs):
+                more = max(required_length, min(2 * used, self._max_pairs)) - len(memory.pairs)
                 memory = memory._replace(
                     pairs=_longer(memory.pairs, more), lost_pairs=_longer(memory.lost_pairs, more)
                 )
@@ -690,8 +695,8 @@ def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -
         UsageError: an unknown name, or an operator without a meaning.
     """
     if name not in get_args(Semantics):
-        known = " and ".join(repr(each) for each in get_args(Semantics))
-        raise UsageError(f"no semantics {name!r}; there are {known}")
+        choices = " and ".join(repr(choice) for choice in get_args(Semantics))
+        raise UsageError(f"no semantics {name!r}; there are {choices}")
     if name == "paper":
         for specification in specifications:
             check_operators(specification)
