@@ -101,14 +101,14 @@ class SignalTable:
         """Whether any row looks at more than the newest sample."""
         return any(row[0] in (*codes.RINGS, codes.DELAY) for row in self._rows)
 
-    def array(self, kept: Iterable[int]) -> Integers:
+    def array(self, kept_rows: Iterable[int]) -> Integers:
         """Return the table (S, SIGNAL_WIDTH), with its rings numbered.
 
         Args:
             kept: the rows that parts look at behind the newest sample.
         """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
-        looked_at = set(kept)
+        looked_at = set(kept_rows)
         for row in self._rows:
             if row[0] in (*codes.RINGS, codes.DELAY):
                 looked_at.update(_operands_of_row(row))
@@ -122,7 +122,7 @@ class SignalTable:
         """Return the row of a formula without future operators."""
         formula = expand(formula)
         if id(formula) not in self._added:
-            operands = [self.add(each) for each in operands_of(formula)]
+            operands = [self.add(operand) for operand in operands_of(formula)]
             self._added[id(formula)] = formula, self._added_row(formula, operands)
         return self._added[id(formula)][1]
 
@@ -185,7 +185,7 @@ class SignalTable:
             result = self.row(codes.AND, within, result)
         return result
 
-    def elapsed(self, unit: int, distance: int, sign: int) -> int:
+    def infinity_after(self, unit: int, distance: int, sign: int) -> int:
         """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
         return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
 
@@ -248,7 +248,7 @@ class PartRows:
         result: list[Row] = []
         for *fields, is_variable in self._rows:
             has_table = fields[0] in _RECURRENT_PAST
-            below = any(result[each][-1] for each in operand_rows(*fields[:3]))
+            below = any(result[operand_row][-1] for operand_row in operand_rows(*fields[:3]))
             result.append(
                 (
                     *fields,
@@ -304,12 +304,12 @@ class PartRows:
             formula, positive = expand(formula.operands[0]), not positive
         key = (id(formula), positive)
         if key not in self._added:
-            self._added[key] = formula, self._built(formula, positive)
+            self._added[key] = formula, self._build(formula, positive)
         return self._added[key][1]
 
-    def _built(self, formula: Formula, positive: bool) -> int:
+    def _build(self, formula: Formula, positive: bool) -> int:
         if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
-            operands = [self._add(each, positive) for each in formula.operands]
+            operands = [self._add(operand, positive) for operand in formula.operands]
             if isinstance(formula, Boolean):
                 is_both = (formula.operator == "and") == positive
                 return reduce(partial(self._join, is_both=is_both), operands)
@@ -324,15 +324,15 @@ class PartRows:
         left, right, bound = _as_until(operator, operands, bound)
         # in its polarity the node is an until or a release, the negation of an until
         is_until = (operator != "G") == positive
-        return self._bounded(left, right, *window_of(bound), is_until=is_until)
+        return self._bounded_until(left, right, *window_of(bound), is_until=is_until)
 
-    def _bounded(
+    def _bounded_until(
         self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
     ) -> int:
         """Add until or release over a window, by the identity that `SignalTable` uses for since."""
         weak = int(not is_until)
-        own, other = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
-        within = None if high is None else self.row(own, right, 0, weak, unit, low, high)
+        right_code, left_code = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
+        within = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
         if within is not None and left == NOTHING:
             return within
         code = codes.UNTIL if is_until else codes.RELEASE
@@ -340,7 +340,7 @@ class PartRows:
         if low > 0 or high is not None:
             running = self.row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
         if low > 0 and left != NOTHING:
-            before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
+            before = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
             running = self._join(before, running, is_both=is_until)
         return running if within is None else self._join(within, running, is_both=is_until)
 
@@ -351,15 +351,15 @@ class PartRows:
         left, right = (NOTHING, operands[0]) if operator in ("O", "H") else operands
         is_since = (operator in ("O", "S")) == positive
         weak = int(not is_since)
-        own, other = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
-        within = None if high is None else self.row(own, right, 0, weak, unit, low, high)
+        right_code, left_code = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
+        within = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
         if within is not None and left == NOTHING:
             return within
         result = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
         if low > 0:
             result = self.row(codes.PAST_DELAY, result, 0, weak, unit, low)
             if left != NOTHING:
-                before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
+                before = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
                 result = self._join(before, result, is_both=is_since)
         return result if within is None else self._join(within, result, is_both=is_since)
 
@@ -374,26 +374,26 @@ class PartRows:
             return self._ending(formula.operands[0], not positive)
         if not isinstance(formula, Temporal):
             # W is U or G
-            sides = [self._ending(each, positive) for each in operands_of(formula)]
+            sides = [self._ending(operand, positive) for operand in operands_of(formula)]
             return reduce(partial(self._join, is_both=not positive), sides)
-        operands = [self._add(each, positive) for each in formula.operands]
+        operands = [self._add(operand, positive) for operand in formula.operands]
         left, body, bound = _as_until(formula.operator, operands, formula.bound)
         unit, low, high = window_of(bound)
         is_until = (formula.operator != "G") == positive
         sign = -1 if is_until else 1
         if low > 0:
-            body = self._join(body, self._elapsed(unit, low, -sign), is_both=is_until)
+            body = self._join(body, self._infinity_after(unit, low, -sign), is_both=is_until)
         if high is not None:
-            end = self._elapsed(unit, high, sign)
+            end = self._infinity_after(unit, high, sign)
             left = end if left == NOTHING else self._join(left, end, is_both=is_until)
             if high < LAST:
-                body = self._join(body, self._elapsed(unit, high + 1, sign), is_both=is_until)
+                body = self._join(body, self._infinity_after(unit, high + 1, sign), is_both=is_until)
         code = codes.UNTIL if is_until else codes.RELEASE
         return self.row(code, left, body, int(not is_until), variable=True)
 
-    def _elapsed(self, unit: int, distance: int, sign: int) -> int:
+    def _infinity_after(self, unit: int, distance: int, sign: int) -> int:
         """Return the row of an infinity that changes its sign a distance from the first sample on."""
-        return self.row(codes.LITERAL, self._signals.elapsed(unit, distance, sign))
+        return self.row(codes.LITERAL, self._signals.infinity_after(unit, distance, sign))
 
 
 def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[int, int, Bound | None]:
@@ -460,25 +460,25 @@ def known_bounds(rows: tuple[Row, ...]) -> int:
     great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
     The table then says what follows from what has closed, if the same holds for all of its variables.
     """
-    way = _direction_of(rows)
-    if way is None:
+    direction = _direction_of(rows)
+    if direction is None:
         return 0
     # whether a node is as great as can be in the best continuation
     outdone: list[bool] = []
     for code, a, b, *_ in rows:
-        if code == way.either:
+        if code == direction.either:
             outdone.append(outdone[a] or outdone[b])
-        elif code == way.both:
+        elif code == direction.both:
             outdone.append(outdone[a] and outdone[b])
-        elif code == way.until:
+        elif code == direction.until:
             outdone.append(a == NOTHING or outdone[a] or outdone[b])
         else:
-            outdone.append(code == way.release and outdone[b])
+            outdone.append(code == direction.release and outdone[b])
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
-    known = 1 << way.worst if rows[-1][codes.NODE_A] == NOTHING else 0
+    bounds = 1 << direction.worst if rows[-1][codes.NODE_A] == NOTHING else 0
     if all(outdone[node] for node in variables):
-        known |= 1 << way.best
-    return known
+        bounds |= 1 << direction.best
+    return bounds
 
 
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
@@ -486,22 +486,28 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
 
     That is as if the run ended with the newest sample: an operator that looks ahead finds nothing after it.
     """
-    found = list[tuple[bool, bool]]()
+    node_directions = list[tuple[bool, bool]]()
     for code, a, b, weak, *_ in rows:
-        below = [found[each] for each in operand_rows(code, a, b)]
+        below = [node_directions[operand] for operand in operand_rows(code, a, b)]
         rises, falls = all(up for up, _ in below), all(down for _, down in below)
         if code in (codes.UNTIL, codes.RELEASE, codes.SHIFT):
             rises, falls = rises and not weak, falls and bool(weak)
-        found.append((rises and code != codes.PART_WINDOW_MIN, falls and code != codes.PART_WINDOW_MAX))
-    return found
+        node_directions.append(
+            (rises and code != codes.PART_WINDOW_MIN, falls and code != codes.PART_WINDOW_MAX)
+        )
+    return node_directions
 
 
 def is_monotone(rows: tuple[Row, ...]) -> bool:
     """Return whether what a root joins by the minimum never falls, or the other way round."""
-    way = _direction_of(rows)
-    if way is None or rows[-1][codes.NODE_A] != NOTHING or any(row[codes.NODE_DEPENDS] for row in rows[:-1]):
+    direction = _direction_of(rows)
+    if (
+        direction is None
+        or rows[-1][codes.NODE_A] != NOTHING
+        or any(row[codes.NODE_DEPENDS] for row in rows[:-1])
+    ):
         return False
-    return directions(rows)[rows[-1][codes.NODE_B]][0 if way is _BY_MINIMUM else 1]
+    return directions(rows)[rows[-1][codes.NODE_B]][0 if direction is _BY_MINIMUM else 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -557,14 +563,14 @@ def compile_formula(formula: Formula) -> Program:
         parts=array_of_rows([rows[-1] for rows in parts.rows], codes.NODE_WIDTH),
         part_rows=tuple(array_of_rows(rows, codes.NODE_WIDTH) for rows in parts.rows),
         reports=report_rows,
-        rows=_joined_rows(signal_rows, parts.rows, report_rows, operand_ids),
+        rows=_join_rows(signal_rows, parts.rows, report_rows, operand_ids),
         windows=signals.windows,
         table_size=parts.table_size,
         keeps_history=signals.keeps_history or parts.keeps_history,
     )
 
 
-def _joined_rows(
+def _join_rows(
     signals: Integers, parts: Sequence[Sequence[Row]], reports: Integers, operands: Sequence[int]
 ) -> Integers:
     """Return the rows of a program (see `Program`)."""
@@ -573,16 +579,16 @@ def _joined_rows(
     reports_at = parts_at + len(parts)
     operands_at = reports_at + len(reports)
     first = operands_at + -(-len(operands) // width)
-    rows = np.zeros((first + sum(len(own) - 1 for own in parts), width), np.int64)
+    rows = np.zeros((first + sum(len(part_rows) - 1 for part_rows in parts), width), np.int64)
     rows[0, :7] = 1, len(signals), parts_at, len(parts), reports_at, len(reports), operands_at
     rows[1:parts_at, : codes.SIGNAL_WIDTH] = signals
     rows[reports_at:operands_at, : codes.REPORT_WIDTH] = reports
     rows[operands_at:first].reshape(-1)[: len(operands)] = operands
-    for number, own in enumerate(parts):
-        rows[first : first + len(own) - 1] = array_of_rows(own[:-1], width)
-        rows[parts_at + number, : len(own[-1])] = own[-1]
-        rows[parts_at + number, [codes.PART_FIRST, codes.PART_END]] = first, first + len(own) - 1
-        first += len(own) - 1
+    for number, part_rows in enumerate(parts):
+        rows[first : first + len(part_rows) - 1] = array_of_rows(part_rows[:-1], width)
+        rows[parts_at + number, : len(part_rows[-1])] = part_rows[-1]
+        rows[parts_at + number, [codes.PART_FIRST, codes.PART_END]] = first, first + len(part_rows) - 1
+        first += len(part_rows) - 1
     return rows
 
 
@@ -599,18 +605,18 @@ class _Parts:
         self.keeps_history = False
         self.literals = set[int]()
         self.rows: list[tuple[Row, ...]] = []
-        self._built: dict[tuple[tuple[Row, ...], bool], int] = {}
+        self._number_of: dict[tuple[tuple[Row, ...], bool], int] = {}
 
     def add(self, node: Temporal, signals: SignalTable) -> int:
         """Add the part of a node that looks ahead, and return its number."""
         part = part_of(signals, node)
-        nodes = tuple(_looked_up(row, signals) for row in part.rows())
+        nodes = tuple(_with_signal_row(row, signals) for row in part.rows())
         has_now = node.operator not in FUTURE_OPERATORS
         key = nodes, has_now
-        if key not in self._built:
-            self._built[key] = len(self.rows)
+        if key not in self._number_of:
+            self._number_of[key] = len(self.rows)
             self.rows.append((*_with_times(nodes), self._own_row(nodes, part, has_now=has_now)))
-        return self._built[key]
+        return self._number_of[key]
 
     def _own_row(self, nodes: tuple[Row, ...], part: PartRows, *, has_now: bool) -> Row:
         row = (
@@ -643,7 +649,7 @@ def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
         timed += is_timed
 
 
-def _looked_up(row: Row, signals: SignalTable) -> Row:
+def _with_signal_row(row: Row, signals: SignalTable) -> Row:
     """Return a row whose numbers, if it is a literal, are those of a signal."""
     code, signal, is_negated, *rest = row
     if code != codes.LITERAL or not is_negated:

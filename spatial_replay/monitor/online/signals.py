@@ -26,7 +26,7 @@ HEAD, TAIL, ENTERING, RING = range(4)
 
 
 @inlined
-def _delayed(times: Integers, unit: int, place: int, distance: int) -> int:
+def _delay_place(times: Integers, unit: int, place: int, distance: int) -> int:
     """Return the last place at least a distance behind another; a negative one if there is none.
 
     Times are compared by their differences, which fit where a time plus the distance might not.
@@ -61,7 +61,7 @@ def _distance(times: Integers, unit: int, place: int, later: int) -> int:
 
 @piece
 def _slide(
-    rows: Integers, row: int, history: Floats, channel: int, own: int, times: Integers, offset: int,
+    rows: Integers, row: int, history: Floats, channel: int, target: int, times: Integers, offset: int,
     begin: int, count: int,
 ) -> None:  # fmt: skip
     """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it."""
@@ -70,8 +70,8 @@ def _slide(
     sign = 1.0 if rows[row, codes.SIGNAL_CODE] == codes.WINDOW_MAX else -1.0
     ring, size = 1 + 4 * rows[row, codes.SIGNAL_WINDOW] + channel, times.shape[1] - RING
     head, tail, entering = times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING]
-    for here in range(begin, begin + count):
-        while entering <= offset + here and _distance(times, unit, entering - offset, here) >= near:
+    for place in range(begin, begin + count):
+        while entering <= offset + place and _distance(times, unit, entering - offset, place) >= near:
             number = sign * history[channel, a, entering - offset]
             while tail > head:
                 newest = times[ring, RING + (tail - 1) % size] - offset
@@ -85,10 +85,10 @@ def _slide(
         while tail > head:
             oldest = times[ring, RING + head % size] - offset
             # what is forgotten is farther than any window reaches
-            if oldest >= 0 and _distance(times, unit, oldest, here) <= far:
+            if oldest >= 0 and _distance(times, unit, oldest, place) <= far:
                 break
             head += 1
-        history[channel, own, here] = history[channel, a, oldest] if tail > head else -sign * np.inf
+        history[channel, target, place] = history[channel, a, oldest] if tail > head else -sign * np.inf
     times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING] = head, tail, entering
 
 
@@ -105,13 +105,13 @@ def run_signals(
         times: of the recent samples, and then a ring for each sliding window and channel.
         memory: (4, …), every signal at the last sample, and then at the first one, by channel.
     """
-    offset, channels, number, end = (
+    offset, channels, signal_count, end = (
         position - begin,
         leaves.shape[0],
         rows[0, codes.HEAD_SIGNALS],
         begin + count,
     )
-    for s in range(number):
+    for s in range(signal_count):
         row = rows[0, codes.HEAD_SIGNALS_AT] + s
         code, a, b = rows[row, codes.SIGNAL_CODE], rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_B]
         unit, low, high = (
@@ -145,21 +145,21 @@ def run_signals(
                     history[c, s, k] = value
             elif code == codes.DELAY:
                 for k in range(begin, end):
-                    at = _delayed(times, unit, k, low)
-                    history[c, s, k] = history[c, a, at] if at >= 0 else high * np.inf
+                    place = _delay_place(times, unit, k, low)
+                    history[c, s, k] = history[c, a, place] if place >= 0 else high * np.inf
             elif code == codes.ELAPSED:
                 for k in range(begin, end):
-                    elapsed = offset + k if unit == codes.SAMPLES else times[0, k] - start_ns
-                    history[c, s, k] = high * (np.inf if elapsed >= low else -np.inf)
+                    distance = offset + k if unit == codes.SAMPLES else times[0, k] - start_ns
+                    history[c, s, k] = high * (np.inf if distance >= low else -np.inf)
             else:
                 _slide(rows, row, history, c, s, times, offset, begin, count)
             memory[c, s] = history[c, s, end - 1]
             if position == 0:
-                memory[c, number + s] = history[c, s, begin]
+                memory[c, signal_count + s] = history[c, s, begin]
 
 
-# rows that a part works with, after one for each of its nodes; what it says comes after them
-VALUES, FRESH, POINT, SAYS = range(4)
+# rows that a part works with, after one for each of its nodes; its results come after them
+VALUES, FRESH, POINT, RESULTS = range(4)
 EXTRA_ROWS = 6
 
 
@@ -207,24 +207,24 @@ def _fill_columns(
 ) -> None:  # fmt: skip
     """Compute the nodes that depend on no variable, over some samples."""
     for d in range(end - first):
-        row, own = first + d, top + d
+        row, target = first + d, top + d
         code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], top + rows[row, codes.NODE_B]
         if code == codes.LITERAL:
             for k in range(count):
-                work[own, k] = history[channel, a, begin + k]
+                work[target, k] = history[channel, a, begin + k]
         elif not rows[row, codes.NODE_DEPENDS]:
             if code == codes.PART_AND:
                 for k in range(count):
-                    work[own, k] = min(work[top + a, k], work[b, k])
+                    work[target, k] = min(work[top + a, k], work[b, k])
             elif code == codes.PART_OR:
                 for k in range(count):
-                    work[own, k] = max(work[top + a, k], work[b, k])
+                    work[target, k] = max(work[top + a, k], work[b, k])
 
 
 @inlined
 def _run_simple(
     rows: Integers, root: int, end_corner: int, memory: Floats, channel: int, table: int, work: Floats,
-    top: int, says: int, count: int,
+    top: int, first_result: int, count: int,
 ) -> None:  # fmt: skip
     """Run a part that is a single until or release: a table of two numbers."""
     low, high = memory[channel, table], memory[channel, table + 1]
@@ -237,8 +237,8 @@ def _run_simple(
         else:
             least, most = min(right, work[top + a, k]) if has_left else -np.inf, right
         low, high = max(low, min(least, high)), max(low, min(most, high))
-        work[says + 1, k], work[says + 2, k] = low, high
-        work[says, k] = high if end_corner else low
+        work[first_result + 1, k], work[first_result + 2, k] = low, high
+        work[first_result, k] = high if end_corner else low
     memory[channel, table], memory[channel, table + 1] = low, high
 
 
@@ -256,28 +256,30 @@ def run_table(
         position: of the first of the `count` samples; they stand at `begin` in the history.
 
     Returns:
-        The first of the rows of `work` that say what it is, and its lower and upper bound.
+        The first of the rows of `work` with its value, its lower and its upper bound.
     """
     first, end = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
     variables, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]
     nodes, corners, root = end - first, 1 << variables, rows[end - 1, codes.NODE_CODE]
-    values, fresh, point, says = (
+    values, fresh, point, first_result = (
         top + nodes + VALUES,
         top + nodes + FRESH,
         top + nodes + POINT,
-        top + nodes + SAYS,
+        top + nodes + RESULTS,
     )
     if position == 0:
         _start(rows, first, end, corners, memory, channel, table, work, values)
     elif memory[channel, table] == memory[channel, table + corners - 1]:
         # it no longer changes
         for k in range(count):
-            work[says, k] = work[says + 1, k] = work[says + 2, k] = memory[channel, table]
-        return int(says)
+            work[first_result, k] = work[first_result + 1, k] = work[first_result + 2, k] = memory[
+                channel, table
+            ]
+        return int(first_result)
     _fill_columns(rows, first, end, history, channel, begin, count, work, top)
     if variables == 1 and root in (codes.UNTIL, codes.RELEASE):
-        _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, says, count)
-        return int(says)
+        _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, first_result, count)
+        return int(first_result)
     for k in range(count):
         for d in range(nodes):
             # what depends on no variable is the same at every corner
@@ -303,6 +305,9 @@ def run_table(
             work[fresh, corner] = read_table(memory, channel, table, variables, work, point)
         for corner in range(corners):
             memory[channel, table + corner] = work[fresh, corner]
-        work[says, k] = memory[channel, table + end_corner]
-        work[says + 1, k], work[says + 2, k] = memory[channel, table], memory[channel, table + corners - 1]
-    return int(says)
+        work[first_result, k] = memory[channel, table + end_corner]
+        work[first_result + 1, k], work[first_result + 2, k] = (
+            memory[channel, table],
+            memory[channel, table + corners - 1],
+        )
+    return int(first_result)

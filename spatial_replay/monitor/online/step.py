@@ -34,7 +34,7 @@ from spatial_replay.monitor.online.windows import run_windows
 NUMBERS = 8
 """Rows of numbers of a node, or of a part."""
 SERIES = 4
-"""Rows that a run says of a node: value, now, lower and upper."""
+"""Rows of results of a node: value, now, lower and upper."""
 
 
 @inlined
@@ -53,8 +53,8 @@ def _channel(row: int, channels: int) -> int:
 
 
 @inlined
-def said_in(mode: int, channel: int, channels: int) -> int:
-    """Return the row for what a part says in a channel, as `OPEN_END`, … say; -1 for none."""
+def result_row(mode: int, channel: int, channels: int) -> int:
+    """Return the row of a part's result in a channel, for a mode such as `OPEN_END`; -1 for none."""
     if channels == 1:
         return 0 if mode == codes.OPEN_END else 1 + mode
     if mode == codes.OPEN_END:
@@ -63,35 +63,35 @@ def said_in(mode: int, channel: int, channels: int) -> int:
 
 
 @inlined
-def _combine(code: int, one: float, one_mirror: float, two: float, two_mirror: float) -> float:
+def _combine(code: int, left: float, left_mirror: float, right: float, right_mirror: float) -> float:
     """Return the lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
     if code == codes.REPORT_XOR:
-        return max(min(one, -two_mirror), min(-one_mirror, two))
+        return max(min(left, -right_mirror), min(-left_mirror, right))
     if code == codes.REPORT_IMPLIES:
-        return max(-one_mirror, two)
-    return min(max(-one_mirror, two), max(-two_mirror, one))
+        return max(-left_mirror, right)
+    return min(max(-left_mirror, right), max(-right_mirror, left))
 
 
 @inlined
-def _join(code: int, work: Floats, into: int, other: int, count: int) -> None:
+def _join(code: int, work: Floats, target: int, source: int, count: int) -> None:
     if code == codes.REPORT_AND:
         for k in range(count):
-            work[into, k] = min(work[into, k], work[other, k])
+            work[target, k] = min(work[target, k], work[source, k])
     else:
         for k in range(count):
-            work[into, k] = max(work[into, k], work[other, k])
+            work[target, k] = max(work[target, k], work[source, k])
 
 
 @inlined
-def _copy(work: Floats, source: int, into: int, count: int) -> None:
+def _copy(work: Floats, source: int, target: int, count: int) -> None:
     for k in range(count):
-        work[into, k] = work[source, k]
+        work[target, k] = work[source, k]
 
 
 @inlined
-def _fill(work: Floats, into: int, value: float, count: int) -> None:
+def _fill(work: Floats, target: int, value: float, count: int) -> None:
     for k in range(count):
-        work[into, k] = value
+        work[target, k] = value
 
 
 @piece
@@ -108,7 +108,7 @@ def report(
     """
     first, number = rows[0, codes.HEAD_REPORTS_AT], rows[0, codes.HEAD_REPORTS]
     operands, width = rows[0, codes.HEAD_OPERANDS_AT], rows.shape[1]
-    own, used = NUMBERS * rows[0, codes.HEAD_PARTS], SERIES if channels == 1 else NUMBERS
+    nodes_at, row_count = NUMBERS * rows[0, codes.HEAD_PARTS], SERIES if channels == 1 else NUMBERS
     for n in range(number - 1, -1, -1):
         row = first + n
         code, index, rule = (
@@ -116,41 +116,45 @@ def report(
             rows[row, codes.REPORT_INDEX],
             rows[row, codes.REPORT_RULE],
         )
-        start, stop, one, two = rows[row, codes.REPORT_FIRST], rows[row, codes.REPORT_END], 0, 0
+        start, stop, left, right = rows[row, codes.REPORT_FIRST], rows[row, codes.REPORT_END], 0, 0
         if stop > start:
-            one = own + NUMBERS * rows[operands + start // width, start % width]
-            two = own + NUMBERS * rows[operands + (stop - 1) // width, (stop - 1) % width]
-        for r in range(used):
-            into, part, mirror = own + NUMBERS * n + r, NUMBERS * index + r, _mirror(r, channels)
+            left = nodes_at + NUMBERS * rows[operands + start // width, start % width]
+            right = nodes_at + NUMBERS * rows[operands + (stop - 1) // width, (stop - 1) % width]
+        for r in range(row_count):
+            target, part, mirror = nodes_at + NUMBERS * n + r, NUMBERS * index + r, _mirror(r, channels)
             channel, is_now = _channel(r, channels), r == 1 if channels == 1 else r in (2, 3)
             if is_now and code == codes.REPORT_SIGNAL:
                 for k in range(count):
-                    work[into, k] = history[channel, index, begin + k]
+                    work[target, k] = history[channel, index, begin + k]
             elif code == codes.REPORT_SIGNAL:  # settled by the first sample
-                _fill(work, into, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
+                _fill(work, target, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
             elif code == codes.REPORT_PART:
                 if not is_now or rule == codes.NOW_OF_PART:
-                    _copy(work, part, into, count)
+                    _copy(work, part, target, count)
                 elif rule in (codes.NOW_LAST_OPERAND, codes.NOW_EITHER):
-                    _copy(work, two + r, into, count)
+                    _copy(work, right + r, target, count)
                     if rule == codes.NOW_EITHER:
-                        _join(codes.REPORT_OR, work, into, one + r, count)
+                        _join(codes.REPORT_OR, work, target, left + r, count)
                 else:
-                    _fill(work, into, np.inf if rule == codes.NOW_TRUE else -np.inf, count)
+                    _fill(work, target, np.inf if rule == codes.NOW_TRUE else -np.inf, count)
             elif code == codes.REPORT_NOT:
                 for k in range(count):
-                    work[into, k] = -work[one + mirror, k]
+                    work[target, k] = -work[left + mirror, k]
             elif code in (codes.REPORT_AND, codes.REPORT_OR, codes.REPORT_SPEC):
-                _copy(work, one + r, into, count)
-                for each in range(start + 1, stop):
-                    other = own + NUMBERS * rows[operands + each // width, each % width]
-                    _join(code, work, into, other + r, count)
+                _copy(work, left + r, target, count)
+                for place in range(start + 1, stop):
+                    operand = nodes_at + NUMBERS * rows[operands + place // width, place % width]
+                    _join(code, work, target, operand + r, count)
             else:
                 for k in range(count):
-                    work[into, k] = _combine(
-                        code, work[one + r, k], work[one + mirror, k], work[two + r, k], work[two + mirror, k]
+                    work[target, k] = _combine(
+                        code,
+                        work[left + r, k],
+                        work[left + mirror, k],
+                        work[right + r, k],
+                        work[right + mirror, k],
                     )
-    _write_series(work, own, own + NUMBERS * number, number, channels, count)
+    _write_series(work, nodes_at, nodes_at + NUMBERS * number, number, channels, count)
 
 
 @inlined
@@ -161,16 +165,16 @@ def _write_series(work: Floats, first: int, series: int, number: int, channels: 
     """
     for n in range(number):
         for r in range(SERIES):
-            into, source = series + SERIES * n + r, first + NUMBERS * n + r
+            target, source = series + SERIES * n + r, first + NUMBERS * n + r
             if channels > 1 and r < 2:
                 source += r
                 for k in range(count):
                     low, high = work[source, k], work[source + 1, k]
-                    work[into, k] = low + 0.0 if low == high else np.nan
+                    work[target, k] = low + 0.0 if low == high else np.nan
             else:
                 source += 0 if channels == 1 else 2
                 for k in range(count):
-                    work[into, k] = work[source, k] + 0.0
+                    work[target, k] = work[source, k] + 0.0
 
 
 TILE = 1024
@@ -210,17 +214,17 @@ def run_samples(
             part = rows[0, codes.HEAD_PARTS_AT] + p
             table = 2 * signals + rows[part, codes.PART_TABLE_START]
             for channel in range(channels if rows[part, codes.PART_KIND] == codes.TABLE else 0):
-                says = run_table(
+                first_result = run_table(
                     rows, part, history, channel, memory, table, work, top, position, begin, count
                 )
                 for mode in range(3):
-                    row = said_in(mode, channel, channels)
+                    row = result_row(mode, channel, channels)
                     if row >= 0:
                         for k in range(count):
-                            work[NUMBERS * p + row, k] = work[says + mode, k]
+                            work[NUMBERS * p + row, k] = work[first_result + mode, k]
                 if channels > 1 and channel >= channels - 2:
                     for k in range(count):
-                        work[NUMBERS * p + 6 + (channel & 1), k] = work[says, k]
+                        work[NUMBERS * p + 6 + (channel & 1), k] = work[first_result, k]
     if phases & FINISH:
         report(rows, history, memory, work, channels, begin, count)
 
@@ -279,24 +283,24 @@ class _OpenPart:
 
     def copy(self, room: int) -> _OpenPart:
         """Return a part of the same state, with columns that are not known yet."""
-        copied = _OpenPart(self.rows, room)
-        copied.tables[:] = self.tables
-        copied.state[windows.HEAD, : windows.ENTERED] = self.state[windows.HEAD, : windows.ENTERED]
-        copied.state[windows.LOWS : windows.STARTS, : self._nodes] = self.state[
+        part = _OpenPart(self.rows, room)
+        part.tables[:] = self.tables
+        part.state[windows.HEAD, : windows.ENTERED] = self.state[windows.HEAD, : windows.ENTERED]
+        part.state[windows.LOWS : windows.STARTS, : self._nodes] = self.state[
             windows.LOWS : windows.STARTS, : self._nodes
         ]
-        return copied
+        return part
 
-    def forget(self, moved: int) -> None:
+    def forget(self, drop_count: int) -> None:
         """Have positions count from a later sample."""
         head = self.state[windows.HEAD]
-        head[windows.OFFSET] += moved
-        head[windows.BASE] -= moved
+        head[windows.OFFSET] += drop_count
+        head[windows.BASE] -= drop_count
         head[windows.ENTERED :] = 0
         head[windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
-        self.state[[windows.LOWS, windows.BOUNDARY], : self._nodes] -= moved
+        self.state[[windows.LOWS, windows.BOUNDARY], : self._nodes] -= drop_count
         self.state[windows.STATE, : self._nodes] -= np.where(
-            self.state[windows.STATE, : self._nodes] < 0, 0, moved
+            self.state[windows.STATE, : self._nodes] < 0, 0, drop_count
         )
 
     @property
@@ -361,7 +365,7 @@ class OnlineRun:
             for number, rows in enumerate(self._program.part_rows)
             if rows[-1, codes.PART_KIND] == codes.WINDOWED
         ]
-        self._see_history()
+        self._refresh_views()
 
     def __len__(self) -> int:
         """Return how many samples were added."""
@@ -388,31 +392,33 @@ class OnlineRun:
         Raises:
             ValueError: the shapes do not fit; kernels would read beyond the arrays.
         """
-        wanted = len(self._program.leaves), len(times_ns)
-        if leaves.shape[1:] != wanted or len(leaves) not in (1, 2, 4):
-            raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{wanted})")
+        shape = len(self._program.leaves), len(times_ns)
+        if leaves.shape[1:] != shape or len(leaves) not in (1, 2, 4):
+            raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{shape})")
         self.widen(len(leaves))
         leaves = np.array(in_channels(leaves, self._channels), np.float64, order="C")
-        series, done = empty((len(self._program.reports), SERIES, len(times_ns))), 0
-        while done < len(times_ns):
-            count = self._make_room(min(self._tile, len(times_ns) - done))
-            self._add(leaves, times_ns[done : done + count], done, count)
-            series[:, :, done : done + count] = self._series[:, :, :count]
-            done += count
+        series, begin = empty((len(self._program.reports), SERIES, len(times_ns))), 0
+        while begin < len(times_ns):
+            count = self._make_room(min(self._tile, len(times_ns) - begin))
+            self._add(leaves, times_ns[begin : begin + count], begin, count)
+            series[:, :, begin : begin + count] = self._series[:, :, :count]
+            begin += count
         return series
 
     def widen(self, channels: int) -> None:
         """Have at least so many channels: each begins as the one that it was equal to."""
         if channels <= self._channels:
             return
-        before, self._channels = self._channels, channels
+        old_channels, self._channels = self._channels, channels
         for state in (self._history, self._memory, self._rings().swapaxes(0, 1)):
-            if before == 1:
+            if old_channels == 1:
                 state[1] = state[0]
             state[2:] = state[:2]
         for _, parts in self._open:
-            parts += [parts[channel % before].copy(self.room) for channel in range(before, channels)]
-        self._see_history()
+            parts += [
+                parts[channel % old_channels].copy(self.room) for channel in range(old_channels, channels)
+            ]
+        self._refresh_views()
 
     def add_sample(self, room: SampleRoom, first_leaf: int, time_ns: int) -> Floats:
         """Add one sample; return value, now, lower and upper of each node, (N, 4).
@@ -476,24 +482,24 @@ class OnlineRun:
                 self._run_open(number, channel, part, begin, count)
 
     def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
-        """Run a part in one channel, and enter what it says."""
+        """Run a part in one channel, and store its results."""
         channels, is_high = self._channels, channel & 1
         bounds = 3 if channels == 1 else 1 << is_high if channel >= channels - 2 else 0
         run_windows(
             part.rows, self._channel_history[channel], self._stamps, part.columns, part.state, part.tables,
             begin, count, bounds,
         )  # fmt: skip
-        says = part.columns[-SERIES:, :count]
+        results = part.columns[-SERIES:, :count]
         rows = self._work[NUMBERS * number : NUMBERS * (number + 1), :count]
         if channels == 1:
-            rows[:SERIES] = says
+            rows[:SERIES] = results
             return
         if channel < 2:
-            rows[is_high], rows[2 + is_high] = says[0], says[windows.SAID_NOW]
+            rows[is_high], rows[2 + is_high] = results[0], results[windows.RESULT_NOW]
         if bounds:
-            rows[4 + is_high], rows[6 + is_high] = says[2 + is_high], says[0]
+            rows[4 + is_high], rows[6 + is_high] = results[2 + is_high], results[0]
 
-    def _see_history(self) -> None:
+    def _refresh_views(self) -> None:
         """Take views of the recent samples, and all arrays that `run_sample` takes."""
         self._stamps = self._times[0, : self.room]
         self._arrays = self._program.rows, self._history, self._times, self._memory, self._work
@@ -503,63 +509,63 @@ class OnlineRun:
         """Return the rings of sliding windows, (W, CHANNELS, …)."""
         return self._times[1:].reshape(-1, CHANNELS, self._times.shape[1])
 
-    def _make_room(self, wanted: int) -> int:
+    def _make_room(self, requested: int) -> int:
         """Make room for at least one of the wanted samples; return for how many."""
         if not self._program.keeps_history:
-            return min(wanted, self.room)
+            return min(requested, self.room)
         used = self._position - self._offset
-        if used + wanted > self.room:
-            moved = self._kept_from() if used else 0
-            if 2 * moved >= self.room:
-                self._forget(moved, used - moved)
-                used -= moved
+        if used + requested > self.room:
+            drop_count = self._kept_from() if used else 0
+            if 2 * drop_count >= self.room:
+                self._forget(drop_count, used - drop_count)
+                used -= drop_count
             elif used == self.room:
                 self._grow()
-        return min(wanted, self.room - used)
+        return min(requested, self.room - used)
 
     def _kept_from(self) -> int:
         """Return the first of the recent samples that anything may still look at after the newest one."""
         last = self._position - self._offset - 1
-        keep, stamps = last, self._stamps[: last + 1]
+        first_needed, stamps = last, self._stamps[: last + 1]
         for code, _, _, unit, low, high, *_ in self._program.signals.tolist():
             if code not in (codes.DELAY, *codes.RINGS):
                 continue
             far = low if code == codes.DELAY else high
             if unit == codes.SAMPLES:
-                keep = min(keep, last - far)
+                first_needed = min(first_needed, last - far)
             else:
                 behind = stamps[last] - stamps
-                keep = min(keep, int(np.count_nonzero(behind > far)) - (code == codes.DELAY))
+                first_needed = min(first_needed, int(np.count_nonzero(behind > far)) - (code == codes.DELAY))
         for _, parts in self._open:
             for part in parts:
-                kept = part.kept_from
-                keep = keep if kept is None else min(keep, kept)
-        return max(keep, 0)
+                part_start = part.kept_from
+                first_needed = first_needed if part_start is None else min(first_needed, part_start)
+        return max(first_needed, 0)
 
-    def _forget(self, moved: int, kept: int) -> None:
+    def _forget(self, drop_count: int, keep_count: int) -> None:
         """Drop the oldest samples, which nothing looks at again."""
-        self._stamps[:kept] = self._stamps[moved : moved + kept].copy()
+        self._stamps[:keep_count] = self._stamps[drop_count : drop_count + keep_count].copy()
         signals = np.flatnonzero(self._program.signals[:, codes.SIGNAL_IS_KEPT])
         for signal in signals.tolist():
             recent = self._history[: self._channels, signal]
-            recent[:, :kept] = recent[:, moved : moved + kept].copy()
+            recent[:, :keep_count] = recent[:, drop_count : drop_count + keep_count].copy()
         for _, parts in self._open:
             for part in parts:
-                part.forget(moved)
-        self._offset += moved
+                part.forget(drop_count)
+        self._offset += drop_count
 
     def _grow(self) -> None:
         """Have room for twice as many recent samples."""
-        old, self.room = self.room, 2 * self.room
+        old_room, self.room = self.room, 2 * self.room
         history = np.zeros((*self._history.shape[:2], self.room))
-        history[: self._channels, :, :old] = self._history[: self._channels]
+        history[: self._channels, :, :old_room] = self._history[: self._channels]
         times = np.zeros((len(self._times), self.room + RING), np.int64)
-        times[0, :old] = self._stamps
+        times[0, :old_room] = self._stamps
         for ring, grown in zip(self._times[1:], times[1:], strict=True):
             entries = np.arange(ring[HEAD], ring[TAIL])
             grown[[HEAD, TAIL, ENTERING]] = ring[[HEAD, TAIL, ENTERING]]
-            grown[RING + entries % self.room] = ring[RING + entries % old]
+            grown[RING + entries % self.room] = ring[RING + entries % old_room]
         self._history, self._times = history, times
         for _, parts in self._open:
             parts[:] = [part.copy(self.room) for part in parts]
-        self._see_history()
+        self._refresh_views()

@@ -38,9 +38,9 @@ SEEN = SETS + 1
 """Sets of columns before the copies that windows keep of their operands' columns."""
 EXTRA = SEEN + SETS
 """Sets of columns before the extra rows."""
-# rows of columns after those of the nodes: what blocks are joined to, room for `_slide`, and what a part says
-JOINED, BEFORE, SAYS = 0, SETS, SETS + 1
-SAID_NOW = 1
+# rows of columns after those of the nodes: joined blocks, room for `_slide`, and the results of a part
+JOINED, BEFORE, RESULTS = 0, SETS, SETS + 1
+RESULT_NOW = 1
 """The row of a part's value at the newest sample, after its value at the first one and before its bounds."""
 EXTRA_ROWS = SETS + 5
 
@@ -64,8 +64,8 @@ def better(is_greatest: bool, first: float, second: float) -> float:
 
 
 @inlined
-def _outdoes(is_greatest: bool, value: float, other: float) -> bool:
-    return value > other if is_greatest else value < other
+def _outdoes(is_greatest: bool, value: float, rival: float) -> bool:
+    return value > rival if is_greatest else value < rival
 
 
 @inlined
@@ -162,9 +162,7 @@ def _first_starting(
 
 
 @inlined
-def _first_unclosed(
-    state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last: int
-) -> int:
+def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last: int) -> int:
     """Return the first position whose window ahead a later sample may fall into."""
     _, unit, _, far, times = window
     if unit == codes.SAMPLES:
@@ -180,24 +178,24 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
         if rows[d, codes.NODE_TIMED] < 0:
             continue
         is_ahead, _, near, far, times = window_of(rows, d)
-        begun, closed = state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS]
+        next_begin, next_close = state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS]
         for position in range(state[HEAD, ENTERED], last + 1):
             time_ns = stamps[position]
             if is_ahead:
                 state[times, position] = state[times + 1, position] = _NEVER
-                while begun <= position and time_ns - stamps[begun] >= near:
-                    state[times, begun] = position
-                    begun += 1
-                while far >= 0 and closed < position and time_ns - stamps[closed] > far:
-                    state[times + 1, closed] = position
-                    closed += 1
+                while next_begin <= position and time_ns - stamps[next_begin] >= near:
+                    state[times, next_begin] = position
+                    next_begin += 1
+                while far >= 0 and next_close < position and time_ns - stamps[next_close] > far:
+                    state[times + 1, next_close] = position
+                    next_close += 1
             else:
-                while begun < position and time_ns - stamps[begun] > far:
-                    begun += 1
-                while closed <= position and time_ns - stamps[closed] >= near:
-                    closed += 1
-                state[times, position], state[times + 1, position] = begun, closed
-        state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS] = begun, closed
+                while next_begin < position and time_ns - stamps[next_begin] > far:
+                    next_begin += 1
+                while next_close <= position and time_ns - stamps[next_close] >= near:
+                    next_close += 1
+                state[times, position], state[times + 1, position] = next_begin, next_close
+        state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS] = next_begin, next_close
     state[HEAD, ENTERED] = last + 1
 
 
@@ -207,7 +205,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
 @inlined
 def _slide(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    child: int, own: int, before: int, begin: int, end: int, last: int,
+    child: int, column: int, scratch: int, begin: int, end: int, last: int,
 ) -> int:  # fmt: skip
     """Compute extrema over windows at begin … end - 1; return the first that changes, last + 1 for none.
 
@@ -229,17 +227,17 @@ def _slide(
             while at > start:
                 at -= 1
                 value = better(is_greatest, value, columns[child, at])
-            columns[before, position - begin] = value
+            columns[scratch, position - begin] = value
         value = nothing
         for position in range(begin, stop):
             after = _after(state, window, position, last)
             while middle < after:
                 value = better(is_greatest, value, columns[child, middle])
                 middle += 1
-            number = better(is_greatest, columns[before, position - begin], value)
-            if changed > last and columns[own, position] != number:
+            number = better(is_greatest, columns[scratch, position - begin], value)
+            if changed > last and columns[column, position] != number:
                 changed = position
-            columns[own, position] = number
+            columns[column, position] = number
         begin = stop
     return changed
 
@@ -247,7 +245,7 @@ def _slide(
 @inlined
 def _run_open(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    child: int, own: int, begin: int, changed: int, last: int, is_fresh: bool,
+    child: int, column: int, begin: int, changed: int, last: int, is_fresh: bool,
 ) -> int:  # fmt: skip
     """Bring windows up that reach to the last sample, backwards as far as they change; return the first.
 
@@ -255,7 +253,7 @@ def _run_open(
     """
     value, is_same = -np.inf if is_greatest else np.inf, False
     for position in range(begin if is_fresh else last, last + 1):
-        columns[own, position] = value
+        columns[column, position] = value
     # after those that have begun
     position, at = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
     while position > begin and not is_same:
@@ -264,25 +262,25 @@ def _run_open(
         if at <= last and extremum(is_greatest, columns, child, first, at, value) == value:
             # as much as the one after them
             start = _start(state, window, position - 1, last)
-            is_same = not is_fresh and start <= changed and columns[own, position - 1] == value
+            is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
             for k in range(position if is_same else stop, position):
-                columns[own, k] = value
+                columns[column, k] = value
             position, at = position if is_same else stop, first
         while position > stop and not is_same:
             start = _start(state, window, position - 1, last)
             while at > start:
                 at -= 1
                 value = better(is_greatest, value, columns[child, at])
-            is_same = not is_fresh and start <= changed and columns[own, position - 1] == value
+            is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
             if not is_same:
                 position -= 1
-                columns[own, position] = value
+                columns[column, position] = value
     return position
 
 
 @inlined
-def _unchanged(
-    is_greatest: bool, columns: Floats, child: int, own: int, seen: int, changed: int, changed_end: int,
+def _changing_windows(
+    is_greatest: bool, columns: Floats, child: int, column: int, seen: int, changed: int, changed_end: int,
     begin: int, end: int,
 ) -> tuple[int, int]:  # fmt: skip
     """Leave windows out that hold something better than all that has changed, before and after it did.
@@ -294,19 +292,19 @@ def _unchanged(
     if changed >= changed_end:
         begin = end
     if begin < end:
-        before = extremum(is_greatest, columns, seen, changed, changed_end, nothing)
-        after = extremum(is_greatest, columns, child, changed, changed_end, nothing)
-        worst = extremum(not is_greatest, columns, own, begin, end, -nothing)
-        if _outdoes(is_greatest, worst, before) and not _outdoes(is_greatest, after, worst):
+        old_extremum = extremum(is_greatest, columns, seen, changed, changed_end, nothing)
+        new_extremum = extremum(is_greatest, columns, child, changed, changed_end, nothing)
+        worst = extremum(not is_greatest, columns, column, begin, end, -nothing)
+        if _outdoes(is_greatest, worst, old_extremum) and not _outdoes(is_greatest, new_extremum, worst):
             begin = end
         while begin < end and (
-            _outdoes(is_greatest, columns[own, begin], before)
-            and not _outdoes(is_greatest, after, columns[own, begin])
+            _outdoes(is_greatest, columns[column, begin], old_extremum)
+            and not _outdoes(is_greatest, new_extremum, columns[column, begin])
         ):
             begin += 1
         while begin < end and (
-            _outdoes(is_greatest, columns[own, end - 1], before)
-            and not _outdoes(is_greatest, after, columns[own, end - 1])
+            _outdoes(is_greatest, columns[column, end - 1], old_extremum)
+            and not _outdoes(is_greatest, new_extremum, columns[column, end - 1])
         ):
             end -= 1
     return begin, end
@@ -319,15 +317,15 @@ def _run_window(
 ) -> tuple[int, int]:  # fmt: skip
     """Bring the column of a bounded operator up; return between which positions it changes."""
     code, window, lowest, nodes = rows[d, codes.NODE_CODE], window_of(rows, d), state[LOWS, d], len(rows) - 1
-    child, own = mode * nodes + rows[d, codes.NODE_A], mode * nodes + d
+    child, column = mode * nodes + rows[d, codes.NODE_A], mode * nodes + d
     changed, changed_end = state[CHANGED, rows[d, codes.NODE_A]], state[CHANGED_END, rows[d, codes.NODE_A]]
-    seen, is_ahead = SEEN * nodes + own, window[0]
+    seen, is_ahead = SEEN * nodes + column, window[0]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     # whether what may come outdoes all that an open window holds
     is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
     tail = last + 1
     if is_decided:
-        tail = _first_unclosed(state, stamps, window, last)
+        tail = _first_open(state, stamps, window, last)
     elif is_ahead:
         tail = _first_holding(state, window, last, last)
     begin, tail = lowest, min(max(tail, lowest), last + 1)
@@ -339,19 +337,23 @@ def _run_window(
         if is_decided and last > 0:
             closing = min(max(_first_holding(state, window, last - 1, last), lowest), tail)
         end = min(_first_starting(state, window, changed_end, last), closing)
-        begin, end = _unchanged(is_greatest, columns, child, own, seen, changed, changed_end, begin, end)
+        begin, end = _changing_windows(
+            is_greatest, columns, child, column, seen, changed, changed_end, begin, end
+        )
         if closing < tail:
             begin, end = closing if begin >= end else begin, tail
     if is_ahead:
         for k in range(changed, changed_end):
             columns[seen, k] = columns[child, k]
         columns[seen, last] = columns[child, last]
-    first = _slide(is_greatest, window, state, columns, child, own, EXTRA * nodes + BEFORE, begin, end, last)
+    first = _slide(
+        is_greatest, window, state, columns, child, column, EXTRA * nodes + BEFORE, begin, end, last
+    )
     if is_decided:
         for position in range(tail if is_fresh else max(tail, last), last + 1):
-            columns[own, position] = beyond(mode, 0)
+            columns[column, position] = beyond(mode, 0)
     elif tail <= last:
-        opened = _run_open(is_greatest, window, state, columns, child, own, tail, changed, last, is_fresh)
+        opened = _run_open(is_greatest, window, state, columns, child, column, tail, changed, last, is_fresh)
         if opened < last:
             first, end = min(first, opened), last
     return (lowest, last) if is_fresh else (first, min(end, last))
@@ -359,8 +361,8 @@ def _run_window(
 
 @inlined
 def _run_since(
-    strong: bool, has_left: bool, columns: Floats, left: int, right: int, own: int, value: float, begin: int,
-    last: int,
+    strong: bool, has_left: bool, columns: Floats, left: int, right: int, column: int, value: float,
+    begin: int, last: int,
 ) -> int:  # fmt: skip
     """Run a since or trigger forwards from a value before `begin`; return the first position that changes."""
     changes, is_same = begin, True
@@ -368,9 +370,9 @@ def _run_since(
         if has_left:
             value = better(not strong, columns[left, k], value)
         value = better(strong, columns[right, k], value)
-        is_same = is_same and k < last and columns[own, k] == value
+        is_same = is_same and k < last and columns[column, k] == value
         changes += is_same
-        columns[own, k] = value
+        columns[column, k] = value
     return changes
 
 
@@ -410,11 +412,11 @@ def _bring_up(
     nodes, first = len(rows) - 1, mode * (len(rows) - 1)
     for d in range(nodes if has_column(rows) else nodes - 1):
         code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
-        own, begin, end, lowest = first + d, last, last, state[LOWS, d]
+        column, begin, end, lowest = first + d, last, last, state[LOWS, d]
         if code == codes.LITERAL:
             begin = lowest if is_fresh else last
             for k in range(begin, last + 1):
-                columns[own, k] = history[a, k]
+                columns[column, k] = history[a, k]
         elif code in (codes.PART_AND, codes.PART_OR):
             is_or, left, right = code == codes.PART_OR, first + a, first + b
             begin = max(min(state[CHANGED, a], state[CHANGED, b]), lowest)
@@ -422,17 +424,21 @@ def _bring_up(
             while (
                 begin < end
                 and not is_fresh
-                and better(is_or, columns[left, begin], columns[right, begin]) == columns[own, begin]
+                and better(is_or, columns[left, begin], columns[right, begin]) == columns[column, begin]
             ):
                 begin += 1
-            one, two, target = columns[left, begin:end], columns[right, begin:end], columns[own, begin:end]
+            left_values, right_values, values = (
+                columns[left, begin:end],
+                columns[right, begin:end],
+                columns[column, begin:end],
+            )
             if is_or:
-                for k in range(len(target)):
-                    target[k] = max(one[k], two[k])
+                for k in range(len(values)):
+                    values[k] = max(left_values[k], right_values[k])
             else:
-                for k in range(len(target)):
-                    target[k] = min(one[k], two[k])
-            columns[own, last] = better(is_or, columns[left, last], columns[right, last])
+                for k in range(len(values)):
+                    values[k] = min(left_values[k], right_values[k])
+            columns[column, last] = better(is_or, columns[left, last], columns[right, last])
         elif code in (codes.UNTIL, codes.RELEASE):
             left, right, strong = first + max(a, 0), first + b, code == codes.UNTIL
             changed, begin = state[CHANGED, b], last + 1
@@ -443,25 +449,25 @@ def _bring_up(
                 if a >= 0:
                     value = better(not strong, columns[left, begin - 1], value)
                 value = better(strong, columns[right, begin - 1], value)
-                is_same = not is_fresh and begin <= min(changed, last) and columns[own, begin - 1] == value
+                is_same = not is_fresh and begin <= min(changed, last) and columns[column, begin - 1] == value
                 if not is_same:
                     begin -= 1
-                    columns[own, begin] = value
+                    columns[column, begin] = value
             if rows[d, codes.NODE_VARIABLE] >= 0:
-                _set_point(rows, d, state, columns, own, mode, last, tables)
+                _set_point(rows, d, state, columns, column, mode, last, tables)
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
             left, right, start = first + max(a, 0), first + b, state[STATE, d]
             value, begin = _start_of_past(rows, d, state, tables), min(state[CHANGED, b], last)
             if a >= 0:
                 begin = min(begin, state[CHANGED, a])
             # what its table says follows what is to come, if that matters to its operands
-            if start >= 0 and (is_fresh or columns[own, start] != value):
-                columns[own, start], begin = value, start
+            if start >= 0 and (is_fresh or columns[column, start] != value):
+                columns[column, start], begin = value, start
             begin = start + 1 if is_fresh else max(begin, start + 1)
             if begin > start + 1:
-                value = columns[own, begin - 1]
+                value = columns[column, begin - 1]
             changed = _run_since(
-                code == codes.PAST_SINCE, a >= 0, columns, left, right, own, value, begin, last
+                code == codes.PAST_SINCE, a >= 0, columns, left, right, column, value, begin, last
             )
             begin = lowest if is_fresh else changed
         elif code in (codes.SHIFT, codes.PAST_DELAY):
@@ -475,7 +481,7 @@ def _bring_up(
                 begin = max(min(_first_holding(state, window, state[CHANGED, a], last), last), lowest)
             for k in range(begin, last + 1):
                 at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
-                columns[own, k] = columns[child, at] if 0 <= at <= last else missing
+                columns[column, k] = columns[child, at] if 0 <= at <= last else missing
         else:
             begin, end = _run_window(rows, d, stamps, state, columns, mode, last, is_fresh)
         if begin >= end:
@@ -492,19 +498,19 @@ def _bring_up(
                 )
 
 
-# --------------------------------------------------------------------------------------- what a part says
+# ------------------------------------------------------------------------------------- the results of a part
 
 
 @inlined
-def _joined(
+def _join_blocks(
     is_until: bool, columns: Floats, body: int, joined: int, value: float, begin: int, end: int
 ) -> float:
     """Join a number with those at begin … end - 1, most of which are joined in blocks."""
-    whole, after = begin // BLOCK + 1, end // BLOCK
-    begun = min(whole * BLOCK, end)
-    value = extremum(is_until, columns, body, begin, begun, value)
-    value = extremum(is_until, columns, joined, whole, after, value)
-    return extremum(is_until, columns, body, max(begun, after * BLOCK), end, value)
+    first_block, block_end = begin // BLOCK + 1, end // BLOCK
+    blocks_begin = min(first_block * BLOCK, end)
+    value = extremum(is_until, columns, body, begin, blocks_begin, value)
+    value = extremum(is_until, columns, joined, first_block, block_end, value)
+    return extremum(is_until, columns, body, max(blocks_begin, block_end * BLOCK), end, value)
 
 
 @inlined
@@ -517,7 +523,7 @@ def _at_first(
     value = beyond(mode, rows[root, codes.NODE_WEAK])
     if not has_column(rows):
         is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, first + rows[root, codes.NODE_B]
-        value = _joined(is_until, columns, body, EXTRA * nodes + JOINED + mode, value, base, last + 1)
+        value = _join_blocks(is_until, columns, body, EXTRA * nodes + JOINED + mode, value, base, last + 1)
     elif base <= last:
         value = columns[first + root, base]
     if state[HEAD, IS_BEGUN]:
@@ -547,42 +553,44 @@ def run_windows(
         rows: (D + 1, NODE_WIDTH), the part's nodes, and the part itself.
         history: (S, room), the signals in the channel.
         stamps: (room,), the times of the recent samples.
-        columns: (EXTRA * D + EXTRA_ROWS, room); the last four rows receive what the part says.
+        columns: (EXTRA * D + EXTRA_ROWS, room); the last four rows receive the results of the part.
         state: see `HEAD`.
         tables: (2 T + 2, …): the part's table and those of its past operators, room for the next ones, a
             point at which tables are read, and what past operators start from.
         bounds: 1 to compute the lower bound, 2 for the upper one, 3 for both.
     """
     nodes = len(rows) - 1
-    root, says = nodes - 1, EXTRA * nodes + SAYS
+    root, first_result = nodes - 1, EXTRA * nodes + RESULTS
     is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
     corners, has_now = 1 << rows[nodes, codes.PART_VARIABLES], rows[nodes, codes.PART_HAS_NOW] > 0
     for k in range(count):
         last = begin + k
         if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corners - 1]:
             # it is the same whatever is still to come
-            columns[says, k] = columns[says + 2, k] = columns[says + 3, k] = tables[0, 0]
+            columns[first_result, k] = columns[first_result + 2, k] = columns[first_result + 3, k] = tables[
+                0, 0
+            ]
             continue
         if state.shape[0] > STARTS:
             _enter(rows, stamps, state, last)
         for mode in range(SETS):
-            into = says + mode + (mode != codes.OPEN_END)
+            result_row = first_result + mode + (mode != codes.OPEN_END)
             if mode != codes.OPEN_END and not bounds >> (mode - 1) & 1:
                 continue
             if mode != codes.OPEN_END and _is_known(rows, state, mode):
                 corner = 0 if mode == codes.OPEN_LOW else corners - 1
-                columns[into, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
+                columns[result_row, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
                 continue
             is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
             state[HEAD, KNOWN + mode] = last
             if is_fresh:
                 find_lows(rows, state, stamps, last)
             _bring_up(rows, history, stamps, columns, state, tables, mode, last, is_fresh)
-            columns[into, k] = _at_first(rows, columns, state, tables, mode, last)
+            columns[result_row, k] = _at_first(rows, columns, state, tables, mode, last)
         if has_now and has_column(rows):
-            columns[says + SAID_NOW, k] = columns[root, last]
+            columns[first_result + RESULT_NOW, k] = columns[root, last]
         elif has_now:
-            columns[says + SAID_NOW, k] = better(
+            columns[first_result + RESULT_NOW, k] = better(
                 is_until,
                 columns[rows[root, codes.NODE_B], last],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
@@ -620,13 +628,13 @@ def _reach(
             continue
         window = window_of(rows, d)
         if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
-            is_closed = is_closed and high < _first_unclosed(state, stamps, window, last)
+            is_closed = is_closed and high < _first_open(state, stamps, window, last)
             high = _after(state, window, high, last) - 1
         elif code == codes.SHIFT:
             shifted = _start(state, window, high, last)
             is_closed = is_closed and shifted <= last
-            wanted = _after(state, window, high, last) - 1 if window[3] >= 0 else shifted
-            high = min(max(shifted, wanted), last)
+            farthest = _after(state, window, high, last) - 1 if window[3] >= 0 else shifted
+            high = min(max(shifted, farthest), last)
         elif code in (codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN):
             low = _start(state, window, min(low, last), last)
         elif code == codes.PAST_DELAY:
@@ -655,18 +663,18 @@ def _run_corner(
 ) -> None:
     """Run what depends on a variable or a table, at `LOW` … `HIGH`, at one corner of the table."""
     nodes = len(rows) - 1
-    point, corners = 2 * rows[nodes, codes.PART_TABLES], SETS * nodes
+    point, corner_columns = 2 * rows[nodes, codes.PART_TABLES], SETS * nodes
     for d in range(nodes):
         if not rows[d, codes.NODE_DEPENDS]:
             continue
         code, a, b = rows[d, codes.NODE_CODE], max(rows[d, codes.NODE_A], 0), rows[d, codes.NODE_B]
         has_left, low, high = rows[d, codes.NODE_A] >= 0, state[LOW, d], state[HIGH, d]
-        left = corners + a if rows[a, codes.NODE_DEPENDS] else a
-        right = corners + b if rows[b, codes.NODE_DEPENDS] else b
-        own = corners + d
+        left = corner_columns + a if rows[a, codes.NODE_DEPENDS] else a
+        right = corner_columns + b if rows[b, codes.NODE_DEPENDS] else b
+        column = corner_columns + d
         if code in (codes.PART_AND, codes.PART_OR):
             for k in range(low, high + 1):
-                columns[own, k] = better(code == codes.PART_OR, columns[left, k], columns[right, k])
+                columns[column, k] = better(code == codes.PART_OR, columns[left, k], columns[right, k])
         elif code in (codes.UNTIL, codes.RELEASE):
             variable, strong, start = rows[d, codes.NODE_VARIABLE], code == codes.UNTIL, -np.inf
             if variable >= 0 and corner >> variable & 1:
@@ -676,24 +684,26 @@ def _run_corner(
                 if has_left:
                     value = better(not strong, columns[left, k], value)
                 value = better(strong, columns[right, k], value)
-                columns[own, k] = value
+                columns[column, k] = value
             if variable >= 0:
                 boundary = state[BOUNDARY, d]
-                tables[point, variable] = columns[own, boundary] if boundary <= high else start
+                tables[point, variable] = columns[column, boundary] if boundary <= high else start
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
             value = _start_of_past(rows, d, state, tables)
             tables[point + 1, rows[d, codes.NODE_TABLE]] = value
             begin = state[STATE, d] + 1
-            _run_since(code == codes.PAST_SINCE, has_left, columns, left, right, own, value, begin, high)
+            _run_since(code == codes.PAST_SINCE, has_left, columns, left, right, column, value, begin, high)
         elif code in (codes.SHIFT, codes.PAST_DELAY):
             window, missing = window_of(rows, d), beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK])
             for k in range(low, high + 1):
                 at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
-                columns[own, k] = columns[left, at] if 0 <= at <= last else missing
+                columns[column, k] = columns[left, at] if 0 <= at <= last else missing
         else:
             is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-            before = EXTRA * nodes + BEFORE
-            _slide(is_greatest, window_of(rows, d), state, columns, left, own, before, low, high + 1, last)
+            scratch = EXTRA * nodes + BEFORE
+            _slide(
+                is_greatest, window_of(rows, d), state, columns, left, column, scratch, low, high + 1, last
+            )
 
 
 @piece
@@ -743,7 +753,7 @@ def _absorb(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
     """Move the base over every position whose windows have all closed, many at a time."""
-    size, before = CLOSING, state[HEAD, BASE]
+    size, old_base = CLOSING, state[HEAD, BASE]
     while size > 0:
         base = state[HEAD, BASE]
         if base + size > last + 1 or not _reach(rows, state, stamps, base, base + size - 1, last):
@@ -758,5 +768,5 @@ def _absorb(
         state[HEAD, BASE], state[HEAD, IS_BEGUN] = base + size, 1
     if rows[len(rows) - 1, codes.PART_IS_MONOTONE] and state[HEAD, IS_BEGUN]:
         _pass_outdone(rows, columns, state, tables, last)
-    if state[HEAD, BASE] > before:
+    if state[HEAD, BASE] > old_base:
         find_lows(rows, state, stamps, last)
