@@ -10,7 +10,8 @@ Equal footprints give equal bits, in either order and in any batch.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Final, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -20,8 +21,25 @@ from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel, p
 from spatial_replay.geometry.arrays import Floats, Integers
 
 SIGNED_DISTANCE, PROTRUSION = 0, 1
-MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
-CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
+MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = range(100, 106)
+CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = range(106, 110)
+QUANTITY_CODES: Final[Mapping[str, int]] = MappingProxyType(
+    {
+        "signed_distance": SIGNED_DISTANCE,
+        "protrusion": PROTRUSION,
+        "min_x": MIN_X,
+        "max_x": MAX_X,
+        "min_y": MIN_Y,
+        "max_y": MAX_Y,
+        "min_z": MIN_Z,
+        "max_z": MAX_Z,
+        "centroid_min_x": CENTROID_MIN_X,
+        "centroid_max_x": CENTROID_MAX_X,
+        "centroid_min_y": CENTROID_MIN_Y,
+        "centroid_max_y": CENTROID_MAX_Y,
+    }
+)
+"""Quantities as kernels know them: between two operands below 100; a least coordinate is even."""
 
 _FLAT: Final = 1e-12
 """Twice the area over the squared perimeter; a polygon with less has no centroid of its area."""
@@ -388,7 +406,7 @@ def measure_rows(
                 if quantity[k] == SIGNED_DISTANCE:
                     grown = enlargement[a] + enlargement[b]
                     values[k, t] = _union_distance(rows, members, a_members, b_members, grown)
-                else:
+                elif quantity[k] == PROTRUSION:
                     grown = enlargement[a] - enlargement[b]
                     values[k, t] = _union_protrusion(rows, members, a_members, b_members, grown)
 

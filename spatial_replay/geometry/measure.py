@@ -11,10 +11,9 @@ They are for pictures and explanations only.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers, writable
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, FootprintBatch
 from spatial_replay.geometry.kernels import (
+    QUANTITY_CODES,
     Rows,
     fill_contacts,
     fill_row,
@@ -30,15 +30,6 @@ from spatial_replay.geometry.kernels import (
     rows_distance,
 )
 
-Quantity: TypeAlias = Literal[
-    "signed_distance", "protrusion", "min_x", "max_x", "min_y", "max_y", "min_z", "max_z",
-    "centroid_min_x", "centroid_max_x", "centroid_min_y", "centroid_max_y",
-]  # fmt: skip
-
-# kernels address a quantity by its position in the list above
-QUANTITY_CODES: Mapping[str, int] = MappingProxyType(
-    {name: code for code, name in enumerate(get_args(Quantity))}
-)
 _SHARE = 16_384
 """So many quantities pay for a thread of their own."""
 _NO_ROWS = np.empty(0, dtype=np.int64)
@@ -60,7 +51,11 @@ class Operand:
 
 @dataclass(frozen=True, slots=True)
 class MeasureRequest:
-    """One quantity of one operand, or between two (indices into the operands)."""
+    """One quantity of one operand, or between two (indices into the operands).
+
+    Attributes:
+        quantity: a key of `QUANTITY_CODES`.
+    """
 
     quantity: str
     first: int

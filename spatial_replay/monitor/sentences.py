@@ -205,7 +205,16 @@ def _order(node: int, values: Floats, final: Floats, settled_ns: Integers) -> tu
 
 
 _ENDED = ", for the log has ended"
-_EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
+_ENDS = {
+    "min_x": "left edge",
+    "max_x": "right edge",
+    "min_y": "lower edge",
+    "max_y": "upper edge",
+    "min_z": "bottom edge",
+    "max_z": "top edge",
+    **dict.fromkeys(("centroid_min_x", "centroid_max_x", "centroid_min_y", "centroid_max_y"), "centroid"),
+}
+"""Coordinates, as sentences name them; every other quantity is named as it is."""
 
 
 def sentences_of(
@@ -591,12 +600,12 @@ def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
             lacks = ", which has no name" if called and value not in called.values() else ""
             return f"{names[0]} is {with_unit(value, unit)}{lacks}"
     if math.isinf(value):
-        return f"no object is in {names[0]}"
-    axis = measured.quantity[-1]
-    if measured.quantity.startswith("centroid"):
-        return f"the centroid of {names[0]} is at {axis} = {with_unit(value, lengths)}"
-    edge = _EDGES.get(measured.quantity, "bottom" if measured.quantity == "min_z" else "top")
-    return f"the {edge} edge of {names[0]} is at {axis} = {with_unit(value, lengths)}"
+        return f"no object is in {' or in '.join(names)}"
+    end = _ENDS.get(measured.quantity)
+    if end is None:
+        quantity = measured.quantity.replace("_", " ")
+        return f"the {quantity} of {' and '.join(names)} is {with_unit(value, lengths)}"
+    return f"the {end} of {names[0]} is at {measured.quantity[-1]} = {with_unit(value, lengths)}"
 
 
 def _flip(

@@ -179,7 +179,7 @@ class Measurement(_Arithmetic):
     @property
     @abstractmethod
     def quantity(self) -> str:
-        """Its name in explanations; if it measures footprints, a `Quantity` of `geometry.measure`, too."""
+        """Its name in explanations; if it measures footprints, a key of `kernels.QUANTITY_CODES`, too."""
 
     @property
     @abstractmethod

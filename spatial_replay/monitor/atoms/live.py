@@ -35,8 +35,8 @@ from spatial_replay.geometry.footprint import (
     TrackedObject,
     centre_object,
 )
-from spatial_replay.geometry.kernels import measure_rows
-from spatial_replay.geometry.measure import QUANTITY_CODES, closest_rows, misalignment_of
+from spatial_replay.geometry.kernels import QUANTITY_CODES, measure_rows
+from spatial_replay.geometry.measure import closest_rows, misalignment_of
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
 from spatial_replay.monitor.atoms.reports import RecentReports, left_out_of
 from spatial_replay.monitor.atoms.terms import (
