@@ -33,8 +33,8 @@ def write_pages(
 ) -> dict[tuple[str, str], Path]:
     """Write the page over all logs, and one about each log with a verdict that fails.
 
-    A page that an earlier run has written of the same log and specifications stays, but for its links to the
-    page over all and to those before and after it. The worst log comes first.
+    A page that an earlier run has written of the same log and specifications stays. Only its links to other
+    pages are written again. The worst log comes first.
 
     Args:
         folder: made if need be; the page over all is its `index.html`.

@@ -2,10 +2,10 @@
 
 A message runs through these stages:
 
-    assemble       raw messages of all topics → `PendingMessages` of each topic, transforms in a `FrameTree`
-    topic_reader   pending messages of one topic → `TopicColumns`: signals, and objects by bound field paths
-    detections     objects → `Detections`: poses and solids in columns
-    tracker        detections → observations in the fixed frame, `Events` over time, and a `Trace` of samples
+- assemble: raw messages of all topics → `PendingMessages` of each topic, transforms in a `FrameTree`
+- topic_reader: pending messages of one topic → `TopicColumns`: signals, and objects by bound field paths
+- detections: objects → `Detections`: poses and solids in columns
+- tracker: detections → observations in the fixed frame, `Events` over time, and a `Trace` of samples
 
 Messages wait in the first stage until none that is earlier can arrive.
 """

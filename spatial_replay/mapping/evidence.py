@@ -246,14 +246,13 @@ class Motions:
         comeback: the longest over a second or more in which messages did not report the object.
         zeros: how often an object leapt to (0, 0), by more than five of its sizes, but for comebacks.
         turn_step: the greatest change of the number that is read as yaw.
-        chances: reports of objects that were reported at least twice before; in `returns` of them an object
-            is back where it was two to four reports before, having leapt by more than its size in each step.
-            `return_moment` is the first, and `slow_returns` those of leaps that took a second or more, at
-            speeds that are usual.
+        chances: reports of objects that were reported at least twice before. In `returns` of them an object
+            is back where it was two to four reports before. It leapt by more than its size in each step.
+            `return_moment` is the first. `slow_returns` took a second or more, at speeds that are usual.
         gaps: (10,) how often so many messages passed from one report of an object to its next.
         changes: the first changes of classes; `change_count` counts all.
-        courses: for the angle as it is read, and for each of `HEADINGS`: the mean of exp(i (course - angle))
-            over the steps of objects that move, and `course`, the mean of exp(i course).
+        courses: the mean of exp(i (course - angle)) over the steps of objects that move, for the angle as it
+            is read and for each of `HEADINGS`. `course` is the mean of exp(i course).
     """
 
     def __init__(self, names: Codes, classes: Codes) -> None:
@@ -426,9 +425,9 @@ class TopicEvidence:
     Attributes:
         arrivals, motions: of its messages and objects.
         objects: the number of reports; `most_at_once` in one message.
-        quaternion_length: of the `quaternions` that are not zeros; `upright` and `upright_otherwise`
-            count upright objects in the order that is read, and with w at the other end; `turned_otherwise`
-            those of the latter that are turned by more than 20 degrees.
+        quaternion_length: of the `quaternions` that are not zeros. `upright` counts upright objects in the
+            order that is read. `upright_otherwise` counts them with w at the other end, and
+            `turned_otherwise` those of them that are turned by more than 20 degrees.
         turn: the numbers that are read as yaw; `first_turn` is the greatest of the first message, without
             its sign.
         low, high: (3,) the least and the greatest coordinates, in the numbers of the messages.

@@ -815,9 +815,10 @@ class Recorder(SampleWriter):
             overwrite: replace a file that exists and is not empty.
 
         Raises:
-            UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1, a
-                trigger without a spec of that name, a planner with a trigger or without `block`, an existing
-                file. OutputError: the file cannot be written.
+            UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1.
+            UsageError: a trigger without a spec of that name, a planner with a trigger or without `block`.
+            UsageError: an existing file.
+            OutputError: the file cannot be written.
         """
         if waiting < 1:
             raise UsageError(f"waiting is {waiting}; give 1 or more samples")

@@ -294,9 +294,10 @@ def record_cameras(
         advance: called with 1 for each sample.
 
     Raises:
-        UsageError: a specification that cannot be recorded, reference tags that do not fit, a camera with a
-        calibration of another size, an unknown camera, a video that cannot be copied. LogError: there is no
-        frame. OutputError: the output cannot be written.
+        UsageError: a specification that cannot be recorded, reference tags that do not fit.
+        UsageError: an unknown camera, one with a calibration of another size, a video that cannot be copied.
+        LogError: there is no frame.
+        OutputError: the output cannot be written.
     """
     refuse_templates(files)
     names = camera_names(cameras)
