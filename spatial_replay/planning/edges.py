@@ -498,11 +498,13 @@ class Attempts:
 
     Attributes:
         motions: the number of motions concluded, without refused ones.
+        planned: the motions that were to follow the last one; none if that failed.
     """
 
     def __init__(self) -> None:
         """Begin with none."""
         self.motions = 0
+        self.planned: tuple[Target, ...] = ()
         self._failed: dict[Edge, Counter[str]] = {}
         self._total: Counter[Edge] = Counter()
         self._places: dict[str, tuple[tuple[float, float], ...]] = {}
@@ -557,6 +559,8 @@ class Attempts:
         before, settings = self._begin
         refused = before is sample and not outcome.succeeded
         self.motions += not refused
+        is_there = outcome.succeeded and _is_at(target, sample, settings)
+        self.planned = aim.motions[1:] if is_there else ()
         if not outcome.succeeded:
             said = (outcome.reason, "no sample came during the motion" if refused else "")
             self._last[aim.edge] = "; ".join(filter(None, said))
@@ -567,7 +571,7 @@ class Attempts:
                 self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
             del self._failed[aim.edge]
-        elif not _is_at(target, sample, settings):
+        elif not is_there:
             place = "({:.4g}, {:.4g})".format(*centre_of(sample.objects[target.name].footprint))
             self._last[aim.edge] = f"moved, but then not at its target: {target.name} at {place}"
         elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):

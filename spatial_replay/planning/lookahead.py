@@ -774,6 +774,8 @@ class Lookahead:
             aims = path[:length]
             if any((aim.source, aim.target) in self._ruled_out for aim in aims):
                 continue
+            if scene is self._first:
+                yield from self._resume(aims, consideration)
             for demands in self._demands_of(scene, aims):
                 # this edge leaves a share of the maps to other edges
                 least = self._expected.budget.left * (1.0 - _JOINT_SHARE)
@@ -788,6 +790,25 @@ class Lookahead:
                     arrangements = sorted(arrangements, key=self._is_near_failure)
                 for poses in arrangements:
                     yield from self._ordered_from(scene, aims, consideration, about, poses, least)
+
+    def _resume(self, aims: Sequence[Transition], consideration: Consideration) -> Iterator[Ordered]:
+        """Yield the motions to the places that the last decision planned, if these still take some edges.
+
+        A new arrangement may need more motions than are left, and the next one may undo its first motion.
+        """
+        scene, states = self._first, frozenset({aims[0].source})
+        places: dict[str, Pose] = {}
+        for motion in self._expected.attempts.planned:
+            scene = scene.after(motion.name, motion.pose)
+            states = self._automaton.step_set(states, self._expected.symbol(scene))
+            places[motion.name] = dict(scene.moved)[motion.name]
+            if states == {aims[-1].target}:
+                robustness = self._expected.robustness(scene.sample, aims[0].guard)
+                never = consideration.constraints.cubes
+                order = MotionOrder(self._expected, self._first, aims, never, places, robustness, 0.0)
+                if (sequence := order.find()) is not None:
+                    yield sequence
+                return
 
     def _demands_of(self, scene: PredictedState, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
         """Yield what has to hold for some edges to be taken, as conjunctions: all progress, no trap."""

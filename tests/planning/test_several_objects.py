@@ -135,6 +135,24 @@ def test_what_is_in_the_way_is_moved_first():
     assert end == "hold"
 
 
+def test_motions_go_on_as_planned_and_do_not_undo_each_other():
+    # a new arrangement after the first motion would take five more, the first of them back
+    spots = [(13, 15.8), (7.6, 17.5), (10.7, 5.6), (7.9, 7.6), (13.7, 4.1), (14.1, 6.9)]
+    things = {f"o{number}": block(*spot, size=1) for number, spot in enumerate(spots)}
+    workspace = Workspace(Grid.over(0, 0, 20, 20, 1), clearance=0.2)
+    settings = Settings(workspace, "push", movable=tuple(things), margin=0.1, constraint_margin=0.1)
+    sorting = " and ".join(
+        f"{left} leftof {right}" for left, right in pairwise(["o5", "o2", "o0", "o3", "o1", "o4"])
+    )
+    planner = Planner(sr.parse_specification(f"F ({sorting})"), settings)
+    table = Table(things, planner)
+    table.look()
+    first = planner.next_step()
+    planner.conclude(table.execute(first))
+    _, *left = [motion.name for motion in first.aim.motions]
+    assert left == [motion.name for motion in planner.next_step().aim.motions]
+
+
 def test_a_slot_for_two_is_not_taken_in_the_middle():
     text = "region slot = box(4, 4, 6.6, 5.6)\n"
     text += "spec s = (F G (a enclosedin slot)) and (F (a leftof d and b enclosedin slot))"
