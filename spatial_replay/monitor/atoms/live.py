@@ -275,15 +275,15 @@ class RowPlaces(NamedTuple):
 def _rows_at(plan: PlanPlaces, sample: Floats, begin: int) -> RowPlaces:
     """Return the places of the rows of a sample in the room that begins there."""
     rows = plan.samples + plan.regions + plan.places
-    parts, corners, at = plan.parts, plan.corners, plan.samples + plan.signals + plan.coded
+    parts, corners, cursor = plan.parts, plan.corners, plan.samples + plan.signals + plan.coded
     for _ in range(plan.places):
-        number = max(int(sample[at + PARTS]), 0)
-        at += _OF_OBJECT
+        number = max(int(sample[cursor + PARTS]), 0)
+        cursor += _OF_OBJECT
         parts += number
         for _ in range(number):
-            of_part = int(sample[at])
-            at += _OF_PART + 2 * of_part
-            corners += of_part
+            vertex_count = int(sample[cursor])
+            cursor += _OF_PART + 2 * vertex_count
+            corners += vertex_count
     vertices = begin + 4 * rows + parts
     classes = vertices + 6 * corners
     return RowPlaces(
@@ -308,9 +308,9 @@ def _fill_rows(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers
 ) -> None:
     """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
-    samples, before = plan.samples, plan.samples + plan.regions
+    samples, object_begin = plan.samples, plan.samples + plan.regions
     lists[rows.part_start] = lists[rows.vertex_start] = 0
-    for k in range(before):
+    for k in range(object_begin):
         lists[rows.classes + k] = int(sample[k]) if k < samples else 0
         parts = 0 if k < samples else whole[plan.region_parts + k - samples]
         lists[rows.part_start + k + 1] = lists[rows.part_start + k] + parts
@@ -324,23 +324,26 @@ def _fill_rows(
     for k in range(2 * plan.corners):
         sample[rows.vertices + k] = real[plan.region_vertices + k]
     part, codes_at = plan.parts, samples + plan.signals
-    at = codes_at + plan.coded
-    for row in range(before, rows.rows):
-        number = max(int(sample[at + PARTS]), 0)
-        lists[rows.classes + row] = int(sample[codes_at + row - before]) if plan.coded > 0 else 0
-        if sample[at + PARTS] == 0.0:
+    cursor = codes_at + plan.coded
+    for row in range(object_begin, rows.rows):
+        number = max(int(sample[cursor + PARTS]), 0)
+        lists[rows.classes + row] = int(sample[codes_at + row - object_begin]) if plan.coded > 0 else 0
+        if sample[cursor + PARTS] == 0.0:
             lists[rows.classes + row] = ABSENT
         lists[rows.part_start + row + 1] = part + number
-        sample[rows.bottom + row], sample[rows.top + row] = sample[at + BOTTOM], sample[at + TOP]
-        sample[rows.yaw + row], sample[rows.uncertainty + row] = sample[at + YAW], sample[at + UNCERTAINTY]
-        at += _OF_OBJECT
+        sample[rows.bottom + row], sample[rows.top + row] = sample[cursor + BOTTOM], sample[cursor + TOP]
+        sample[rows.yaw + row], sample[rows.uncertainty + row] = (
+            sample[cursor + YAW],
+            sample[cursor + UNCERTAINTY],
+        )
+        cursor += _OF_OBJECT
         for p in range(part, part + number):
-            start, count = lists[rows.vertex_start + p], int(sample[at])
-            sample[rows.radius + p] = sample[at + 1]
-            at += _OF_PART
+            start, count = lists[rows.vertex_start + p], int(sample[cursor])
+            sample[rows.radius + p] = sample[cursor + 1]
+            cursor += _OF_PART
             for k in range(2 * count):
-                sample[rows.vertices + 2 * start + k] = sample[at + k]
-            at += 2 * count
+                sample[rows.vertices + 2 * start + k] = sample[cursor + k]
+            cursor += 2 * count
             lists[rows.vertex_start + p + 1] = start + count
         part += number
 
@@ -459,11 +462,11 @@ def _closest(
             sample[rows.edges : rows.classes].reshape((-1, 4)),
             nearest,
         )
-        at = closest + 4 * k
-        sample[at] = sample[at + 1] = nearest[0, 0]
-        sample[at + 2], sample[at + 3] = nearest[0, 1], nearest[0, 2]
+        pair_at = closest + 4 * k
+        sample[pair_at] = sample[pair_at + 1] = nearest[0, 0]
+        sample[pair_at + 2], sample[pair_at + 3] = nearest[0, 1], nearest[0, 2]
         if hidden > 0 and present > 1:  # it may be anywhere, and so may be the closest
-            sample[at] = sample[at + 2] = -np.inf
+            sample[pair_at] = sample[pair_at + 2] = -np.inf
 
 
 @inlined
@@ -687,8 +690,8 @@ class PlanRows:
 
     def required_rows(self, term: Term) -> list[Row]:
         """Return the rows, its sample's among them, without which a term is unknown."""
-        then, base = standing(term), base_of(term)
-        sample = [Row(self._sample_of(then))] if isinstance(then, Earlier) else []
+        current_term, base = standing(term), base_of(term)
+        sample = [Row(self._sample_of(current_term))] if isinstance(current_term, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
             return sample
         return sample + self.of_term(term)
@@ -815,7 +818,7 @@ class LeafPlan:
 def _signal(signal: Signal, sample: Sample, reports: RecentReports) -> float:
     """Return what `TraceScene.signal` does of one sample."""
     if isinstance(signal, ReportStep | PreviousSignal):
-        latest = reports.of.get(signal.signal or signal)
+        latest = reports.latest.get(signal.signal or signal)
         if latest is None or latest.before is None:
             return nan
         return latest.seconds if isinstance(signal, ReportStep) else float(latest.before.value)

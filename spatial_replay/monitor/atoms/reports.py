@@ -105,7 +105,7 @@ class RecentReports:
     def __init__(self, objects: frozenset[str] | None, signals: Iterable[Signal]) -> None:
         self._objects = objects
         self._signals = tuple(signals)
-        self.of: dict[str | Signal, LatestReport] = {}
+        self.latest: dict[str | Signal, LatestReport] = {}
 
     def add(self, sample: Sample) -> None:
         """Add the next sample; a hole forgets the reports before it."""
@@ -122,18 +122,18 @@ class RecentReports:
                 value, time_ns = sample.signals.get(signal.name, nan), times.get(signal.name, time_ns)
             if isfinite(value) and value > TEXTS:
                 latest[signal] = self._next(signal, value, time_ns)
-        self.of = latest
+        self.latest = latest
 
     def _next(self, key: str | Signal, value: Any, reported_ns: int) -> LatestReport:
-        latest = self.of.get(key)
+        latest = self.latest.get(key)
         return LatestReport(value, reported_ns) if latest is None else latest.follow(value, reported_ns)
 
     def step(self, terms: Iterable[Term], sample: Sample) -> float:
         """Return the shortest time between two reports of what moves in some terms, NaN for none."""
-        shortest, of = inf, self.of
+        shortest, latest = inf, self.latest
         for term in terms:
             for name in (term.name,) if isinstance(term, TrackedName) else _members_in(term, sample):
-                seconds = of[name].seconds if name in of else nan
+                seconds = latest[name].seconds if name in latest else nan
                 if seconds < shortest:
                     shortest = seconds
                 elif seconds != seconds and name not in sample.lasting:
@@ -142,7 +142,7 @@ class RecentReports:
 
     def packed_centre(self, name: str, tracked: TrackedObject) -> tuple[bytes, bytes]:
         """Return the packed centre of an object, computed once for each report."""
-        latest = self.of.get(name)
+        latest = self.latest.get(name)
         for report in () if latest is None else (latest, latest.before):
             if report is not None and report.value is tracked:
                 report.centre = report.centre or packed_centre(tracked)
@@ -151,14 +151,14 @@ class RecentReports:
 
     def moved_back(self, name: str, sample: Sample, shortest: float) -> TrackedObject | None:
         """Return an object as it was some seconds ago by its velocity; None if it was not reported before."""
-        latest = self.of.get(name)
+        latest = self.latest.get(name)
         if latest is None:
             return None
-        before, seconds = latest.before, latest.seconds
+        previous_report, seconds = latest.before, latest.seconds
         current: TrackedObject = latest.value
-        if before is None or seconds != seconds:
+        if previous_report is None or seconds != seconds:
             return current if name in sample.lasting else None
-        previous: TrackedObject = before.value
+        previous: TrackedObject = previous_report.value
         if seconds == shortest:
             return previous
         if not seconds > shortest:

@@ -231,8 +231,8 @@ class TraceScene:
                 self._step(signal.terms) if signal.signal is None else self._reports_of(signal.signal).seconds
             )
         if isinstance(signal, PreviousSignal):
-            before = self._reports_of(signal.signal).before
-            return np.where(before < 0, np.nan, self._signal(signal.signal)[before])
+            previous_samples = self._reports_of(signal.signal).before
+            return np.where(previous_samples < 0, np.nan, self._signal(signal.signal)[previous_samples])
         if isinstance(signal, Present):
             return np.asarray(self._rows_of(signal.term.name) != ABSENT, np.float64)
         if isinstance(signal, ComputedSignal):
@@ -252,8 +252,8 @@ class TraceScene:
         if not moving:
             return None
         nearest = min(moving, key=seconds.__getitem__)
-        times_ns, before = self._reported_ns(nearest), self._reports_of(nearest).before[self.skip]
-        return int(times_ns[before]), int(times_ns[self.skip])
+        times_ns, previous_sample = self._reported_ns(nearest), self._reports_of(nearest).before[self.skip]
+        return int(times_ns[previous_sample]), int(times_ns[self.skip])
 
     def _reported_ns(self, source: TrackedName | Signal) -> Integers:
         """Return when each sample's report of an object or a signal was made, (T,) of the whole trace."""
@@ -319,9 +319,9 @@ class TraceScene:
         base = open_group(group)
         _, source = self._base_and_source(group)
         names, rows = self._open_rows(base)
-        before = source < 0
-        present = (rows != ABSENT)[np.maximum(source, 0)] & ~before[:, None]
-        return names, present.astype(np.int8), before
+        is_before_start = source < 0
+        present = (rows != ABSENT)[np.maximum(source, 0)] & ~is_before_start[:, None]
+        return names, present.astype(np.int8), is_before_start
 
     def _resolve(self, term: Term) -> ResolvedTerm:
         if isinstance(term, Enlarged):
@@ -330,22 +330,22 @@ class TraceScene:
             return ResolvedTerm(operand, inner.unknown, inner.spread, inner.yaw)
         if isinstance(term, Centre):
             inner, self._has_centres = self.resolve(term.term), True
-            rows, whole = inner.operand.rows, len(self._whole)
+            rows, row_count = inner.operand.rows, len(self._whole)
             # what is moved back has its centre right after it
-            centres = np.where(rows < 2 * whole, rows + whole, rows + 1)
+            centres = np.where(rows < 2 * row_count, rows + row_count, rows + 1)
             return replace(inner, operand=Operand(np.where(rows < 0, rows, centres)))
         if isinstance(term, Earlier) and term.rate:
             return self._moved_back(term)
         base, source = self._base_and_source(term)
         if isinstance(base, RegionName):
             return self._resolve_region(base, source < 0)
-        at = np.maximum(source, 0) if isinstance(term, Earlier) else slice(self.skip, None)
+        samples = np.maximum(source, 0) if isinstance(term, Earlier) else slice(self.skip, None)
         if isinstance(base, Group):
             is_open = base.members is None
-            rows = (self._open_rows(base)[1] if is_open else self._named_rows(base))[at]
+            rows = (self._open_rows(base)[1] if is_open else self._named_rows(base))[samples]
             unknown = (rows < (ABSENT if is_open else 0)).any(axis=1)
         else:
-            rows = self._rows_of(base.name)[at, None]
+            rows = self._rows_of(base.name)[samples, None]
             unknown = rows[:, 0] < 0
         return self._resolve_rows(rows, unknown | (source < 0))
 
@@ -379,25 +379,28 @@ class TraceScene:
         rows = np.where(is_there & ~stands, _NO_REPORT, current)
         uncertainty = np.append(self.trace.uncertainty, 0.0)
         spread = np.where(is_there, uncertainty[np.where(is_there, current, -1)], 0.0)
-        was = is_there & (seconds == shortest)
-        rows[was], spread[was] = before_rows[was], uncertainty[before_rows[was]]
+        is_previous = is_there & (seconds == shortest)
+        rows[is_previous], spread[is_previous] = (
+            before_rows[is_previous],
+            uncertainty[before_rows[is_previous]],
+        )
         between = np.flatnonzero(is_there & (seconds > shortest))
         if len(between):
-            now, then = current[between], before_rows[between]
-            rows[between] = self._add_moved_rows(now, then, shortest[between] / seconds[between])
-            spread[between] = np.maximum(uncertainty[now], uncertainty[then])
+            newer, older = current[between], before_rows[between]
+            rows[between] = self._add_moved_rows(newer, older, shortest[between] / seconds[between])
+            spread[between] = np.maximum(uncertainty[newer], uncertainty[older])
         return rows, spread
 
-    def _add_moved_rows(self, now: Integers, then: Integers, share: Floats) -> Integers:
+    def _add_moved_rows(self, newer: Integers, older: Integers, share: Floats) -> Integers:
         """Move some rows by a share of the way back to others; return their new rows."""
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
-        moved = shifted(self._whole.select(now), (centres[then] - centres[now]) * share[:, None])
-        pairs = np.arange(2 * len(now)).reshape(2, -1).T.ravel()
-        self._moved.append(FootprintBatch.concatenate([moved, centres_of(moved)]).select(pairs))
+        moved_batch = shifted(self._whole.select(newer), (centres[older] - centres[newer]) * share[:, None])
+        pairs = np.arange(2 * len(newer)).reshape(2, -1).T.ravel()
+        self._moved.append(FootprintBatch.concatenate([moved_batch, centres_of(moved_batch)]).select(pairs))
         first = 2 * len(self._whole) + self._moved_count
-        self._moved_count += 2 * len(now)
-        return np.asarray(first + 2 * np.arange(len(now)), np.int64)
+        self._moved_count += 2 * len(newer)
+        return np.asarray(first + 2 * np.arange(len(newer)), np.int64)
 
     def _members_of(
         self, term: TrackedName | Variable | RegionName | Group
@@ -412,25 +415,25 @@ class TraceScene:
 
     def _base_and_source(self, term: _Base | Earlier) -> tuple[_Base, Integers]:
         """Return what a term is about, and the trace's sample each of the scene's looks at (-1: none)."""
-        now = np.arange(self.skip, len(self.trace), dtype=np.int64)
+        samples = np.arange(self.skip, len(self.trace), dtype=np.int64)
         if not isinstance(term, Earlier):
-            return term, now
+            return term, samples
         if term.samples is not None:
-            return term.term, np.asarray(np.maximum(now - term.samples, -1), np.int64)
+            return term.term, np.asarray(np.maximum(samples - term.samples, -1), np.int64)
         times = self.trace.times_ns
         source_times = times[self.skip :] - (term.duration_ns or 0)
         return term.term, np.searchsorted(times, source_times, side="right").astype(np.int64) - 1
 
     def _resolve_rows(self, rows: Integers, unknown: Booleans) -> ResolvedTerm:
-        seen = rows >= 0
-        at = np.maximum(rows, 0)
-        if len(self.trace.uncertainty) and seen.shape[1]:
+        is_present = rows >= 0
+        places = np.maximum(rows, 0)
+        if len(self.trace.uncertainty) and is_present.shape[1]:
             spread = (
                 np.zeros(len(rows))
                 if self.is_sure
-                else np.where(seen, self.trace.uncertainty[at], 0.0).max(axis=1)
+                else np.where(is_present, self.trace.uncertainty[places], 0.0).max(axis=1)
             )
-            yaw = np.where(seen[:, 0], self.trace.yaw[at[:, 0]], np.nan)
+            yaw = np.where(is_present[:, 0], self.trace.yaw[places[:, 0]], np.nan)
         else:
             spread, yaw = np.zeros(len(rows)), np.full(len(rows), np.nan)
         return ResolvedTerm(Operand(rows), unknown, spread, yaw)
