@@ -160,7 +160,7 @@ def run_offline(
         row = rows[r]
         code = row[0]
         is_ahead = code >= codes.AHEAD
-        past = code - codes.AHEAD if is_ahead else code
+        past_code = code - codes.AHEAD if is_ahead else code
         steps = Steps(stamps, end - 1 if is_ahead else begin, -1 if is_ahead else 1, end - begin)
         for channel in range(channels):
             mirror = channel ^ 1 if channels > 1 else channel
@@ -171,14 +171,14 @@ def run_offline(
                     target[k] = leaves[channel, row[1], k]
                 continue
             source = columns[channel, row[1]]
-            if past < codes.ONCE:
+            if past_code < codes.ONCE:
                 _run_boolean(row, columns, channel, mirror, target, begin, end)
-            elif past <= codes.SINCE:
-                _run_past(past, source, columns[channel, row[2]], target, steps)
-            elif past == codes.DELAY:
+            elif past_code <= codes.SINCE:
+                _run_past(past_code, source, columns[channel, row[2]], target, steps)
+            elif past_code == codes.DELAY:
                 _run_delay(source, target, steps, row[3], row[4], row[5] * np.inf)
             else:
-                sign = 1.0 if past == codes.WINDOW_MAX else -1.0
+                sign = 1.0 if past_code == codes.WINDOW_MAX else -1.0
                 _slide(source, target, steps, row[3], row[4], row[5], sign, extrema)
 
 
@@ -229,9 +229,9 @@ class OfflineTable(SignalTable):
         others = (row for row in range(len(self._rows)) if row not in column)
         column |= dict(zip(others, count(len(nodes)), strict=False))
         result = []
-        for number, (code, a, b, *rest) in enumerate(self._rows):
+        for number, (code, a, b, *window) in enumerate(self._rows):
             operands = (a, b) if code == codes.LEAF else (column[a], column[b])
-            result.append((code, *operands, *rest, column[number]))
+            result.append((code, *operands, *window, column[number]))
         # equal nodes share a row, but each has a column of its own
         copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
         result += [copy for copy in copies if copy[1] != copy[-1]]

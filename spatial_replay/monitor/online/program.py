@@ -149,10 +149,10 @@ class SignalTable:
         return self._leaf_numbers[key]
 
     def _boolean(self, operator: str, operands: list[int]) -> int:
-        first, *rest = operands
+        first, *other_operands = operands
         if operator == "not":
             return self.row(codes.NOT, first)
-        for operand in rest:
+        for operand in other_operands:
             first = self.row(codes.AND if operator == "and" else codes.OR, first, operand)
         return first
 
@@ -177,12 +177,12 @@ class SignalTable:
         psi before. Min distributes over max, so both are exact for robustness too."""
         result = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
-            before = self.delay(result, unit, low, ahead)
+            delayed = self.delay(result, unit, low, ahead)
             since = self.row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
-            result = self.row(codes.AND, since, before)
+            result = self.row(codes.AND, since, delayed)
         if high is not None:
-            within = self.row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
-            result = self.row(codes.AND, within, result)
+            window_row = self.row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
+            result = self.row(codes.AND, window_row, result)
         return result
 
     def infinity_after(self, unit: int, distance: int, sign: int) -> int:
@@ -248,13 +248,13 @@ class PartRows:
         result: list[Row] = []
         for *fields, is_variable in self._rows:
             has_table = fields[0] in _RECURRENT_PAST
-            below = any(result[operand_row][-1] for operand_row in operand_rows(*fields[:3]))
+            depends_below = any(result[operand_row][-1] for operand_row in operand_rows(*fields[:3]))
             result.append(
                 (
                     *fields,
                     variable if is_variable else NOTHING,
                     table if has_table else NOTHING,
-                    int(is_variable or has_table or below),
+                    int(is_variable or has_table or depends_below),
                 )
             )
             variable += is_variable
@@ -332,17 +332,17 @@ class PartRows:
         """Add until or release over a window, by the identity that `SignalTable` uses for since."""
         weak = int(not is_until)
         right_code, left_code = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
-        within = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
-        if within is not None and left == NOTHING:
-            return within
+        window_row = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
+        if window_row is not None and left == NOTHING:
+            return window_row
         code = codes.UNTIL if is_until else codes.RELEASE
         running = self.row(code, left, right, weak, variable=high is None)
         if low > 0 or high is not None:
             running = self.row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
         if low > 0 and left != NOTHING:
-            before = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
-            running = self._join(before, running, is_both=is_until)
-        return running if within is None else self._join(within, running, is_both=is_until)
+            lead_row = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
+            running = self._join(lead_row, running, is_both=is_until)
+        return running if window_row is None else self._join(window_row, running, is_both=is_until)
 
     def _past(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
         unit, low, high = window_of(bound)
@@ -352,16 +352,16 @@ class PartRows:
         is_since = (operator in ("O", "S")) == positive
         weak = int(not is_since)
         right_code, left_code = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
-        within = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
-        if within is not None and left == NOTHING:
-            return within
+        window_row = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
+        if window_row is not None and left == NOTHING:
+            return window_row
         result = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
         if low > 0:
             result = self.row(codes.PAST_DELAY, result, 0, weak, unit, low)
             if left != NOTHING:
-                before = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
-                result = self._join(before, result, is_both=is_since)
-        return result if within is None else self._join(within, result, is_both=is_since)
+                lead_row = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
+                result = self._join(lead_row, result, is_both=is_since)
+        return result if window_row is None else self._join(window_row, result, is_both=is_since)
 
     def _ending(self, formula: Formula, positive: bool) -> int:
         """Return the row of a bounded operator of which only the value at the first sample is needed.
@@ -488,8 +488,8 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
     """
     node_directions = list[tuple[bool, bool]]()
     for code, a, b, weak, *_ in rows:
-        below = [node_directions[operand] for operand in operand_rows(code, a, b)]
-        rises, falls = all(up for up, _ in below), all(down for _, down in below)
+        operand_directions = [node_directions[operand] for operand in operand_rows(code, a, b)]
+        rises, falls = all(up for up, _ in operand_directions), all(down for _, down in operand_directions)
         if code in (codes.UNTIL, codes.RELEASE, codes.SHIFT):
             rises, falls = rises and not weak, falls and bool(weak)
         node_directions.append(
@@ -651,10 +651,10 @@ def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
 
 def _with_signal_row(row: Row, signals: SignalTable) -> Row:
     """Return a row whose numbers, if it is a literal, are those of a signal."""
-    code, signal, is_negated, *rest = row
+    code, signal, is_negated, *fields = row
     if code != codes.LITERAL or not is_negated:
         return row
-    return (code, signals.row(codes.NOT, signal), 0, *rest)
+    return (code, signals.row(codes.NOT, signal), 0, *fields)
 
 
 def _now_rule(node: Temporal) -> int:
