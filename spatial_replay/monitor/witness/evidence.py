@@ -88,12 +88,14 @@ class Evidence:
             trace = scene.trace
             while pending and pending[-1] <= trace.times_ns[-1]:
                 time_ns = pending.pop()
-                at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
-                if at == end:
+                begin, end = window_of(trace.times_ns, time_ns, time_ns + 1)
+                if begin == end:
                     raise LookupError(f"there is no sample at {time_ns} ns any more")
-                past = tail(trace.slice(0, at), self._reach) if at and self._reach else trace.slice(0, 0)
-                sample = Trace.concatenate([past, trace.slice(at, end)])
-                scenes[time_ns] = TraceScene(sample, self._regions, len(past))
+                earlier_samples = (
+                    tail(trace.slice(0, begin), self._reach) if begin and self._reach else trace.slice(0, 0)
+                )
+                sample = Trace.concatenate([earlier_samples, trace.slice(begin, end)])
+                scenes[time_ns] = TraceScene(sample, self._regions, len(earlier_samples))
             if not pending:
                 return scenes
         raise LookupError(f"there is no sample at {pending[-1]} ns any more")
@@ -166,17 +168,17 @@ class Evidence:
 
     def _scenes(self) -> Iterator[TraceScene]:
         """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
-        past: Trace | None = None
+        previous_trace: Trace | None = None
         for trace in self._traces():
             if len(trace) and trace.times_ns[0] >= self.instance.end_ns:
                 # an object of a template is there for a part of the log only
                 return
             skip = 0
-            if past is not None and self._reach:
-                recent = tail(past, self._reach)
+            if previous_trace is not None and self._reach:
+                recent = tail(previous_trace, self._reach)
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
-            past = trace if len(trace) else past
+            previous_trace = trace if len(trace) else previous_trace
             if len(trace) and trace.times_ns[-1] >= self.instance.start_ns:
                 yield TraceScene(trace, self._regions, skip)
 
@@ -243,18 +245,18 @@ def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_
     starts, ends = turns[::2], turns[1::2]
     # leading and trailing samples, without another one between
     is_at_ends = bool(((starts == 0) | (ends > last)).all()) and not missing.all()
-    before = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
-    after = int(times_ns[starts[-1]]) if ends[-1] > last else None
+    window_start = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
+    window_end = int(times_ns[starts[-1]]) if ends[-1] > last else None
     spans = np.stack((times_ns[starts], times_ns[np.minimum(ends, last)]))
-    around = (spans[0] <= time_ns) & (time_ns < spans[1])
-    longest = spans[:, (around if around.any() else np.diff(spans, axis=0)).argmax()]
+    contains_time = (spans[0] <= time_ns) & (time_ns < spans[1])
+    longest = spans[:, (contains_time if contains_time.any() else np.diff(spans, axis=0)).argmax()]
     return Gap(
         name,
         int(missing.sum()),
         len(missing),
         int(times_ns[starts[0]]),
         int(times_ns[ends[-1] - 1]),
-        (before, after) if is_at_ends else None,
+        (window_start, window_end) if is_at_ends else None,
         (int(longest[0]), int(longest[1])),
         int(longest[1]) - 1 in times_ns[missing][1:],
     )

@@ -217,19 +217,19 @@ class _Walk:
                         extremum, end, lambda index: self._nodes.interval(index, sample)
                     )
                 ]
-                below = min(paths, key=lambda path: path.steps[-1].sample)
+                operand_path = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal():
                 lasting = self._lasting(node, sample, end) if self._nodes.goes_on else None
                 next_step = lasting or self._deciding_operand(formula, operands, sample, end)
                 if next_step is None or self._nodes.is_left_out(next_step.node, next_step.sample):
                     return DecidingPath((step,), end)
-                below = self.follow(next_step.node, next_step.sample, end)
-                if end is End.OPEN and not self._is_open(below.steps[-1]):
+                operand_path = self.follow(next_step.node, next_step.sample, end)
+                if end is End.OPEN and not self._is_open(operand_path.steps[-1]):
                     # the operand is certain there, but not whether its rates have values
-                    below = next(self._unknown_rates(next_step.node, next_step.sample), below)
+                    operand_path = next(self._unknown_rates(next_step.node, next_step.sample), operand_path)
             case _:
                 return DecidingPath((step,), end)
-        return DecidingPath((step, *below.steps), below.end)
+        return DecidingPath((step, *operand_path.steps), operand_path.end)
 
     def _is_open(self, step: PathNode) -> bool:
         low, high = self._nodes.interval(step.node, step.sample)
@@ -250,8 +250,8 @@ class _Walk:
                 return
         if 0 <= sample < len(self._nodes.times_ns):
             for operand in operands:
-                for below in self._unknown_rates(operand, sample):
-                    yield DecidingPath((step, *below.steps), End.OPEN)
+                for operand_path in self._unknown_rates(operand, sample):
+                    yield DecidingPath((step, *operand_path.steps), End.OPEN)
 
     def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
         low, high = (column[samples] for column in self._nodes.judged_ends(operand.index))
@@ -327,15 +327,17 @@ class _Walk:
             np.minimum(right_numbers, left_least[inside])
             for right_numbers, left_least in zip(rights, left_so_far, strict=True)
         )
-        at = window[int(np.argmax(end.of_maximum(low, high)))]
-        right_key = float(end.of_minimum(*rights)[at - window.start])
-        between = range(sample, at) if is_ahead else range(at + 1, sample + 1)
-        left_key = end.of_minimum(*lefts)[between.start - span.start : between.stop - span.start]
-        first = [PathNode(left.index, between[int(np.argmin(left_key))])] if len(between) else []
-        least = float(left_key.min()) if len(between) else np.inf
+        best_sample = window[int(np.argmax(end.of_maximum(low, high)))]
+        right_key = float(end.of_minimum(*rights)[best_sample - window.start])
+        left_samples = range(sample, best_sample) if is_ahead else range(best_sample + 1, sample + 1)
+        left_key = end.of_minimum(*lefts)[left_samples.start - span.start : left_samples.stop - span.start]
+        left_steps = (
+            [PathNode(left.index, left_samples[int(np.argmin(left_key))])] if len(left_samples) else []
+        )
+        least = float(left_key.min()) if len(left_samples) else np.inf
         if right_key == least:
-            return min([*first, PathNode(right.index, at)], key=lambda step: step.sample)
-        return first[0] if least < right_key else PathNode(right.index, at)
+            return min([*left_steps, PathNode(right.index, best_sample)], key=lambda step: step.sample)
+        return left_steps[0] if least < right_key else PathNode(right.index, best_sample)
 
     def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> PathNode:
         """Return what decides a weak until: the greater of `phi U psi` and `G phi`."""
@@ -389,13 +391,13 @@ def missed_response(
     Args:
         bindings: the objects that variables stand for.
     """
-    for step, below in pairwise(path.steps):
+    for step, next_step in pairwise(path.steps):
         node, operands = nodes.tree[step.node]
         if operator_of(node) == "->" and nodes.ends(step.node)[1][step.sample] < 0.0:
             condition, response = (
                 short_title(substitute(operand, bindings)) for operand in operands_of(node)
             )
-            time_ns, is_condition = int(nodes.times_ns[step.sample]), below.node == operands[0]
+            time_ns, is_condition = int(nodes.times_ns[step.sample]), next_step.node == operands[0]
             closest = (
                 deciding_path(nodes, operands[1], End.HIGH, sample=step.sample) if is_condition else None
             )
@@ -420,8 +422,8 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
                 is_explained = is_explained or bool(reasons)
                 yield from reasons
             if not is_explained:
-                of = part.signal.name if part.signal else " and ".join(map(format_term, part.terms))
-                yield f"{of} has no report to compare with, or none of an earlier time"
+                rate_text = part.signal.name if part.signal else " and ".join(map(format_term, part.terms))
+                yield f"{rate_text} has no report to compare with, or none of an earlier time"
         case Signal() | Equality():
             signal, compared = (part, 0.0) if isinstance(part, Signal) else (part.signal, part.value)
             name, value = signal.name, scene.signal(signal)[0]
@@ -468,11 +470,11 @@ def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
     members = _members(base_of(term))
     rows = scene.resolve(term).operand.rows[0]
     for name, row in zip(members or [format_term(term)] * len(rows), rows.tolist(), strict=True):
-        when = " then" if isinstance(term, Earlier) else ""
+        time_text = " then" if isinstance(term, Earlier) else ""
         if row < ABSENT:
-            yield f"the position of {name} is unknown{when}"
+            yield f"the position of {name} is unknown{time_text}"
         elif row == ABSENT and members:
-            yield f"{name} is not in the sample{when and f' that {format_term(term)} looks at'}"
+            yield f"{name} is not in the sample{time_text and f' that {format_term(term)} looks at'}"
 
 
 def _members(base: Term) -> Sequence[str]:
@@ -553,10 +555,10 @@ class DecidingAtom:
 def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | None:
     """Return the atom that decides a leaf in the one sample of a scene; None if its group is empty."""
     while not isinstance(leaf, Atom):
-        below = _below(scene, leaf, end)
-        if below is None:
+        operand_and_end = _below(scene, leaf, end)
+        if operand_and_end is None:
             return None
-        leaf, end = below
+        leaf, end = operand_and_end
     (nominal,), ((lower, upper),) = (_intervals(scene, [leaf], wide=wide) for wide in (False, True))
     value = nominal[0] if nominal[0] == nominal[1] else float("nan")
     unknown = unknowns_of(scene, leaf)
@@ -571,13 +573,13 @@ def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Form
     The third value is whether the atom that decides the leaf is in the condition.
     """
     while not isinstance(leaf, Atom):
-        below = _below(scene, leaf, end)
-        if below is None:
+        operand_and_end = _below(scene, leaf, end)
+        if operand_and_end is None:
             return None
         if operator_of(leaf) == "->" and _intervals(scene, [leaf])[0][1] < 0.0:
             condition, response = operands_of(leaf)
-            return condition, response, below[0] is condition
-        leaf, end = below
+            return condition, response, operand_and_end[0] is condition
+        leaf, end = operand_and_end
     return None
 
 

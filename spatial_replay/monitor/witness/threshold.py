@@ -89,10 +89,10 @@ class Dial:
         if not isinstance(self.value, NamedNumber) or not self.value.is_plain:
             return None
         (constant,) = self.value.constants
-        used = [number for atom in iter_atoms(formula) for number in _numbers(atom.expression)]
+        numbers = [number for atom in iter_atoms(formula) for number in _numbers(atom.expression)]
         is_entangled = any(
             constant in number.constants and not number.is_plain
-            for number in used
+            for number in numbers
             if isinstance(number, NamedNumber)
         )
         return None if is_entangled else replace(self, constant=constant)
@@ -185,8 +185,10 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
             yield from _signed_atoms(formula.body, signs)
         case Boolean() | Temporal():
             for place, operand in enumerate(formula.operands):
-                below = {sign * sign_below for sign in signs for sign_below in operand_signs(formula, place)}
-                yield from _signed_atoms(operand, frozenset(below))
+                operand_signs_below = {
+                    sign * sign_below for sign in signs for sign_below in operand_signs(formula, place)
+                }
+                yield from _signed_atoms(operand, frozenset(operand_signs_below))
 
 
 RESIDUE: Final = 1e-12
@@ -351,11 +353,16 @@ class _Search:
         atom = self._deciding.atom
         for variant in _variants(atom, margin):
             formula = self._change_atoms(variant)
-            added = new_leaves(formula, self._order)
+            added_leaves = new_leaves(formula, self._order)
             # heights, or rounding, may decide instead
-            if self._is_flipped(self._verdict_with(formula, added, self._columns(added))):
-                changed = variant(atom)
-                return format_atom(changed.relation, changed.expression, changed.terms, changed.parameters)
+            if self._is_flipped(self._verdict_with(formula, added_leaves, self._columns(added_leaves))):
+                changed_atom = variant(atom)
+                return format_atom(
+                    changed_atom.relation,
+                    changed_atom.expression,
+                    changed_atom.terms,
+                    changed_atom.parameters,
+                )
         return ""
 
     def obstacle(self) -> Obstacle:
@@ -366,8 +373,8 @@ class _Search:
             return replace(atom, expression=Sum(atom.expression, Number(far)))
 
         formula = self._change_atoms(change)
-        added = new_leaves(formula, self._order)
-        verdict = self._verdict_with(formula, added, self._columns(added))
+        added_leaves = new_leaves(formula, self._order)
+        verdict = self._verdict_with(formula, added_leaves, self._columns(added_leaves))
         if self._is_flipped(verdict):
             return "limits"
         return "others" if verdict is self._verdict else "unknown"
@@ -432,8 +439,10 @@ class _Search:
         A radius goes no lower than 0.
         """
         value = self._dial.value
-        beyond = 0.0 if self._dial.is_exact else _STEPS * float(np.spacing(max(abs(value) + size, 1.0)))
-        number = value + direction * (size + beyond)
+        rounding_step = (
+            0.0 if self._dial.is_exact else _STEPS * float(np.spacing(max(abs(value) + size, 1.0)))
+        )
+        number = value + direction * (size + rounding_step)
         return max(number, 0.0) if self._dial.kind == "radius" else number
 
     def _verdicts(self, numbers: Sequence[float], *, is_shifted: bool = True) -> list[Verdict]:
@@ -443,18 +452,21 @@ class _Search:
             is_shifted: whether numbers of atoms may be shifted, but for rounding, instead of measured again.
         """
         formulas = [self._formula_at(number) for number in numbers]
-        added = [new_leaves(formula, self._order) for formula in formulas]
+        added_leaves = [new_leaves(formula, self._order) for formula in formulas]
         if self._is_uniform and is_shifted:
             columns = [
-                self._shift_columns(leaves, number) for leaves, number in zip(added, numbers, strict=True)
+                self._shift_columns(leaves, number)
+                for leaves, number in zip(added_leaves, numbers, strict=True)
             ]
         elif numbers:
-            every = self._columns([leaf for leaves in added for leaf in leaves])
-            ends = np.cumsum([0, *map(len, added)]).tolist()
-            columns = [every[:, begin:end] for begin, end in pairwise(ends)]
+            all_columns = self._columns([leaf for leaves in added_leaves for leaf in leaves])
+            ends = np.cumsum([0, *map(len, added_leaves)]).tolist()
+            columns = [all_columns[:, begin:end] for begin, end in pairwise(ends)]
         else:
             columns = []
-        return [self._verdict_with(*arguments) for arguments in zip(formulas, added, columns, strict=True)]
+        return [
+            self._verdict_with(*arguments) for arguments in zip(formulas, added_leaves, columns, strict=True)
+        ]
 
     def _is_meant(self, atom: Atom) -> bool:
         """Return whether the constant is in an atom or, of another number, it was written where that was."""
@@ -566,12 +578,12 @@ def _enlarge_term(atom: Atom, place: int, radius: float) -> Atom:
 def _short_numbers(number: float, value: float) -> Iterator[float]:
     """Iterate over short numbers near one, and beyond it as seen from a value; the number itself is last."""
     exact, change = Decimal(number), Decimal(number) - Decimal(value)
-    beyond = ROUND_CEILING if change > 0 else ROUND_FLOOR
+    rounding_away = ROUND_CEILING if change > 0 else ROUND_FLOOR
     # a rounding error, or the step that `_number_beyond` adds near 0, has no digits of its own
     leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
     last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):
-        for rounding in (ROUND_HALF_EVEN, beyond):
+        for rounding in (ROUND_HALF_EVEN, rounding_away):
             rounded = exact.quantize(Decimal(1).scaleb(place), context=Context(_PRECISION, rounding))
             yield float(rounded) + 0.0
     yield number

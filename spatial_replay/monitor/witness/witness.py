@@ -202,15 +202,15 @@ def find_witness(
         while_present = _while_present(evidence, leaves, times_ns, node, path)
 
     def flip(atom: DecidingAtom) -> Threshold | Obstacle | None:
-        over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
-        return threshold_of(evidence, *over, node, verdict, atom, goes_on=open_ended)
+        samples, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
+        return threshold_of(evidence, *samples, node, verdict, atom, goes_on=open_ended)
 
     threshold = flip(deciding) if deciding is not None and flips else None
     has_open_end = end is not End.OPEN and lower < upper and not goes_on
     missed, closest, closest_path = _NOTHING_MISSED
     if verdict is Verdict.VIOLATED:
         missed, closest, closest_path = find_missed_response(evidence, nodes, path, evidence.scene)
-    response = flip(closest[0]) if closest is not None and flips else None
+    response_threshold = flip(closest[0]) if closest is not None and flips else None
     return Witness(
         instance.name,
         instance.object,
@@ -230,7 +230,7 @@ def find_witness(
         evidence.units,
         declared_unit(evidence.bound(nodes.tree[node][0]), evidence.units),
         while_present,
-        response if isinstance(response, Threshold) else None,
+        response_threshold if isinstance(response_threshold, Threshold) else None,
     )
 
 
@@ -294,10 +294,10 @@ def find_missed_response(
         return _NOTHING_MISSED
     # an implication within the one node of an open group
     scene = scene_at(at_ns)
-    within = failed_implication(scene, leaf, path.end)
-    if within is None:
+    implication = failed_implication(scene, leaf, path.end)
+    if implication is None:
         return _NOTHING_MISSED
-    condition, response, is_condition = within
+    condition, response, is_condition = implication
     missed = MissedResponse(short_title(condition), short_title(response), at_ns, is_condition)
     best = deciding_atom(scene, response, End.HIGH) if is_condition else None
     return MissedWitness(missed, None if best is None or best.unknown else (best, at_ns))
@@ -317,14 +317,14 @@ def _while_present(
     instance, bindings = evidence.instance, evidence.instance.bindings
     formula, order = instance.formula, instance.program.leaves
     nodes = nodes_of(formula)
-    around = [step.node for step in path.steps if operator_of(nodes[step.node]) in ("G", "H", "F", "O")]
+    operators = [step.node for step in path.steps if operator_of(nodes[step.node]) in ("G", "H", "F", "O")]
     objects = dict.fromkeys(map(base_of, iter_terms([nodes[path.steps[-1].node]])))
     terms = [
         term
         for term in objects
         if isinstance(term, TrackedName) or (isinstance(term, Variable) and term.name in bindings)
     ]
-    if not around or not terms:
+    if not operators or not terms:
         return None
     conditions = [Atom(presence.signal.name, "present", presence) for presence in map(presence_of, terms)]
     columns = evidence.columns(conditions)[:, :, : len(times_ns)]
@@ -332,20 +332,20 @@ def _while_present(
     if not absent or any((columns[0, place] < 0.0).all() for place in absent):
         return None
     condition = Boolean("and", tuple(conditions[place] for place in absent))
-    operator = nodes[around[-1]]
-    how: BooleanOperator = "->" if operator_of(operator) in ("G", "H") else "and"
+    operator = nodes[operators[-1]]
+    connective: BooleanOperator = "->" if operator_of(operator) in ("G", "H") else "and"
 
-    body = Boolean(how, (condition, *operands_of(operator)))
-    asked = with_operands(formula, around[-1], (body,))
-    both = joined_channels([leaves, columns], axis=1)
-    evaluated = evaluate_offline(asked, (*order, *conditions), both, times_ns)
+    body = Boolean(connective, (condition, *operands_of(operator)))
+    guarded_formula = with_operands(formula, operators[-1], (body,))
+    all_leaves = joined_channels([leaves, columns], axis=1)
+    evaluated = evaluate_offline(guarded_formula, (*order, *conditions), all_leaves, times_ns)
     # nodes before the operator and around it keep their ids
     verdict = final_verdict(*evaluated.interval(node))
     if verdict is Verdict.UNKNOWN:
         return None
     condition_text = " and ".join(conditions[place].text for place in absent)
     names = tuple(bindings.get(terms[place].name, terms[place]).name for place in absent)
-    return WhilePresent(names, f"{title_of(operator)} ({condition_text} {how} …)", verdict)
+    return WhilePresent(names, f"{title_of(operator)} ({condition_text} {connective} …)", verdict)
 
 
 def time_of_least(
