@@ -174,10 +174,10 @@ def _intervals_of(
     conjunct = invariant.conjunct
     if invariant.condition is None:
         return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
-    held = _Runs.of(is_asked & (nodes.ends(invariant.condition)[0] >= 0.0))
-    missed = np.unique(np.searchsorted(held.starts, runs.starts, side="right"))
+    condition_runs = _Runs.of(is_asked & (nodes.ends(invariant.condition)[0] >= 0.0))
+    missed = np.unique(np.searchsorted(condition_runs.starts, runs.starts, side="right"))
     condition = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
-    entries = len(held.starts), len(missed)
+    entries = len(condition_runs.starts), len(missed)
     return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals), condition, entries)
 
 
@@ -198,7 +198,7 @@ def _with_atoms(
     ]
     ends = [path.steps[-1].sample for path in (*paths, *responses, *conditions) if path is not None]
     scene_at = evidence.scenes(set(nodes.times_ns[ends].tolist())).__getitem__
-    for interval, path, asked in zip(intervals, paths, conditions, strict=True):
+    for interval, path, condition_path in zip(intervals, paths, conditions, strict=True):
         deciding = atom_of_path(evidence, nodes, path, scene_at)
         deciding_ns = int(nodes.times_ns[path.steps[-1].sample])
         closest = find_missed_response(evidence, nodes, path, scene_at).closest
@@ -207,7 +207,7 @@ def _with_atoms(
         if deciding is None:
             yield interval
             continue
-        place = _place_of(deciding) or _place_of(atom_of_path(evidence, nodes, asked, scene_at))
+        place = _place_of(deciding) or _place_of(atom_of_path(evidence, nodes, condition_path, scene_at))
         yield replace(interval, deciding=deciding, deciding_ns=deciding_ns, place=place)
 
 
@@ -234,10 +234,10 @@ def invariant_sentences(
         return
     often = counted(len(intervals), "interval")
     if invariant.condition is not None:
-        among = f"{missed:,} of {entries:,} entries of `{invariant.condition}`"
-        often = among if missed == len(intervals) else f"{often}, in {among}"
-    more = f"; the first {LISTED} are" if len(intervals) > LISTED else ""
-    yield Sentence(f"It is violated in {often}{more}:")
+        entries_text = f"{missed:,} of {entries:,} entries of `{invariant.condition}`"
+        often = entries_text if missed == len(intervals) else f"{often}, in {entries_text}"
+    list_note = f"; the first {LISTED} are" if len(intervals) > LISTED else ""
+    yield Sentence(f"It is violated in {often}{list_note}:")
     for interval in intervals[:LISTED]:
         yield _interval_sentence(interval, first_ns, units)
 
@@ -255,8 +255,8 @@ def _interval_sentence(interval: ViolatedInterval, first_ns: int, units: Mapping
     if interval.place is not None:
         parts.append(f", near ({', '.join(map(number_text, interval.place))})")
     if deciding is not None:
-        measured = " and ".join(deciding.unknown) or measurement_clause(deciding, units, first_ns)
-        parts += [": ", measured]
+        clause = " and ".join(deciding.unknown) or measurement_clause(deciding, units, first_ns)
+        parts += [": ", clause]
         if interval.deciding_ns not in (None, interval.worst_ns):
             parts += [" at ", Instant(interval.deciding_ns, first_ns)]
     return Sentence(*parts, ".")

@@ -179,10 +179,10 @@ class LogNumbers:
         self._add_ranges(trace)
 
     def _add_ranges(self, trace: Trace) -> None:
-        past = None if self._past is None or not self._reach else tail(self._past, self._reach)
-        around = trace if past is None else Trace.concatenate([past, trace])
-        self._past = around
-        scene = TraceScene(around, self._regions, len(around) - len(trace))
+        earlier_samples = None if self._past is None or not self._reach else tail(self._past, self._reach)
+        extended_trace = trace if earlier_samples is None else Trace.concatenate([earlier_samples, trace])
+        self._past = extended_trace
+        scene = TraceScene(extended_trace, self._regions, len(extended_trace) - len(trace))
         for key, threshold_range in self._ranges.items():
             number = replace(
                 threshold_range.atom,
@@ -377,12 +377,14 @@ def _doubts(atom: Atom, log: LogNumbers, threshold_range: ThresholdRange | None)
         yield f"{name} is never {text} in this log", hint
     for limit in limits:
         if _is_far(limit, threshold_range, is_length=bool(lengths)):
-            below = limit < threshold_range.least
-            end, side = (threshold_range.least, "below") if below else (threshold_range.greatest, "above")
-            what = "the distance is" if lengths else "its signal is" if atom.relation == "signal" else "it is"
+            is_below = limit < threshold_range.least
+            end, side = (threshold_range.least, "below") if is_below else (threshold_range.greatest, "above")
+            subject = (
+                "the distance is" if lengths else "its signal is" if atom.relation == "signal" else "it is"
+            )
             message = (
                 f"`{threshold_range.text}` {threshold_range.holds} holds in this log:"
-                f" {what} never {side} {end:.4g}"
+                f" {subject} never {side} {end:.4g}"
             )
             yield message, f"no value comes near {format_number(limit)}; is it the threshold you mean?"
 
@@ -407,12 +409,12 @@ def _doubts_of_window(text: str, bound: Bound, log: LogNumbers) -> Iterator[tupl
     if not log.samples:
         return
     in_time = bound.unit != "samples"
-    lasts = log.times_ns[1] - log.times_ns[0] if in_time else log.samples - 1
-    ends = f"{log.seconds:.3f} s" if in_time else counted(log.samples, "sample")
-    if bound.lower > lasts:
-        yield f"no sample of this log lies in the window {text}", f"the log has {ends}"
-    elif bound.upper is not None and bound.upper > lasts:
-        yield f"the window {text} is longer than this log", f"the log has {ends}, so its end decides"
+    length = log.times_ns[1] - log.times_ns[0] if in_time else log.samples - 1
+    length_text = f"{log.seconds:.3f} s" if in_time else counted(log.samples, "sample")
+    if bound.lower > length:
+        yield f"no sample of this log lies in the window {text}", f"the log has {length_text}"
+    elif bound.upper is not None and bound.upper > length:
+        yield f"the window {text} is longer than this log", f"the log has {length_text}, so its end decides"
 
 
 def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float:
@@ -452,18 +454,20 @@ def over_bindings(
 def bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
     """Yield every node, with the quantifiers that bind variables of it, from the outside in."""
     for spec in specification.results:
-        for node, around in iter_bound(spec.formula):
-            yield node, _binding(node, around, spec.parameter) if isinstance(node, Atom) else ()
+        for node, quantifiers in iter_bound(spec.formula):
+            yield node, _binding(node, quantifiers, spec.parameter) if isinstance(node, Atom) else ()
 
 
-def _binding(atom: Atom, around: tuple[Quantified, ...], parameter: str | None) -> tuple[Quantified, ...]:
+def _binding(
+    atom: Atom, quantifiers: tuple[Quantified, ...], parameter: str | None
+) -> tuple[Quantified, ...]:
     """Return those of the quantifiers around an atom that bind a variable of it, or of one that does.
 
     The objects of a template are all but those that the atom names: no distance to itself is meant.
     """
     variables = _variables([*terms_of(atom.expression), *atom.terms])
     bound: list[Quantified] = []
-    for quantifier in reversed(around):
+    for quantifier in reversed(quantifiers):
         if variables.intersection(quantifier.variables):
             bound.insert(0, quantifier)
             variables = variables.difference(quantifier.variables) | _variables([quantifier.group])

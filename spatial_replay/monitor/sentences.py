@@ -145,9 +145,9 @@ def find_causes(
         first.setdefault(conjunct.spec, conjunct)
     causes = []
     for conjunct in first.values():
-        at = settled_time(settled_ns, conjunct.node)
-        about = named.get(conjunct.spec)
-        witness, least = witnesses(conjunct.node, at)
+        settled_at_ns = settled_time(settled_ns, conjunct.node)
+        spec = named.get(conjunct.spec)
+        witness, least = witnesses(conjunct.node, settled_at_ns)
         causes.append(
             Cause(
                 conjunct.spec,
@@ -155,10 +155,10 @@ def find_causes(
                 format_formula(conjunct.formula),
                 _verdict(final, conjunct.node),
                 float(values[conjunct.node]),
-                at,
+                settled_at_ns,
                 witness,
-                None if about is None else about.id,
-                None if about is None else about.title,
+                None if spec is None else spec.id,
+                None if spec is None else spec.title,
                 least,
             )
         )
@@ -173,13 +173,13 @@ def find_least(
     Args:
         whole: what the formula itself is called.
     """
-    least = min(conjuncts, key=lambda each: _number(each.node, values, final))
-    robustness = _number(least.node, values, final)
-    if least.node == first.node or not robustness < _number(first.node, values, final):
+    least_conjunct = min(conjuncts, key=lambda each: _number(each.node, values, final))
+    robustness = _number(least_conjunct.node, values, final)
+    if least_conjunct.node == first.node or not robustness < _number(first.node, values, final):
         return None
-    has_own_name = least.spec not in (first.spec, whole)
-    name = least.spec if has_own_name else shortened_formula(format_formula(least.formula))
-    return LeastPart(least.spec, name, least.node, robustness)
+    has_own_name = least_conjunct.spec not in (first.spec, whole)
+    name = least_conjunct.spec if has_own_name else shortened_formula(format_formula(least_conjunct.formula))
+    return LeastPart(least_conjunct.spec, name, least_conjunct.node, robustness)
 
 
 def settled_time(settled_ns: Integers, node: int) -> int | None:
@@ -254,16 +254,16 @@ def sentences_of(
         sentences.append(_unknown_sentence(witness, witness.deciding, first_ns))
         sentences += [gap_sentence(gap, first_ns) for gap in witness.gaps]
         if (presence := witness.while_present) is not None:
-            are = "is" if len(presence.names) == 1 else "are"
-            what = f"Asked only while {' and '.join(presence.names)} {are} in the samples"
-            sentences.append(Sentence(f"{what}, it is {presence.verdict}: write `{presence.text}`."))
+            verb = "is" if len(presence.names) == 1 else "are"
+            clause = f"Asked only while {' and '.join(presence.names)} {verb} in the samples"
+            sentences.append(Sentence(f"{clause}, it is {presence.verdict}: write `{presence.text}`."))
     elif witness.verdict is Verdict.UNKNOWN:
         sentences.append(_uncertain_sentence(witness, witness.deciding, first_ns))
     else:
-        what = "What counts so far" if is_open else "What decides"
-        how = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
+        subject = "What counts so far" if is_open else "What decides"
+        outcome = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
         if witness.missed is None or not witness.missed.is_condition or is_open:
-            sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
+            sentences.append(Sentence(f"{subject} is `{witness.deciding.text}`, which ", outcome))
         if least is not None:
             sentences.append(_first_failure(flipping, first_ns))
         if flipping.closest is not None and flipping.closest_threshold is not None:
@@ -319,12 +319,14 @@ def verdict_sentence(
         least: the part that its number is of, if that is another than the first cause.
         least_at: when the first cause reaches its number, if that is later than what settled it.
     """
-    since = (", certain since ", certain_since) if certain_since is not None else ()
-    of = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
+    since_parts = (", certain since ", certain_since) if certain_since is not None else ()
+    part_text = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
     is_later = least_at is not None and str(least_at) != str(certain_since)
-    at = (", least at ", least_at) if least_at is not None and is_later else ()
-    how = f"{verdict}{_ENDED if has_ended else ''}"
-    return Sentence(f"{title} is {how}: {_robustness(*ends, unit)}", *since, *at, f"{of}.")
+    least_parts = (", least at ", least_at) if least_at is not None and is_later else ()
+    verdict_words = f"{verdict}{_ENDED if has_ended else ''}"
+    return Sentence(
+        f"{title} is {verdict_words}: {_robustness(*ends, unit)}", *since_parts, *least_parts, f"{part_text}."
+    )
 
 
 _TESTED = {"nothing": ", tested by nothing", "cut": ", cut by the end of the log"}
@@ -375,12 +377,12 @@ def how_text(
     Args:
         is_violated: whether it decides a violation: one that holds must not.
     """
-    how = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
+    outcome = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
     unwanted = "must not hold, and " if is_violated and number >= 0.0 else ""
     if not without_residue(number, atom):
-        return f"{unwanted}{how} by rounding" if number else f"{unwanted}just {how}"
+        return f"{unwanted}{outcome} by rounding" if number else f"{unwanted}just {outcome}"
     amount = f" by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else ""
-    return f"{unwanted}{how}{amount}"
+    return f"{unwanted}{outcome}{amount}"
 
 
 def uncertain_text(least: str) -> str:
@@ -416,10 +418,10 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
         return _join(*missed)
-    how = _how_it_decides(witness, deciding, first_ns)
+    outcome = _how_it_decides(witness, deciding, first_ns)
     if witness.missed is not None and witness.missed.response == deciding.text:
-        return Sentence(_missed_clause(witness.missed, first_ns), ": it ", how)
-    return _join(*missed, Sentence(f"`{deciding.text}` ", how))
+        return Sentence(_missed_clause(witness.missed, first_ns), ": it ", outcome)
+    return _join(*missed, Sentence(f"`{deciding.text}` ", outcome))
 
 
 def _join(first: Sentence, *others: Sentence) -> Sentence:
@@ -456,25 +458,25 @@ def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) ->
     deciding, closest = witness.deciding, []
     if witness.closest is not None:
         best, best_ns = witness.closest
-        measured = measurement_clause(best, witness.units, first_ns)
+        measurement = measurement_clause(best, witness.units, first_ns)
         if (best.text, best_ns) == (missed.response, missed.time_ns):
-            clause = Sentence(clause, ": ", measured)
+            clause = Sentence(clause, ": ", measurement)
         else:
-            at = Instant(best_ns, first_ns)
-            closest = [Sentence(f"`{best.text}` came closest at ", at, ": ", measured, ".")]
+            instant = Instant(best_ns, first_ns)
+            closest = [Sentence(f"`{best.text}` came closest at ", instant, ": ", measurement, ".")]
     sentences = [Sentence(clause, "."), *closest]
     if missed.is_condition and deciding is not None and not deciding.unknown:
-        measured = measurement_clause(deciding, witness.units, first_ns)
+        measurement = measurement_clause(deciding, witness.units, first_ns)
         # an operator such as `Y` measures in another sample
         own_time = () if witness.time_ns == missed.time_ns else (" at ", Instant(witness.time_ns, first_ns))
-        sentences.append(Sentence("The condition held: ", measured, *own_time, "."))
+        sentences.append(Sentence("The condition held: ", measurement, *own_time, "."))
     return tuple(sentences)
 
 
 def _missed_clause(missed: MissedResponse, first_ns: int) -> Sentence:
-    when = Instant(missed.time_ns, first_ns)
-    what = f"`{missed.response}` did not hold at "
-    return Sentence(what, when, f", when its condition `{missed.condition}` held")
+    instant = Instant(missed.time_ns, first_ns)
+    clause = f"`{missed.response}` did not hold at "
+    return Sentence(clause, instant, f", when its condition `{missed.condition}` held")
 
 
 def _how_it_decides(
@@ -484,14 +486,16 @@ def _how_it_decides(
     if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
         amount = least
     is_violated = witness.verdict is Verdict.VIOLATED and not is_open
-    how = how_text(amount, deciding.atom, witness.units, is_violated=is_violated)
+    outcome = how_text(amount, deciding.atom, witness.units, is_violated=is_violated)
     if abs(least) < abs(amount) and without_residue(amount, deciding.atom):
-        how += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
-    where = _in_time(witness)
+        outcome += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
+    window_text = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
-        where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
-    what = measurement_clause(deciding, witness.units, first_ns)
-    return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: ", what, ".")
+        window_text = _in_time_of_all(witness, deciding, "so far " if is_open else "")
+    measurement = measurement_clause(deciding, witness.units, first_ns)
+    return Sentence(
+        f"{outcome} at ", Instant(witness.time_ns, first_ns), f"{window_text}: ", measurement, "."
+    )
 
 
 def measurement_clause(deciding: DecidingAtom, units: Mapping[str, str], first_ns: int) -> Sentence:
@@ -511,16 +515,16 @@ def measurement_clause(deciding: DecidingAtom, units: Mapping[str, str], first_n
 def _change(measured: Measured, units: Mapping[str, str], first_ns: int) -> Sentence:
     """Return by how much something changed between two reports, and at which rate."""
     before_ns, now_ns = measured.reports_ns or (0, 0)
-    names, of = measured.names, measured.names[0] if measured.quantity == "rate" else ""
-    change = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(of, ""))
-    rate = with_unit(abs(measured.value), per_second(units.get(of, "")) or "a second")
-    how = f"{names[0]} moved"
-    if of:
-        how = f"{of} {'rose' if measured.value > 0.0 else 'fell'}"
+    names, signal_name = measured.names, measured.names[0] if measured.quantity == "rate" else ""
+    change = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(signal_name, ""))
+    rate = with_unit(abs(measured.value), per_second(units.get(signal_name, "")) or "a second")
+    motion = f"{names[0]} moved"
+    if signal_name:
+        motion = f"{signal_name} {'rose' if measured.value > 0.0 else 'fell'}"
     elif len(names) == 2:
-        how = f"{names[0]} and {names[1]} {'approached' if measured.value > 0.0 else 'parted'}"
+        motion = f"{names[0]} and {names[1]} {'approached' if measured.value > 0.0 else 'parted'}"
     times = Instant(before_ns, first_ns), " to ", Instant(now_ns, first_ns)
-    return Sentence(f"{how} by {change} from ", *times, f", {'by' if of else 'at'} {rate}")
+    return Sentence(f"{motion} by {change} from ", *times, f", {'by' if signal_name else 'at'} {rate}")
 
 
 def _end(deciding: DecidingAtom) -> float:
@@ -552,11 +556,11 @@ def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> st
     for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator == unsure:
             break
-        where = f"{so_far}within `{_step_title(witness, place)}`"
+        window_text = f"{so_far}within `{_step_title(witness, place)}`"
         if step.operator in ("F", "O") and passed <= {"or", "spec"}:
-            return f" (its greatest {where})"
+            return f" (its greatest {window_text})"
         if step.operator in ("G", "H") and passed <= {"and", "spec"}:
-            return f" (its least {where})"
+            return f" (its least {window_text})"
         if step.operator not in ("and", "or", "spec"):
             break
         passed.add(step.operator)
@@ -585,14 +589,14 @@ def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
         case "present":
             return f"{names[0]} is {'' if value else 'not '}in the sample"
         case "speed" | "rate":
-            of = names[0] if measured.quantity == "rate" else ""
-            size = with_unit(abs(value), per_second(units.get(of, "")))
+            signal_name = names[0] if measured.quantity == "rate" else ""
+            size = with_unit(abs(value), per_second(units.get(signal_name, "")))
             if len(names) == 2:
                 return f"{names[0]} and {names[1]} {'approach' if value > 0.0 else 'part'} at {size}"
             if value == 0.0:
-                return f"{names[0]} {'does not change' if of else 'stands still'}"
+                return f"{names[0]} {'does not change' if signal_name else 'stands still'}"
             return f"{names[0]} " + (
-                f"{'rises' if value > 0.0 else 'falls'} by {size}" if of else f"moves at {size}"
+                f"{'rises' if value > 0.0 else 'falls'} by {size}" if signal_name else f"moves at {size}"
             )
         case "signal":
             unit = units.get(names[0], "")
@@ -629,14 +633,14 @@ def _flip(
         would = "It would not have been violated then"
     if threshold.is_written:
         is_idle = deciding is witness.deciding and witness.missed is not None and witness.missed.is_condition
-        why = ", as the condition would not hold there" if is_idle else ""
-        return f"{would} with {_limit(threshold)} {_place(deciding, threshold)}{why}."
+        reason = ", as the condition would not hold there" if is_idle else ""
+        return f"{would} with {_limit(threshold)} {_place(deciding, threshold)}{reason}."
     if threshold.replacement:
         return f"{would} with `{threshold.replacement}` instead of `{deciding.text}`."
     unit = declared_unit(deciding.atom, witness.units, is_scaled=False)
     margin = with_unit(abs(threshold.flips_at), unit)
-    more = "more" if threshold.flips_at < 0.0 else "less"
-    return f"{would} in a log in which `{deciding.text}` holds by {margin} {more}."
+    direction = "more" if threshold.flips_at < 0.0 else "less"
+    return f"{would} in a log in which `{deciding.text}` holds by {margin} {direction}."
 
 
 def _limit(threshold: Threshold) -> str:
@@ -672,17 +676,17 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     begin_ns, end_ns = gap.longest_ns
     length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"
     if gap.name is None:
-        lost = "the connection was lost, or topics were silent"
+        lost_text = "the connection was lost, or topics were silent"
         if not gap.is_filled and end_ns - begin_ns < 10**6:
-            return Sentence("Everything is unknown at ", Instant(begin_ns, first_ns), f": {lost}.")
+            return Sentence("Everything is unknown at ", Instant(begin_ns, first_ns), f": {lost_text}.")
         place = (Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length)
         last_ns = end_ns - 1 if gap.is_filled else begin_ns
-        others = "" if (gap.first_ns, gap.last_ns) == (begin_ns, last_ns) else ", and at other times"
-        why = "`max_gap` makes that unknown" if gap.is_filled else lost
-        return Sentence("The samples pause from ", *place, f"{others}: {why}.")
+        elsewhere = "" if (gap.first_ns, gap.last_ns) == (begin_ns, last_ns) else ", and at other times"
+        reason = "`max_gap` makes that unknown" if gap.is_filled else lost_text
+        return Sentence("The samples pause from ", *place, f"{elsewhere}: {reason}.")
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")
-    many = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"
+    count_text = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"
     if gap.window is not None:
         parts: list[str | Instant] = []
         options = []
@@ -691,13 +695,13 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
                 parts += [" or " if parts else "", word, Instant(at_ns, first_ns)]
                 # whole milliseconds, not past the sample
                 options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
-        on = " on" if gap.window[1] is not None else ""
-        return Sentence(f"{many}, all ", *parts, f"{on}: {' '.join(options)} leaves them out.")
+        onwards = " on" if gap.window[1] is not None else ""
+        return Sentence(f"{count_text}, all ", *parts, f"{onwards}: {' '.join(options)} leaves them out.")
     if gap.first_ns == gap.last_ns:
-        return Sentence(f"{many}, at ", Instant(begin_ns, first_ns), ".")
-    how = "all" if begin_ns <= gap.first_ns and gap.last_ns <= end_ns else "the longest time"
+        return Sentence(f"{count_text}, at ", Instant(begin_ns, first_ns), ".")
+    extent = "all" if begin_ns <= gap.first_ns and gap.last_ns <= end_ns else "the longest time"
     begin, end = Instant(begin_ns, first_ns), Instant(end_ns, first_ns)
-    return Sentence(f"{many}, {how} from ", begin, " to ", end, f"{length}.")
+    return Sentence(f"{count_text}, {extent} from ", begin, " to ", end, f"{length}.")
 
 
 def open_text(witness: Witness) -> str:
@@ -723,13 +727,13 @@ def _uncertain_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int)
 
 def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
     """Name what leaves the robustness open, where the verdict is known."""
-    when = Instant(time_ns, first_ns)
+    instant = Instant(time_ns, first_ns)
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)
-        return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", when, f", {reasons}.")
-    between = _between(deciding, units)
-    what = f"By how much is uncertain: the robustness of `{deciding.text}` lies {between} at "
-    return Sentence(what, when, ".")
+        return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", instant, f", {reasons}.")
+    limits = _between(deciding, units)
+    clause = f"By how much is uncertain: the robustness of `{deciding.text}` lies {limits} at "
+    return Sentence(clause, instant, ".")
 
 
 _DEAD_ENDS = {
@@ -745,8 +749,8 @@ def _dead_end(step: WitnessStep, first_ns: int) -> Sentence:
     text = shortened_formula(step.text)
     if step.operator in ("true", "false"):
         return Sentence(f"What decides is the constant `{text}`.")
-    why = _DEAD_ENDS.get(step.operator, "no sample lies in its window")
+    reason = _DEAD_ENDS.get(step.operator, "no sample lies in its window")
     if step.leaves_out:
-        within = "object in its group" if step.operator in ("forall", "exists") else "sample in its window"
-        why = f"no {within} has a rate"
-    return Sentence(f"What decides is `{text}` at ", Instant(step.time_ns, first_ns), f": {why}.")
+        member = "object in its group" if step.operator in ("forall", "exists") else "sample in its window"
+        reason = f"no {member} has a rate"
+    return Sentence(f"What decides is `{text}` at ", Instant(step.time_ns, first_ns), f": {reason}.")

@@ -266,15 +266,19 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
                 node,
             )
         if sides[0]:
-            both = _join_implications("and", sides[0], node)
-            response = _Implications(Boolean("not", (both.formula,)), (node, *both.nodes))
+            conjunction = _join_implications("and", sides[0], node)
+            response = _Implications(Boolean("not", (conjunction.formula,)), (node, *conjunction.nodes))
             return _join_implications("->", (_join_implications("or", sides[0], node), response), node)
     if not isinstance(formula, Boolean | Temporal):
         return _Implications(formula, (node,))
     signs = [_sign_below(operator, place, sign) for place in range(len(operands))]
-    below = [_implications_of(*part, sign_below) for part, sign_below in zip(operands, signs, strict=True)]
-    whole = replace(formula, operands=tuple(part.formula for part in below))
-    return _Implications(whole, (node, *(identifier for part in below for identifier in part.nodes)))
+    operand_parts = [
+        _implications_of(*part, sign_below) for part, sign_below in zip(operands, signs, strict=True)
+    ]
+    new_formula = replace(formula, operands=tuple(part.formula for part in operand_parts))
+    return _Implications(
+        new_formula, (node, *(identifier for part in operand_parts for identifier in part.nodes))
+    )
 
 
 def _operands_with_ids(formula: Formula, node: int) -> Iterator[tuple[Formula, int]]:
@@ -364,15 +368,15 @@ def _scopes(
     scopes = [np.arange(len(windows.times_ns)) == 0] * len(tree)
     for scope, (node, operands) in zip(scopes, tree, strict=True):
         for place, operand in enumerate(operands):
-            within = scope
+            operand_scope = scope
             if isinstance(node, Temporal):
-                within = _below(node, place, scope, windows)
-                read = judged(node).operands[place]
-                if operator_of(read) in ("given", "with"):
-                    within = within & holding(operands_of(read)[0])
+                operand_scope = _below(node, place, scope, windows)
+                judged_operand = judged(node).operands[place]
+                if operator_of(judged_operand) in ("given", "with"):
+                    operand_scope = operand_scope & holding(operands_of(judged_operand)[0])
             elif is_conditional and place and operator_of(node) == "->" and scope.any():
-                within = scope & holding(operands_of(node)[0])
-            scopes[operand] = within
+                operand_scope = scope & holding(operands_of(node)[0])
+            scopes[operand] = operand_scope
     return scopes
 
 
@@ -392,8 +396,8 @@ def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) ->
     is_open = begin < end
     np.add.at(edges, begin[is_open], 1)
     np.add.at(edges, end[is_open], -1)
-    covered: _Samples = np.cumsum(edges[:-1]) > 0
-    return covered
+    is_covered: _Samples = np.cumsum(edges[:-1]) > 0
+    return is_covered
 
 
 # --------------------------------------------------------------------------------------------- reasons
@@ -418,18 +422,19 @@ def _empty_windows(
         (begin, end), times_ns = windows(node), windows.times_ns
         counts = active_scope if active_scope.any() else scope
         if not (begin < end)[counts].any():
-            where = " where it counts" if (begin < end)[scope].any() else ""
-            what: tuple[str | Instant, ...] = (f"no sample of the log lies in its window{where}",)
-            after = int(begin[counts][0])
+            place_text = " where it counts" if (begin < end)[scope].any() else ""
+            predicate: tuple[str | Instant, ...] = (f"no sample of the log lies in its window{place_text}",)
+            begin_sample = int(begin[counts][0])
             if node.operator in _NEXT:
-                what = (f"the log has no {_NEXT[node.operator]}{where}",)
-            elif 0 < after < len(times_ns):
-                between = (
-                    Instant(int(time), evidence.first_ns()) for time in times_ns[after - 1 : after + 1]
+                predicate = (f"the log has no {_NEXT[node.operator]}{place_text}",)
+            elif 0 < begin_sample < len(times_ns):
+                instants = (
+                    Instant(int(time), evidence.first_ns())
+                    for time in times_ns[begin_sample - 1 : begin_sample + 1]
                 )
-                first = "first " if counts.sum() > 1 else ""
-                what += (f", {first}between those at ", next(between), " and ", next(between))
-            yield _Idle(identifier, "empty window", ("was never tested: ", *what, "."))
+                first_text = "first " if counts.sum() > 1 else ""
+                predicate += (f", {first_text}between those at ", next(instants), " and ", next(instants))
+            yield _Idle(identifier, "empty window", ("was never tested: ", *predicate, "."))
 
 
 def _idle_implications(
@@ -449,8 +454,8 @@ def _untested_implication(
     identifier: int, implication: Boolean, evidence: Evidence, where: str = ""
 ) -> _Idle:
     antecedent = format_formula(evidence.bound(implication.operands[0]))
-    what = f"was never tested: `{antecedent}` never held{where}."
-    return _Idle(identifier, "antecedent never held", (what,))
+    predicate = f"was never tested: `{antecedent}` never held{where}."
+    return _Idle(identifier, "antecedent never held", (predicate,))
 
 
 def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence) -> Iterator[_Idle]:
@@ -516,8 +521,8 @@ def _empty_groups(
         empty = [group for group in node_groups if not groups[group]]
         if empty:
             names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty))
-            what = f"decided nothing: no object was ever in {names}."
-            yield _Idle(identifier, "no members", (what,))
+            predicate = f"decided nothing: no object was ever in {names}."
+            yield _Idle(identifier, "no members", (predicate,))
 
 
 def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
@@ -528,8 +533,8 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
             excluded = tuple(
                 excluded_term for excluded_term in group.excluded if isinstance(excluded_term, TrackedName)
             )
-            whole = replace(group, excluded=excluded)
-            yield replace(term, term=whole) if isinstance(term, Earlier) else whole
+            full_group = replace(group, excluded=excluded)
+            yield replace(term, term=full_group) if isinstance(term, Earlier) else full_group
 
 
 def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence) -> bool:
@@ -548,22 +553,24 @@ def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence)
     )
 
 
-def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
+def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idle]:
     """Yield why a result is infinite, from the node that its number is of."""
     if leaves_out(node):
-        within = "object in its group" if isinstance(node, Quantified) else "sample in its window"
-        what = ("decides at ", when, f", where no {within} has a rate.")
-        yield _Idle(identifier, "no rate", what, when.time_ns)
+        member = "object in its group" if isinstance(node, Quantified) else "sample in its window"
+        predicate = ("decides at ", instant, f", where no {member} has a rate.")
+        yield _Idle(identifier, "no rate", predicate, instant.time_ns)
     elif isinstance(node, Temporal):
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
-        what = ("decides at ", when, f", where it looks {side} of the log.")
-        yield _Idle(identifier, "past the end", what, when.time_ns)
-    elif isinstance(node, Atom | Quantified) and not any(isinstance(e, Equality) for e in iter_parts(node)):
+        predicate = ("decides at ", instant, f", where it looks {side} of the log.")
+        yield _Idle(identifier, "past the end", predicate, instant.time_ns)
+    elif isinstance(node, Atom | Quantified) and not any(
+        isinstance(part, Equality) for part in iter_parts(node)
+    ):
         # comparing a mode makes it infinite with members in its groups, too
         count = len(node.variables) if isinstance(node, Quantified) else 1
         members = "no object is" if count == 1 else f"fewer than {count} objects are"
-        what = ("decides at ", when, f", where {members} in its group.")
-        yield _Idle(identifier, "no members", what, when.time_ns)
+        predicate = ("decides at ", instant, f", where {members} in its group.")
+        yield _Idle(identifier, "no members", predicate, instant.time_ns)
 
 
 def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Sentence, ...]:
@@ -625,16 +632,20 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
                     formula, operands=(condition, with_stand_ins(body, in_antecedent=in_antecedent))
                 )
             case Boolean() | Temporal():
-                read = judged(formula).operands if isinstance(formula, Temporal) else formula.operands
-                operands = [with_stand_ins(operand, in_antecedent=in_antecedent) for operand in read]
+                judged_operands = (
+                    judged(formula).operands if isinstance(formula, Temporal) else formula.operands
+                )
+                operands = [
+                    with_stand_ins(operand, in_antecedent=in_antecedent) for operand in judged_operands
+                ]
                 return replace(formula, operands=tuple(operands))
             case Atom() | Quantified() if in_antecedent:
                 return stand_ins[leaf_key(formula)]
         return formula
 
-    both = joined_channels([unknown, known_leaves], axis=1)
+    all_leaves = joined_channels([unknown, known_leaves], axis=1)
     formula = with_stand_ins(_implications_of(instance.formula).formula)
-    nodes = evaluate_offline(formula, (*order, *stand_ins.values()), both, times_ns)
+    nodes = evaluate_offline(formula, (*order, *stand_ins.values()), all_leaves, times_ns)
     return final_verdict(*nodes.interval(0)) is verdict
 
 
@@ -693,11 +704,11 @@ def find_cut_window(
         return None
     order = instance.program.leaves
     cut_nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
-    whole = evaluate_with_whole_windows(instance.formula, order, leaves, times_ns)
-    cut_verdict, whole_verdict = (final_verdict(*nodes.interval(0)) for nodes in (cut_nodes, whole))
+    whole_nodes = evaluate_with_whole_windows(instance.formula, order, leaves, times_ns)
+    cut_verdict, whole_verdict = (final_verdict(*nodes.interval(0)) for nodes in (cut_nodes, whole_nodes))
     if cut_verdict is not verdict or whole_verdict is verdict:
         return None
-    ranks = _rank_by_verdict(cut_nodes, whole, is_violated=verdict is Verdict.VIOLATED)
+    ranks = _rank_by_verdict(cut_nodes, whole_nodes, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
     # 1 and -1 are where a cut window decides
@@ -713,10 +724,10 @@ def _is_cut_at(node: Formula, sample: int, times_ns: Integers) -> bool:
 def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) -> _Idle:
     """Return that a window is cut at a sample, and how far it reaches beyond the log."""
     identifier, sample = step.node, step.sample
-    when = Instant(int(times_ns[sample]), evidence.first_ns())
+    instant = Instant(int(times_ns[sample]), evidence.first_ns())
     bound = node.bound if isinstance(node, Temporal) else None
     if bound is None or bound.upper is None:
-        beyond = "the log has no next sample"
+        reach_text = "the log has no next sample"
     else:
         is_time = bound.unit == "ns"
         # places in time or in samples: of the window's begin and end, and of the log's end
@@ -728,13 +739,13 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
             time_text(n) if is_time else counted(n, "sample") for n in (missing_length, length)
         )
         seen_text = time_text(seen_length) if is_time else f"{seen_length:,}"
-        beyond = f"its window ends {left_text} after the log"
-        beyond += f" ({seen_text} of {whole_text} seen)" if length else ""
+        reach_text = f"its window ends {left_text} after the log"
+        reach_text += f" ({seen_text} of {whole_text} seen)" if length else ""
     return _Idle(
         identifier,
         "cut window",
-        ("decides at ", when, f", where {beyond}: a longer log may change the verdict."),
-        when.time_ns,
+        ("decides at ", instant, f", where {reach_text}: a longer log may change the verdict."),
+        instant.time_ns,
     )
 
 
@@ -744,6 +755,8 @@ def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violate
     Ranks go through minima, maxima and negations as numbers do, so that a path by them leads to a cut window.
     """
     holds = np.greater if is_violated else np.greater_equal
-    both = [nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (cut_nodes, whole)]
-    low = sum(holds(low, 0.0) * 1.0 for low, _ in both)
-    return replace(cut_nodes, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in both)]))
+    end_pairs = [
+        nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (cut_nodes, whole)
+    ]
+    low = sum(holds(low, 0.0) * 1.0 for low, _ in end_pairs)
+    return replace(cut_nodes, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in end_pairs)]))
