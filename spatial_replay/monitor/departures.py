@@ -143,7 +143,8 @@ class Departures:
             return
         early_samples = [_early(trace, members, *turn) for turn in turns]
         sample_triples = [
-            (first, sample - 1, sample) for first, (sample, _) in zip(early_samples, turns, strict=True)
+            (early_sample, sample - 1, sample)
+            for early_sample, (sample, _) in zip(early_samples, turns, strict=True)
         ]
         member_columns = np.array([trace.names.index(names[column]) for _, column in turns])
         distances = self._distances(visitors, member_columns, np.array(sample_triples), trace)
@@ -153,10 +154,10 @@ class Departures:
         ):
             key, times_ns = (visitors, names[column]), trace.times_ns[list(triple)].tolist()
             if not members[sample, column]:
-                why = _why_absent(visitors, names[column], trace, sample)
+                reason = _why_absent(visitors, names[column], trace, sample)
                 early_ns, last_ns, start_ns = times_ns
                 self._absent[key] = _Absence(
-                    why,
+                    reason,
                     early_ns,
                     last_ns,
                     start_ns,
@@ -199,17 +200,21 @@ class Departures:
         span_ns = max(absence.last_ns - absence.early_ns, 1)
         # a group without members is infinitely far away, and no member approaches it
         with np.errstate(invalid="ignore"):
-            approach = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
-        for watch, close, last, back in zip(
-            self._watches[visitors], approach.tolist(), absence.last.tolist(), distances.tolist(), strict=True
+            approaches = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
+        for watch, approach, last_distance, return_distance in zip(
+            self._watches[visitors],
+            approaches.tolist(),
+            absence.last.tolist(),
+            distances.tolist(),
+            strict=True,
         ):
-            was_near = last - watch.threshold < max(watch.threshold or absence.size, close)
-            if was_near or back - watch.threshold < (watch.threshold or size):
+            was_near = last_distance - watch.threshold < max(watch.threshold or absence.size, approach)
+            if was_near or return_distance - watch.threshold < (watch.threshold or size):
                 start, end = Instant(absence.start_ns, 0), Instant(end_ns, 0)
-                distance, when = (last, "before") if was_near else (back, "after")
-                away = f"it was {with_unit(distance, self._unit)} away {when}"
-                text = f"; {away}, from {format_term(_without(watch.reference, name))}"
-                message = Sentence(absence.why, " from ", start, " to ", end, text)
+                distance, side = (last_distance, "before") if was_near else (return_distance, "after")
+                distance_text = f"it was {with_unit(distance, self._unit)} away {side}"
+                text = f"; {distance_text}, from {format_term(_without(watch.reference, name))}"
+                message = Sentence(absence.reason, " from ", start, " to ", end, text)
                 self.departures.append(Departure(name, absence.start_ns, end_ns, distance, message))
                 return
 
@@ -225,7 +230,7 @@ class _Absence(NamedTuple):
         size: its own in the second.
     """
 
-    why: str
+    reason: str
     early_ns: int
     last_ns: int
     start_ns: int
@@ -264,19 +269,19 @@ def _why_absent(visitors: _Visitors, name: str, trace: Trace, sample: int) -> st
     row = int(trace.rows[sample, trace.names.index(name)])
     if row == ABSENT or isinstance(visitors, TrackedName):
         return f"{printable(name)} was not in the log"
-    current = trace.classes[trace.class_code[row if row >= 0 else -2 - row]]
-    instead = f" but {printable(current)!r}" if current else ""
-    return f"{printable(name)} was not of the class {printable(visitors.class_name or '')!r}{instead}"
+    class_name = trace.classes[trace.class_code[row if row >= 0 else -2 - row]]
+    class_text = f" but {printable(class_name)!r}" if class_name else ""
+    return f"{printable(name)} was not of the class {printable(visitors.class_name or '')!r}{class_text}"
 
 
 def _watches_of(instance: Instance) -> Iterator[_Watch]:
     formula = substitute(instance.formula, instance.bindings)
     present_terms = {part.term for part in iter_parts(formula) if isinstance(part, Present)}
-    for node, around in iter_bound(formula):
+    for node, quantifiers in iter_bound(formula):
         distances = list(_distances_of(node)) if isinstance(node, Atom) else []
         if not isinstance(node, Atom) or len(distances) != 1:
             continue
-        groups = {variable: scope.group for scope in around for variable in scope.variables}
+        groups = {variable: scope.group for scope in quantifiers for variable in scope.variables}
         terms = distances[0].first, distances[0].second
         limits = (abs(limit) for limit in node.parameters if isinstance(limit, float))
         threshold = max(limits, default=0.0) + sum(map(_enlargement, terms))

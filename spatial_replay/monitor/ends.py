@@ -163,12 +163,12 @@ class RunEnds:
     def _note(self, trace: Trace) -> None:
         times_ns = trace.times_ns
         for span in trace.spans:
-            before = self._spans.get(span.topic)
-            self._spans[span.topic] = span if before is None else before.join(span)
+            earlier_span = self._spans.get(span.topic)
+            self._spans[span.topic] = span if earlier_span is None else earlier_span.join(span)
             # the first sample after the last one in which the topic could be judged
-            after = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
-            since_ns = int(times_ns[after]) if after < len(times_ns) else None
-            if after == 0 and before is not None and self._since_ns[span.topic] is not None:
+            next_sample = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
+            since_ns = int(times_ns[next_sample]) if next_sample < len(times_ns) else None
+            if next_sample == 0 and earlier_span is not None and self._since_ns[span.topic] is not None:
                 since_ns = self._since_ns[span.topic]
             self._since_ns[span.topic] = since_ns
 
@@ -197,42 +197,45 @@ class RunEnds:
         self.late = tuple(span.topic for span, delay in delays if delay > self._limit_ns(span))
         in_time = [span for span, delay in delays if delay <= self._limit_ns(span)]
         self.begin_ns = max((span.first_ns or 0 for span in in_time), default=self.log_begin_ns)
-        last = max(in_time, key=lambda span: span.first_ns or 0, default=None)
-        if last is not None and self.begin_ns > self.log_begin_ns:
-            self._remark_begin(last, self.begin_ns)
+        latest_span = max(in_time, key=lambda span: span.first_ns or 0, default=None)
+        if latest_span is not None and self.begin_ns > self.log_begin_ns:
+            self._remark_begin(latest_span, self.begin_ns)
 
     def _remark_begin(self, span: TopicSpan, begin_ns: int) -> None:
         times_ns = np.concatenate([trace.times_ns for trace in self._held])
         left_out = times_ns[times_ns < begin_ns]
-        why: list[str | Instant] = [f"no transform places {span.topic} before"]
+        reason: list[str | Instant] = [f"no transform places {span.topic} before"]
         if span.begun_ns is not None and span.begun_ns > int(left_out[-1]):
-            why = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
-        self._remark("beginning", left_out, why)
+            reason = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
+        self._remark("beginning", left_out, reason)
 
     def _remark_late(self, span: TopicSpan) -> None:
         """Say that objects are absent before a topic that was not waited for."""
         if span.pattern is None or span.begun_ns is None or span.begun_ns <= self.log_begin_ns:
             return
         limit = format_duration(self._limit_ns(span))
-        why = f", more than {limit} after the first sample: its objects are absent before,"
+        reason = f", more than {limit} after the first sample: its objects are absent before,"
         begun = Instant(span.begun_ns, 0)
-        self.remarks = (*self.remarks, Sentence(f"{span.topic} begins at ", begun, why, " also from groups"))
+        self.remarks = (
+            *self.remarks,
+            Sentence(f"{span.topic} begins at ", begun, reason, " also from groups"),
+        )
 
     def _remark_end(self) -> None:
         span = min(self._open_spans(), key=lambda span: self._since_ns[span.topic] or FOREVER)
         times_ns = np.concatenate([trace.times_ns for trace in self._held])
         left_out = times_ns[times_ns >= self.end_ns]
-        why: list[str | Instant] = [f"no transform places {span.topic} then"]
+        reason: list[str | Instant] = [f"no transform places {span.topic} then"]
         if span.heard_ns is not None and self.end_ns - span.heard_ns > span.limit_ns:
-            why = [f"{span.topic} ends at ", Instant(span.heard_ns, 0)]
-        self._remark("end", left_out, why)
+            reason = [f"{span.topic} ends at ", Instant(span.heard_ns, 0)]
+        self._remark("end", left_out, reason)
 
-    def _remark(self, which: str, left_out: Integers, why: Iterable[str | Instant]) -> None:
+    def _remark(self, which: str, left_out: Integers, reason: Iterable[str | Instant]) -> None:
         first, last = (Instant(int(at), 0) for at in left_out[[0, -1]])
         count = counted(len(left_out), "sample")
-        are = "is" if len(left_out) == 1 else "are"
-        when = ("at ", first) if len(left_out) == 1 else ("from ", first, " to ", last)
-        sentence = Sentence(f"{count} at the {which} {are} left out, ", *when, ": ", *why)
+        verb = "is" if len(left_out) == 1 else "are"
+        times = ("at ", first) if len(left_out) == 1 else ("from ", first, " to ", last)
+        sentence = Sentence(f"{count} at the {which} {verb} left out, ", *times, ": ", *reason)
         self.remarks = (*self.remarks, sentence)
 
     def _open_spans(self) -> Iterator[TopicSpan]:

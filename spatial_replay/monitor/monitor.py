@@ -351,7 +351,7 @@ class Monitor:
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends here; unknown before the first sample."""
         results = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
-        endings = (_ending(spec, final, last, unit) for spec, final, last, unit in results)
+        endings = (_ending(spec, final, numbers, unit) for spec, final, numbers, unit in results)
         return tuple(
             ending._replace(reason=self._unknown[index].reason) if index in self._unknown else ending
             for index, ending in enumerate(endings)
@@ -399,9 +399,9 @@ class Monitor:
         require_sample(sample)
         time_ns = sample.time_ns
         if time_ns <= self._last_ns:
-            at, last = times_apart(time_ns, self._last_ns)
+            time, last_time = times_apart(time_ns, self._last_ns)
             raise TraceError(
-                f"a sample at {at} follows one at {last}; give samples in the order of their times"
+                f"a sample at {time} follows one at {last_time}; give samples in the order of their times"
             )
         remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
         if remarks is not self._settlement.remarks:
@@ -498,8 +498,8 @@ class _AwaitedNames:
                     names_so_far.update(new_names)
 
     def _diagnose_missing_names(self) -> tuple[Diagnostic, ...]:
-        after = self._after or 0
-        during = time_text(after) if self._is_time else counted(after, "sample")
+        limit = self._after or 0
+        during = time_text(limit) if self._is_time else counted(limit, "sample")
         objects, signals, classes = self._known
         diagnostics = check_names(
             self._specification,
@@ -611,8 +611,8 @@ class Violation:
 
 def _has_factor(atom: Atom) -> bool:
     """Return whether what an atom measures is multiplied: its amount is not that of the signal then."""
-    whole = atom.expression.operand if isinstance(atom.expression, Scaled) else atom.expression
-    return any(isinstance(part, Product | Scaled) for part in iter_expressions(whole))
+    expression = atom.expression.operand if isinstance(atom.expression, Scaled) else atom.expression
+    return any(isinstance(part, Product | Scaled) for part in iter_expressions(expression))
 
 
 def _settling_number(atom: DecidingAtom) -> float:
@@ -622,8 +622,8 @@ def _settling_number(atom: DecidingAtom) -> float:
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
     is_violated = witness.verdict is Verdict.VIOLATED
-    how = how_text(_settling_number(atom), atom.atom, witness.units, is_violated=is_violated)
-    return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
+    outcome = how_text(_settling_number(atom), atom.atom, witness.units, is_violated=is_violated)
+    return f"`{atom.text}` {outcome} at {Instant(witness.time_ns, first_ns)}"
 
 
 def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
@@ -633,13 +633,13 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
         signed = []
     if len(signed) == 1 and len(atom.measured) == 1:
         (sign, part), *_ = signed
-        (measured,) = atom.measured
+        (measurement,) = atom.measured
         needs_more = (sign > 0) == (atom.end is End.HIGH)
-        if measured.quantity == "signed_distance":
-            first, second = measured.names
-            where = f"too close to {second}" if needs_more else f"too far from {second}"
-            return f"{first} is {amount} {where}"
-        if measured.quantity == "signal" and not isfinite(_settling_number(atom)):
+        if measurement.quantity == "signed_distance":
+            first, second = measurement.names
+            misplacement = f"too close to {second}" if needs_more else f"too far from {second}"
+            return f"{first} is {amount} {misplacement}"
+        if measurement.quantity == "signal" and not isfinite(_settling_number(atom)):
             return measurement_clause(atom, {}, 0)
         if isinstance(part, Signal):
             return f"{part.name} is {amount} too {'low' if needs_more else 'high'}"
@@ -783,24 +783,24 @@ class ViolationLog:
         self._samples.append(sample)
         settled, satisfied = self.settled, self.satisfied
         for index, spec, conjuncts in self._open:
-            after = numbers[index]
-            if after is None:
+            spec_numbers = numbers[index]
+            if spec_numbers is None:
                 continue
-            if conjuncts and after.item(0, 3) < 0.0:
-                self._settle(spec, conjuncts, after)
-            elif index in self._unsatisfied and after.item(0, 2) >= 0.0:
+            if conjuncts and spec_numbers.item(0, 3) < 0.0:
+                self._settle(spec, conjuncts, spec_numbers)
+            elif index in self._unsatisfied and spec_numbers.item(0, 2) >= 0.0:
                 del self._unsatisfied[index]
-                whole = Conjunct(0, spec.name, spec.formula)
+                conjunct = Conjunct(0, spec.name, spec.formula)
                 newly_satisfied = self._verdict_with_samples(
-                    spec, whole, Verdict.SATISFIED, float(after[0, 2])
+                    spec, conjunct, Verdict.SATISFIED, float(spec_numbers[0, 2])
                 )
                 self.satisfied = (*self.satisfied, newly_satisfied)
         return self.settled is not settled or self.satisfied is not satisfied
 
     def unknown(self, spec: NamedSpec) -> Settled:
         """Return a result that is unknown since the newest sample, if the run ends there."""
-        whole = Conjunct(0, spec.name, spec.formula)
-        return self._verdict_with_samples(spec, whole, Verdict.UNKNOWN, float("nan"))
+        conjunct = Conjunct(0, spec.name, spec.formula)
+        return self._verdict_with_samples(spec, conjunct, Verdict.UNKNOWN, float("nan"))
 
     def _settle(self, spec: NamedSpec, conjuncts: list[Conjunct], numbers: Floats) -> None:
         for conjunct in tuple(conjuncts):

@@ -495,10 +495,10 @@ class SpecResult(Displayed):
         if self.worst is None or self.leaves is None:
             return Sentence("")
         is_settled = self.worst.is_settled
-        whole = (
+        whole_witness = (
             find_witness(self.evidence, self.leaves, self.times_ns, flips=False) if is_settled else self.worst
         )
-        return reason_sentence(whole, first_ns=first_ns)
+        return reason_sentence(whole_witness, first_ns=first_ns)
 
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.
@@ -528,9 +528,9 @@ class SpecResult(Displayed):
         conjuncts = {part.node: part for part in self._conjuncts_of(node)}
         sentences = [self._headline(node, causes, first_ns)]
         for cause in causes:
-            about = cause_sentences(cause, first_ns=first_ns, object=self.object)
+            cause_lines = cause_sentences(cause, first_ns=first_ns, object=self.object)
             # of the whole formula, the headline has said the first of them
-            sentences += about if cause.node != node else about[1:]
+            sentences += cause_lines if cause.node != node else cause_lines[1:]
             part = [conjuncts[cause.node]]
             for invariant in self._violated_invariants(part, goes_on=goes_on, most=LISTED):
                 sentences += invariant_sentences(invariant, first_ns, self.evidence.units)
@@ -564,14 +564,21 @@ class SpecResult(Displayed):
         return find_least(self._conjuncts_of(node), self.values, self.final, causes[0], name)
 
     def _least_at_ns(self, causes: Sequence[Cause]) -> int | None:
-        first = causes[0] if causes else None
-        if self.leaves is None or first is None or first.witness is None or first.settled_ns is None:
+        first_cause = causes[0] if causes else None
+        if (
+            self.leaves is None
+            or first_cause is None
+            or first_cause.witness is None
+            or first_cause.settled_ns is None
+        ):
             return None
-        least = float(self.final[first.node, 1])
-        if not least < first.witness.upper:
+        least = float(self.final[first_cause.node, 1])
+        if not least < first_cause.witness.upper:
             return None
         instance = self.evidence.instance
-        return time_of_least(instance, self.leaves, self.times_ns, first.node, first.settled_ns, least)
+        return time_of_least(
+            instance, self.leaves, self.times_ns, first_cause.node, first_cause.settled_ns, least
+        )
 
     def _name_of(self, node: int) -> str:
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
@@ -584,23 +591,26 @@ class SpecResult(Displayed):
             return self.witness(node)
         count = int(np.searchsorted(self.times_ns, settled_ns, side="right"))
         leaves, times_ns = self.leaves[:, :, :count], self.times_ns[:count]
-        whole = (self.leaves, self.times_ns)
-        return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole)
+        whole_log = (self.leaves, self.times_ns)
+        return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole_log)
 
     def _witnesses(self, node: int, settled_ns: int | None) -> tuple[Witness | None, Witness | None]:
         """Return what settled the verdict of a node and, of a violation that grew later, what it grew by."""
-        first = self._settled_witness(node, settled_ns)
+        settling = self._settled_witness(node, settled_ns)
         if (
             self.leaves is None
-            or first is None
+            or settling is None
             or settled_ns is None
-            or not self.final[node, 1] < first.upper
+            or not self.final[node, 1] < settling.upper
         ):
-            return first, None
-        least = find_witness(self.evidence, self.leaves, self.times_ns, node, flips=False)
+            return settling, None
+        least_witness = find_witness(self.evidence, self.leaves, self.times_ns, node, flips=False)
         # the first response that was missed says more than a later one
-        is_atom = least.deciding is not None and not least.deciding.unknown
-        return first, least if is_atom and first.missed is None and least.missed is None else None
+        is_atom = least_witness.deciding is not None and not least_witness.deciding.unknown
+        return (
+            settling,
+            least_witness if is_atom and settling.missed is None and least_witness.missed is None else None,
+        )
 
     def _leaves(self, what: str) -> Floats:
         require_ltlf(self.semantics, what)
@@ -917,10 +927,10 @@ def _evaluate_group(
     instances = find_instances(specification, {}, (), 0, FOREVER)
     counting = [trace for trace, _ in trimmed]
     scene = TraceScene(one_after_another(counting), specification.regions)
-    for whole, (trace, left_out), (streams, blocks) in zip(
+    for full_trace, (trace, left_out), (streams, blocks) in zip(
         traces, trimmed, run_together(instances, scene, counting, semantics), strict=True
     ):
-        first_ns = int(whole.times_ns[0])
+        first_ns = int(full_trace.times_ns[0])
         evaluation = _evaluation_of(specification, semantics, trace, first_ns, streams, blocks)
         yield replace(evaluation, left_out=counted_from(left_out, first_ns))
 

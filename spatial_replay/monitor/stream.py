@@ -340,9 +340,9 @@ class EvaluationStream:
         if self._before is not None:
             before_ns = self._before.times_ns[-1]
             if before_ns >= trace.times_ns[0]:
-                at, last = times_apart(int(trace.times_ns[0]), int(before_ns))
+                time, last_time = times_apart(int(trace.times_ns[0]), int(before_ns))
                 raise TraceError(
-                    f"a sample at {at} follows one at {last}; give samples in the order of their times"
+                    f"a sample at {time} follows one at {last_time}; give samples in the order of their times"
                 )
             if self._reach:
                 recent = tail(self._before, self._reach)
