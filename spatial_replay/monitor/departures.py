@@ -130,12 +130,13 @@ class Departures:
         scene = TraceScene(trace, self._regions)
         for visitors in self._watches:
             self._follow(visitors, scene)
+        # the newest second suffices for the approach of a member that leaves next
         self._past = tail(trace, Reach(1, _APPROACH_NS))
 
     def _follow(self, visitors: _Visitors, scene: TraceScene) -> None:
         trace, past_count = scene.trace, 0 if self._past is None else len(self._past)
         names, members = _memberships(visitors, scene)
-        # the first sample of a log is no turn
+        # no one arrives in the first sample of a log
         start = max(past_count, 1)
         samples, columns = np.nonzero(np.diff(members[start - 1 :], axis=0))
         turns = list(zip((samples + start).tolist(), columns.tolist(), strict=True))

@@ -36,7 +36,7 @@ class ClassMembers:
         if not codes:
             return
         rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
-        # the number of an absent object, -1, is the place of a class that is none
+        # -1, the row of an absent object, reads the appended entry: a code that no class has
         code_of_row = np.append(trace.class_code, -1)[rows]
         for code in codes:
             columns = np.flatnonzero((code_of_row == code).any(axis=0)).tolist()

@@ -256,6 +256,7 @@ class RunEnds:
         """Return the traces that end before a time, and drop them here."""
         count = 0
         for trace in self._held:
+            # a trace is released as a whole: callers count on one trace for each that they added
             if len(trace) and int(trace.times_ns[-1]) >= before_ns:
                 break
             if len(trace):
@@ -278,5 +279,5 @@ def trim_trace(
         return trace, ()
     ends = RunEnds(needs, start=start, end=end, is_rest=is_rest)
     (counting,) = [*ends.add(trace), *ends.finish()]
-    # a trace that stays whole keeps its measurements
+    # the same trace object keeps its cache of measurements
     return (counting, ends.remarks) if ends.remarks else (trace, ())

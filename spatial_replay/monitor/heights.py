@@ -62,6 +62,7 @@ class HeightComparisons:
             samples = _samples_with_one_above(trace, specification) if comparisons else np.empty(0, np.int64)
             if not len(samples):
                 continue
+            # evenly spread: a block may hold thousands of such samples
             trace_then = trace.take(samples[:: 1 + len(samples) // _MOST_SAMPLES]).compact()
             scenes = (
                 TraceScene(trace_then, specification.regions),

@@ -150,7 +150,7 @@ class _Invariant(NamedTuple):
         (body,), inner = operands_of(formula), node + 1
         while operator_of(body) == "spec":
             (body,), inner = operands_of(body), inner + 1
-        # the first operand of a node is numbered next
+        # ids are in the order of the text: the first operand follows its node
         condition = inner + 1 if sign > 0 and operator_of(body) == "->" else None
         return cls(conjunct, formula, node + 1, condition)
 

@@ -148,7 +148,7 @@ class Settlement(NamedTuple):
 class Update:
     """The numbers and verdicts after a sample. It stays as it is when others follow."""
 
-    # no frozen dataclass, which takes half a microsecond more to make
+    # a frozen dataclass takes half a microsecond more to make, at every sample
     __slots__ = ("_monitored", "_numbers", "_settlement", "_specs", "_time_ns")
 
     def __init__(
@@ -493,6 +493,7 @@ class _AwaitedNames:
     def _learn(self, *names: Collection[str]) -> None:
         """Keep names, for hints."""
         if not self._remarks:
+            # bounded: a run may bring a new track name at every sample
             for names_so_far, new_names in zip(self._known, names, strict=True):
                 if len(names_so_far) < _MOST_KNOWN:
                     names_so_far.update(new_names)
@@ -741,12 +742,14 @@ def rehearse(specification: Specification) -> None:
             trial = Settled(
                 spec, program, specification, conjunct, Verdict.VIOLATED, 0.0, (sample,), 0, True, 0, {}
             )
+            # both are computed when they are read
             _ = trial.violation.sentences, trial.reason
 
 
 def _run_trial(specification: Specification, semantics: Semantics) -> None:
     """Load every kernel, so that no sample has to wait for one."""
     trial = LiveStream(specification, semantics, 0)
+    # the second sample takes branches that the first one does not
     for time_ns in range(2):
         trial.extend(Sample(time_ns))
     if semantics == "ltlf":
@@ -823,6 +826,7 @@ class ViolationLog:
             verdict,
             number,
             samples,
+            # samples before the start are only there to be looked back at
             next(k for k, sample in enumerate(samples) if sample.time_ns >= self._start_ns),
             samples[0].time_ns == first_ns,
             first_ns,

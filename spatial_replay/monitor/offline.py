@@ -163,10 +163,11 @@ def run_offline(
         past_code = code - codes.AHEAD if is_ahead else code
         steps = Steps(stamps, end - 1 if is_ahead else begin, -1 if is_ahead else 1, end - begin)
         for channel in range(channels):
+            # a negation swaps the low and the high end (see `codes`)
             mirror = channel ^ 1 if channels > 1 else channel
             target = columns[channel, row[codes.OFFLINE_TARGET]]
             if code == codes.LEAF:
-                # element by element: what says that two slices differ in length takes seconds to compile
+                # element by element: the error for slices of unequal length takes seconds to compile
                 for k in range(begin, end):
                     target[k] = leaves[channel, row[1], k]
                 continue
@@ -225,6 +226,7 @@ class OfflineTable(SignalTable):
         Returns:
             (R, OFFLINE_WIDTH), operands first.
         """
+        # reversed, so that the first of several equal nodes owns the row
         column = {row: node for node, row in reversed(list(enumerate(nodes)))}
         others = (row for row in range(len(self._rows)) if row not in column)
         column |= dict(zip(others, count(len(nodes)), strict=False))
@@ -418,7 +420,7 @@ class _OpenFormulas:
         self.leaves: list[Atom] = []
         self.columns: list[Booleans] = []
         self._times_ns, self._beyond = times_ns, beyond
-        # the formulas stay alive, so that no other one takes the id of one
+        # formulas are stored to stay alive: a freed one would leave its id to another
         self._stand_ins: dict[int, tuple[Formula, Formula]] = {}
 
     def of(self, formula: Formula) -> Formula:
@@ -479,7 +481,7 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
         return np.zeros(count, np.bool_)
     if bound.unit == "samples":
         return np.arange(count) + min(bound.upper, count) < count
-    # integers of any size: a time and a duration may add up to more than 64 bits
+    # Python integers: a time and a duration may add up to more than 64 bits
     span_ns = int(times_ns[-1]) - bound.upper
     return np.arange(count) < bisect_left(times_ns, span_ns + 1)
 

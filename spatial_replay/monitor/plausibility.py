@@ -142,7 +142,6 @@ class LogNumbers:
         self._regions = specification.regions
         self._reach = look_back([spec.formula for spec in specification.results])
         self._past: Trace | None = None
-        # by part: how many samples lack it, and the first of them
         self.missing: dict[NamedPart, tuple[int, int]] = {}
         self._parts = list(
             dict.fromkeys(part for spec in specification.results for part in named_parts(spec.formula))
@@ -188,7 +187,7 @@ class LogNumbers:
                 threshold_range.atom,
                 expression=_compared_quantity(threshold_range.atom) or threshold_range.atom.expression,
             )
-            # one by one, so that each has as many bindings as in a replay
+            # one call a formula, as in a replay: the limit of bindings counts all formulas of a call
             least, greatest, all_hold, any_holds = (
                 leaf_values(scene, [over_bindings(quantifier, threshold_range.bound, atom)], {})[:, 0]
                 for atom in (number, threshold_range.atom)
@@ -302,7 +301,7 @@ def plausibility_warnings(
     for part, (count, first_ns) in log.missing.items():
         named = (atom for spec in specification.results for atom in iter_atoms(spec.formula))
         span = next(atom.span for atom in named if part in named_parts(atom))
-        # one that the log never has is an error of names
+        # a name that the log never has is reported by `check_names`
         if count < log.samples:
             at = time_text(first_ns, zero_ns)
             message = (
@@ -395,7 +394,7 @@ def _is_far(limit: float, threshold_range: ThresholdRange, *, is_length: bool) -
     if least <= limit <= greatest:
         return False
     if is_length and limit < 0.0:
-        # only what overlaps has a negative distance
+        # only overlapping footprints have a negative distance
         return True
     reach = max(greatest - least, abs(least), abs(greatest))
     if limit < least - reach or limit > greatest + reach:

@@ -426,7 +426,7 @@ class SpecResult(Displayed):
     @cached_property
     def _cut_window(self) -> UntestedPart | None:
         if self.certain_ns() is not None:
-            # no sample that follows could have changed it
+            # the verdict was certain before the end: no later sample could have changed it
             return None
         return find_cut_window(self.evidence, *self._stored, self.verdict)
 
@@ -529,7 +529,7 @@ class SpecResult(Displayed):
         sentences = [self._headline(node, causes, first_ns)]
         for cause in causes:
             cause_lines = cause_sentences(cause, first_ns=first_ns, object=self.object)
-            # of the whole formula, the headline has said the first of them
+            # the headline stands for the first sentence on the whole formula
             sentences += cause_lines if cause.node != node else cause_lines[1:]
             part = [conjuncts[cause.node]]
             for invariant in self._violated_invariants(part, goes_on=goes_on, most=LISTED):
@@ -605,7 +605,7 @@ class SpecResult(Displayed):
         ):
             return settling, None
         least_witness = find_witness(self.evidence, self.leaves, self.times_ns, node, flips=False)
-        # the first response that was missed says more than a later one
+        # the first missed response explains more than a later one
         is_atom = least_witness.deciding is not None and not least_witness.deciding.unknown
         return (
             settling,

@@ -146,6 +146,7 @@ def _step_first(
         return
     start = memory.starts[n]
     if code in (EVENTUALLY, ALWAYS):
+        # the number of a plain operand at a sample never changes: a running extremum suffices
         if is_plain:
             value[n] = pick(code == ALWAYS, value[n], memory.now[right])
             lost[n] |= memory.lost_now[right]
@@ -312,8 +313,8 @@ class PaperTable:
     """A formula's nodes, by id.
 
     Attributes:
-        rows: (N, WIDTH): code; begin and end of the node's operands in `operands`; its window; whether it is
-            plain; its places in `PaperMemory`; a leaf's number, or the sign of a constant.
+        rows: (N, WIDTH), the columns `CODE` to `LEAF`. `FIRST` and `END` are places in `operands`; `COLUMN`,
+            `INNER` and `PAIRS` are places in `PaperMemory`. `LEAF` is a leaf's number, or a constant's sign.
         operands: ids of the operands, node after node.
         columns: how many columns are kept.
         pairs: how many tables over pairs of samples are kept.
@@ -347,6 +348,7 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
                 upper = NOTHING if node.bound.upper is None else node.bound.upper
                 row[[IS_IN_NS, LOW, HIGH]] = node.bound.unit == "ns", node.bound.lower, upper
             is_until_nested = node.operator == "U" and not is_plain[operand_ids[-1]]
+            # without a bound the numbers of the operator are those of its scan: one column serves both
             if has_column[identifier] and row[LOW] == 0 and row[HIGH] == NOTHING:
                 row[INNER] = row[COLUMN]
             elif has_column[identifier] or is_until_nested:
@@ -567,7 +569,7 @@ class PaperRun:
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = empty((len(self._table.rows), 4, len(times_ns)))
         samples, rows = self._position + len(times_ns), self._table.rows
-        # windows without an end: the others are known once their samples come
+        # unbounded windows only: pairs of bounded ones are counted when their samples come
         lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
         self._check_pairs(int((np.maximum(samples - lows, 0) ** 2 // 2).sum()), samples)
         for t in range(0, len(times_ns), _TILE):
@@ -586,6 +588,7 @@ class PaperRun:
         """Grow the memory to hold the given number of samples."""
         memory, pairs = self._memory, self._table.pairs
         if self._table.columns and samples > len(memory.stamps):
+            # doubled, so that a long run copies each number a constant number of times
             more = max(samples, 2 * len(memory.stamps)) - len(memory.stamps)
             memory = memory._replace(
                 stamps=_longer(memory.stamps, more),
@@ -760,4 +763,4 @@ class Evaluator(NamedTuple):
         """
         if self.semantics == "paper":
             return left_out(leaves, self.program.leaves, positions, times_ns, first_ns)
-        return leaves  # unknown there, which their intervals say
+        return leaves  # their intervals are unbounded there already

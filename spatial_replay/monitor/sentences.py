@@ -416,7 +416,7 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
         return _join(*missed, sentences_of(witness, first_ns=first_ns)[1 + len(missed)])
     if witness.missed is not None and witness.missed.is_condition:
-        # how well the condition held is not what went wrong
+        # the condition held: by how much does not explain the violation
         return _join(*missed)
     outcome = _how_it_decides(witness, deciding, first_ns)
     if witness.missed is not None and witness.missed.response == deciding.text:
@@ -551,7 +551,7 @@ def _step_title(witness: Witness, place: int) -> str:
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
     """Name it, and say that the atom is greatest or least within it, where that is so."""
     passed: set[str] = set()
-    # one sample may settle a G that fails or an F that holds, and later ones be worse or better
+    # one sample may settle a failing G or a holding F, and later ones may be more extreme
     unsure = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
     for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator == unsure:
@@ -693,7 +693,7 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
         for word, option, at_ns in zip(("before ", "from "), ("--from", "--to"), gap.window, strict=True):
             if at_ns is not None:
                 parts += [" or " if parts else "", word, Instant(at_ns, first_ns)]
-                # whole milliseconds, not past the sample
+                # rounded down to milliseconds, so that the option does not leave the sample out
                 options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
         onwards = " on" if gap.window[1] is not None else ""
         return Sentence(f"{count_text}, all ", *parts, f"{onwards}: {' '.join(options)} leaves them out.")

@@ -56,6 +56,7 @@ class Stillness:
             is_new = rows >= 0
             if trace.reported_ns is not None:
                 times = trace.reported_ns[:, column]
+                # samples repeat a report until the next one comes
                 is_new &= np.concatenate([[True], times[1:] != times[:-1]])
             rows = rows[is_new]
             if not len(rows):

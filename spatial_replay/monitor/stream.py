@@ -169,6 +169,7 @@ def _appearances(
                 continue
             first_ns = spans[name][0] if name in spans else int(times[present_samples[0]])
             spans[name] = (first_ns, int(times[present_samples[-1]]))
+            # a row below `ABSENT` is -2 - the observation of an object whose position is unknown
             codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[present_samples]])
             for parameter, choice in choices.items():
                 if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
@@ -244,7 +245,7 @@ class InstanceStream:
         self._begin()
 
     def _begin(self) -> None:
-        # arrays of their own: results hold those of earlier samples
+        # new arrays: results of the previous run still refer to the old ones
         self.first_satisfied_ns: int | None = None
         self.robustness = np.full(len(self.instance.program.reports), np.nan)
         self.settled_ns = np.full((len(self.instance.program.reports), 2), NEVER, np.int64)
@@ -277,7 +278,7 @@ class InstanceStream:
             no_series = np.empty((len(program.reports), 4, 0))
             return SeriesBlock(times, no_series, np.empty((1, len(program.leaves), 0)))
         leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
-        # a scene holds all samples that may be looked back at: its first is the log's, or out of reach
+        # the scene begins with the log or beyond every reach, so its positions may stand for the log's
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
@@ -298,7 +299,7 @@ class InstanceStream:
         """Take the time of the first sample at which each node became certain."""
         newest = series[:, :, -1]
         for column, is_settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
-            # what is certain stays so: only where the newest sample is, the first one is looked for
+            # certainty is permanent: only nodes that are certain at the newest sample are searched, once
             for node in np.flatnonzero(is_settled & (self.settled_ns[:, column] == NEVER)):
                 self.settled_ns[node, column] = times_ns[_first_certain(series[node], column)]
 
@@ -344,6 +345,7 @@ class EvaluationStream:
                 raise TraceError(
                     f"a sample at {time} follows one at {last_time}; give samples in the order of their times"
                 )
+            # a term that looks back reads footprints of earlier samples
             if self._reach:
                 recent = tail(self._before, self._reach)
                 skip = len(recent)
@@ -357,6 +359,7 @@ def one_after_another(traces: Sequence[Trace]) -> Trace:
     """Join traces whatever their times are: each sample gets its number as its time."""
     numbered, begin = [], 0
     for trace in traces:
+        # times of different traces overlap, and those of one trace have to increase
         times_ns = np.arange(begin, begin + len(trace), dtype=np.int64)
         numbered.append(
             replace(trace, times_ns=times_ns, reported_ns=None, signals_reported_ns={}, spans=(), doubts=())
@@ -411,6 +414,7 @@ class LiveStream:
         self._leaf_ranges = _ranges(len(program.leaves) for program in programs)
         self._is_online = semantics == "ltlf"
         first_leaves = [leaf_range.start for leaf_range in self._leaf_ranges]
+        # paired here, since `extend` reads them at every sample
         self._online_runs = list(zip(cast(list[OnlineRun], self._runs), first_leaves, strict=True))
         self._start_ns = start_ns
         self._first_ns: int | None = None

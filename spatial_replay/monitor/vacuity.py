@@ -161,7 +161,7 @@ def find_vacuous(
         offline = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
         path = deciding_path(offline, 0, infinite)
         node, sample = path.steps[-1].node, path.steps[-1].sample
-        # -inf is the number of a missed goal, too
+        # a missed goal (`F`) is -inf as well: -inf alone does not show that nothing was tested
         is_idle = infinite is End.LOW or (
             _leaves_all_out(offline, path, evidence)
             and is_tested_by_nothing(evidence, leaves, times_ns, Verdict.VIOLATED)
@@ -365,6 +365,7 @@ def _scopes(
         is_conditional: only those at which the verdict depends on a node, where antecedents may hold.
     """
     tree = nodes_with_operands(formula)
+    # the verdict is the number of the root at the first sample
     scopes = [np.arange(len(windows.times_ns)) == 0] * len(tree)
     for scope, (node, operands) in zip(scopes, tree, strict=True):
         for place, operand in enumerate(operands):
@@ -392,6 +393,7 @@ def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) ->
         else:
             begin = counting
             end = end - (formula.operator != "W")
+    # +1 where a window begins, -1 after its end: the running sum counts the windows over a sample
     edges = np.zeros(len(scope) + 1, np.int64)
     is_open = begin < end
     np.add.at(edges, begin[is_open], 1)
@@ -566,7 +568,7 @@ def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idl
     elif isinstance(node, Atom | Quantified) and not any(
         isinstance(part, Equality) for part in iter_parts(node)
     ):
-        # comparing a mode makes it infinite with members in its groups, too
+        # an equality, as of a mode, is infinite by definition, also with members in its groups
         count = len(node.variables) if isinstance(node, Quantified) else 1
         members = "no object is" if count == 1 else f"fewer than {count} objects are"
         predicate = ("decides at ", instant, f", where {members} in its group.")
@@ -617,6 +619,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     order = instance.program.leaves
     unknown = _with_unknown_leaves(order, leaves, evidence)
     known_leaves = leaves if verdict is Verdict.SATISFIED else unknown
+    # each leaf is evaluated twice: unknown, and with its numbers for antecedents
     stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
 
     def with_stand_ins(formula: Formula, *, in_antecedent: bool = False) -> Formula:
@@ -711,7 +714,7 @@ def find_cut_window(
     ranks = _rank_by_verdict(cut_nodes, whole_nodes, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
-    # 1 and -1 are where a cut window decides
+    # ranks 1 and -1: a cut window decides, and a whole one would not
     decided = [step for step in cut if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}]
     step = decided[-1] if decided else path.steps[0]
     return _part(_cut(step, nodes[step.node], times_ns, evidence), nodes[step.node], evidence)
@@ -730,7 +733,7 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
         reach_text = "the log has no next sample"
     else:
         is_time = bound.unit == "ns"
-        # places in time or in samples: of the window's begin and end, and of the log's end
+        # positions in ns or in samples: one calculation serves both units
         place, last = (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
         missing_length = place + bound.upper - last
         length = bound.upper - bound.lower + (not is_time)

@@ -72,6 +72,7 @@ def online_verdict(lower: float, upper: float) -> Verdict:
         return Verdict.SATISFIED
     if upper < 0.0:
         return Verdict.VIOLATED
+    # NaN alone differs from itself
     is_nan = lower != lower
     return Verdict.UNKNOWN if is_nan else Verdict.PENDING
 

@@ -209,7 +209,7 @@ def run_instructions(
                 # rows by their numbers: a slice of an array takes as long as ten samples
                 target, opposite = i * channels + channel, a * channels + mirror
                 first, second = a * channels + channel, b * channels + channel
-                # a loop for each operation: a single one would ask for each sample which it is
+                # a loop for each operation: a single loop would test the operation at each sample
                 if op == CONSTANT:
                     for k in range(count):
                         columns[target, k] = constants[a]
@@ -449,6 +449,7 @@ class LeafCode:
         result = self._constant(inf if is_forall else -inf)
         if self._groups.may_be_unknown(group):
             result = self._row(op, result, result, self._member(group, ()))
+        # permutations: different variables stand for different members
         for candidates in permutations(range(len(names)), len(formula.variables)):
             members = [TrackedName(names[n]) for n in candidates]
             inner = {**bindings, **dict(zip(formula.variables, members, strict=True))}

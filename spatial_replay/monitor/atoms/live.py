@@ -375,7 +375,10 @@ def _measure(
     of_operands, measured_at = begin, begin + operands + 1
     widths = measured_at + plan.geometric_count
     hidden, members = widths + operands, widths + 2 * operands + 1
-    sample[of_operands + operands], lists[hidden + operands] = 0.0, 0  # for no operand, -1
+    sample[of_operands + operands], lists[hidden + operands] = (
+        0.0,
+        0,
+    )  # read for a measurement without a second operand
     for operand in range(operands):
         first, last = whole[starts + operand], whole[starts + operand + 1]
         lists[widths + operand], lists[hidden + operand], spread = last - first, 0, 0.0
@@ -389,7 +392,7 @@ def _measure(
                 lists[members + k] = row
                 spread = max(spread, sample[rows.uncertainty + row])
         sample[of_operands + operand] = spread
-    # a literal 0 has a type of its own, for which all of it would be compiled once more
+    # numba gives a literal 0 a type of its own, and would compile `measure_rows` once more for it
     zero = min(operands, 0)
     measure_rows(
         lists[rows.part_start : rows.part_start + rows.rows + 1],
@@ -465,7 +468,7 @@ def _closest(
         pair_at = closest + 4 * k
         sample[pair_at] = sample[pair_at + 1] = nearest[0, 0]
         sample[pair_at + 2], sample[pair_at + 3] = nearest[0, 1], nearest[0, 2]
-        if hidden > 0 and present > 1:  # it may be anywhere, and so may be the closest
+        if hidden > 0 and present > 1:  # a hidden member may be one of the closest two
             sample[pair_at] = sample[pair_at + 2] = -np.inf
 
 
@@ -587,6 +590,7 @@ class SampleRoom:
         self._plan, self._length = plan, length
         size = begin + 4 * length + 8 * plan.room
         if size > len(self._bytes):
+            # doubled, since the numbers of objects and vertices change from sample to sample
             self._bytes = bytearray(2 * size)
             self._numbers = np.frombuffer(self._bytes)
         self.arguments = plan.whole, plan.real, self._numbers, (begin + length) // 8, self.leaves
@@ -952,7 +956,9 @@ class SampleLeaves:
         self._prefix = "?"
         while any(name.startswith(self._prefix) for name in self._spec_names):
             self._prefix += "?"
-        self._spec_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
+        self._spec_members: frozenset[Member] = (
+            frozenset()
+        )  # at most the members that the specification names
         self._code_of = lru_cache(_MOST_CLASSES)(partial(_class_code, self._frame.classes))
         self._plans: dict[tuple[frozenset[Member], _Counts], LeafPlan] = {}
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
@@ -1023,6 +1029,7 @@ class SampleLeaves:
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
         """Return the plan for the given number of unnamed members of each kind."""
         key, plans = (self._spec_members, tuple(sorted(counts.items()))), self._plans
+        # taken out and put back: the order of the dict is that of use
         plan = plans.pop(key, None)
         if plan is None:
             plan = _plan(self._frame, self._prefix, *key)
@@ -1044,7 +1051,7 @@ def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
 
 def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], counts: _Counts) -> LeafPlan:
     """Return the plan for the given number of unnamed members of each kind."""
-    # names that the specification does not use
+    # no name of the specification begins with the prefix
     placeholders = {
         classes: [f"{prefix}{classes} {number}" for number in range(count)] for classes, count in counts
     }

@@ -137,7 +137,7 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     closest = np.array([_closest(scene, pair) for pair in code.closest]).reshape(len(code.closest), 4, count)
     rows = np.array(list(code.rows), np.int64).reshape(len(code.rows), 4)
     constants = np.array(list(code.constants), np.float64)
-    # whether a number is equal to a text is not known
+    # a comparison of a number with a text is unknown
     has_texts = (signals <= TEXTS).any() or (np.isfinite(constants) & (constants <= TEXTS)).any()
     is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
     is_known = is_known and not has_texts and (closest[:, 0] == closest[:, 1]).all()
@@ -164,7 +164,7 @@ def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:
     if ends is None:
         rows, uncertainty = scene.resolve(pair.group).operand.rows, scene.trace.uncertainty
         least, low, high = closest_pairs(scene.batch, rows, uncertainty, pair.enlargement).T
-        # one that cannot be read may be anywhere, and so may be the closest
+        # a member with an unknown position may be one of the closest two
         is_hidden = (rows < ABSENT).any(axis=1) & ((rows != ABSENT).sum(axis=1) > 1)
         nominal_low, wide_low = (np.where(is_hidden, -np.inf, distances) for distances in (least, low))
         ends = np.stack((nominal_low, least, wide_low, high))

@@ -91,7 +91,7 @@ class LatestReport:
         if reported_ns == self.reported_ns:
             return LatestReport(value, reported_ns, self.before, self.seconds)
         step_ns = reported_ns - self.reported_ns
-        self.before = None  # no more than two are needed
+        self.before = None  # two reports are compared; a longer chain would never be freed
         return LatestReport(value, reported_ns, self, step_ns / 1e9 if step_ns > 0 else nan)
 
 
@@ -159,6 +159,7 @@ class RecentReports:
         if previous_report is None or seconds != seconds:
             return current if name in sample.lasting else None
         previous: TrackedObject = previous_report.value
+        # no arithmetic: the earlier report itself, bit for bit
         if seconds == shortest:
             return previous
         if not seconds > shortest:

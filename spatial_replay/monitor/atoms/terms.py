@@ -284,7 +284,9 @@ class TraceScene:
                 for name, rows in zip(*self._members_of(term), strict=True):
                     seconds = self._reports_of(TrackedName(name)).seconds
                     ignored = (rows == ABSENT) & is_open
-                    if name in self.trace.lasting:  # it stands until it has a rate
+                    if (
+                        name in self.trace.lasting
+                    ):  # an object that lasts stands still until it has two reports
                         ignored |= (rows >= 0) & np.isnan(seconds)
                     shortest = np.minimum(shortest, np.where(ignored, np.inf, seconds))
             self._steps[terms] = np.where(np.isfinite(shortest), shortest, np.nan)
@@ -331,7 +333,7 @@ class TraceScene:
         if isinstance(term, Centre):
             inner, self._has_centres = self.resolve(term.term), True
             rows, row_count = inner.operand.rows, len(self._whole)
-            # what is moved back has its centre right after it
+            # a row that is moved back is followed by the row of its centre
             centres = np.where(rows < 2 * row_count, rows + row_count, rows + 1)
             return replace(inner, operand=Operand(np.where(rows < 0, rows, centres)))
         if isinstance(term, Earlier) and term.rate:
@@ -380,6 +382,7 @@ class TraceScene:
         uncertainty = np.append(self.trace.uncertainty, 0.0)
         spread = np.where(is_there, uncertainty[np.where(is_there, current, -1)], 0.0)
         is_previous = is_there & (seconds == shortest)
+        # the earlier report itself, so that a log and a live run have the same bits
         rows[is_previous], spread[is_previous] = (
             before_rows[is_previous],
             uncertainty[before_rows[is_previous]],
@@ -466,6 +469,7 @@ class TraceScene:
             return names, rows
         group_class = (group.class_name or "").casefold()
         fits = np.array([(name or "").casefold() == group_class for name in self.trace.classes], np.bool_)
+        # a row below `ABSENT` is -2 - the observation of an object whose position is unknown
         observation = np.where(rows < ABSENT, -2 - rows, np.maximum(rows, 0))
         if len(self.trace.class_code) == 0:
             return names, rows

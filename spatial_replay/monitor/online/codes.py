@@ -19,9 +19,9 @@ SAMPLES, NANOSECONDS = 0, 1
 
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
-SIGNAL_IS_KEPT = 7  # whether it is looked at behind the newest sample, too
+SIGNAL_IS_KEPT = 7  # whether it is also read behind the newest sample
 SIGNAL_WIDTH = 8
-OFFLINE_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
+OFFLINE_TARGET = 6  # of offline rows: the column that a row writes, instead of the window
 OFFLINE_WIDTH = 7
 # codes of signals
 LEAF = 0  # leaf a
@@ -33,7 +33,7 @@ DELAY = 12  # a, low back; high times infinity where there is none
 # high times infinity once the first sample is at least low behind, the negative of that before
 ELAPSED = 31
 RINGS = (WINDOW_MAX, WINDOW_MIN)  # keep positions in a ring
-AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
+AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `offline`)
 
 # columns of parts' nodes
 # a = -1 for the left operand of an until that is `true`, of a release that is `false`
@@ -47,7 +47,7 @@ PART_AND, PART_OR = 2, 3
 # max(b, min(a, next)); min(b, max(a, next))
 UNTIL, RELEASE = 4, 5
 PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # of a, over [low, high] ahead
-SHIFT = 8  # a, low ahead; a is wanted up to high ahead
+SHIFT = 8  # a, low ahead; positions of a up to high ahead are needed
 AHEAD_OF = (PART_WINDOW_MAX, PART_WINDOW_MIN, SHIFT)
 PAST_SINCE, PAST_TRIGGER = 9, 10  # max(b, min(a, previous)); min(b, max(a, previous))
 PAST_WINDOW_MAX, PAST_WINDOW_MIN = 11, 12
@@ -59,11 +59,11 @@ BINARY_NODES = (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER)
 # columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run,
 # and where the table begins in each channel (of parts without windows)
 PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
-# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: which bounds follow from the table alone, since what may still
-# come outdoes all that is open
+# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: whether the bound follows from the table alone, because later
+# samples may exceed every pending position
 PART_KNOWN = 7
-PART_HAS_NOW = 8  # whether it says what it is at the newest sample, too
-PART_IS_MONOTONE = 9  # whether what the root joins by the minimum never falls, or the other way round
+PART_HAS_NOW = 8  # whether it also reports its value at the newest sample
+PART_IS_MONOTONE = 9  # whether the operand that the root joins by the minimum never falls (maximum: rises)
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 

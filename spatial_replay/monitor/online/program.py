@@ -123,6 +123,7 @@ class SignalTable:
         formula = expand(formula)
         if id(formula) not in self._added:
             operands = [self.add(operand) for operand in operands_of(formula)]
+            # the formula is stored to stay alive: a freed one would leave its id to another
             self._added[id(formula)] = formula, self._added_row(formula, operands)
         return self._added[id(formula)][1]
 
@@ -244,7 +245,7 @@ class PartRows:
     def rows(self) -> tuple[Row, ...]:
         """Return rows with the numbers of their variable and table, and whether they depend on either."""
         variable = 0
-        table = 1  # the part's own is 0
+        table = 1  # 0 is the part's own table
         result: list[Row] = []
         for *fields, is_variable in self._rows:
             has_table = fields[0] in _RECURRENT_PAST
@@ -265,7 +266,7 @@ class PartRows:
     def is_flat(self) -> bool:
         """Whether one sample settles everything but the variables: no window, shift or past operator."""
         flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR)
-        # what a past operator is now is asked for, too, although nothing past is left of `H[0,5] G G x`
+        # `H[0,5] G G x` has flat rows alone, but a past root also reports its value at the newest sample
         is_flat = all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
         return is_flat and not self._is_past
 
@@ -322,7 +323,7 @@ class PartRows:
 
     def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
         left, right, bound = _as_until(operator, operands, bound)
-        # in its polarity the node is an until or a release, the negation of an until
+        # under a negation an until is a release, and the other way round
         is_until = (operator != "G") == positive
         return self._bounded_until(left, right, *window_of(bound), is_until=is_until)
 
@@ -366,14 +367,14 @@ class PartRows:
     def _ending(self, formula: Formula, positive: bool) -> int:
         """Return the row of a bounded operator of which only the value at the first sample is needed.
 
-        Its window is a fixed stretch of the run. In an until, say, positions outside the window are -inf, and
-        so is the operand that has to hold so far where the window ends: later samples are out of reach.
+        Its window is a fixed stretch of the run. In an until, positions outside the window are -inf. From
+        the window's end on, the left operand is -inf, too: later samples are out of reach.
         """
         formula = expand(formula)
         if isinstance(formula, Boolean) and formula.operator == "not":
             return self._ending(formula.operands[0], not positive)
         if not isinstance(formula, Temporal):
-            # W is U or G
+            # W expands to `U or G`
             sides = [self._ending(operand, positive) for operand in operands_of(formula)]
             return reduce(partial(self._join, is_both=not positive), sides)
         operands = [self._add(operand, positive) for operand in formula.operands]
@@ -463,7 +464,7 @@ def known_bounds(rows: tuple[Row, ...]) -> int:
     direction = _direction_of(rows)
     if direction is None:
         return 0
-    # whether a node is as great as can be in the best continuation
+    # whether a node is infinite in the best continuation
     outdone: list[bool] = []
     for code, a, b, *_ in rows:
         if code == direction.either:
@@ -579,6 +580,7 @@ def _join_rows(
     reports_at = parts_at + len(parts)
     operands_at = reports_at + len(reports)
     first = operands_at + -(-len(operands) // width)
+    # one array: each array argument of a kernel costs time at every sample
     rows = np.zeros((first + sum(len(part_rows) - 1 for part_rows in parts), width), np.int64)
     rows[0, :7] = 1, len(signals), parts_at, len(parts), reports_at, len(reports), operands_at
     rows[1:parts_at, : codes.SIGNAL_WIDTH] = signals

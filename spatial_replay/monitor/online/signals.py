@@ -84,7 +84,7 @@ def _slide(
         oldest = 0
         while tail > head:
             oldest = times[ring, RING + head % size] - offset
-            # what is forgotten is farther than any window reaches
+            # positions dropped from the history are farther back than any window reaches
             if oldest >= 0 and _distance(times, unit, oldest, place) <= far:
                 break
             head += 1
@@ -270,7 +270,7 @@ def run_table(
     if position == 0:
         _start(rows, first, end, corners, memory, channel, table, work, values)
     elif memory[channel, table] == memory[channel, table + corners - 1]:
-        # it no longer changes
+        # the extreme corners agree: no later sample can change the value
         for k in range(count):
             work[first_result, k] = work[first_result + 1, k] = work[first_result + 2, k] = memory[
                 channel, table
@@ -282,7 +282,7 @@ def run_table(
         return int(first_result)
     for k in range(count):
         for d in range(nodes):
-            # what depends on no variable is the same at every corner
+            # a node that depends on no variable has one value for all corners
             if not rows[first + d, codes.NODE_DEPENDS]:
                 work[values, d] = work[top + d, k]
         for corner in range(corners):

@@ -5,8 +5,8 @@ sample), then each part, then the tree as the user wrote it. A tile of one sampl
 same bits, because the only arithmetic is minima, maxima and negation.
 
 Where everything is known a node has four numbers for each sample: value, now, lower and upper. In more
-channels (see `codes`) it has eight: low and high end of the value, of `now`, of the value over every
-continuation, and of the value if the run ends there. A number is made of those of the operands in the same
+channels (see `codes`) it has eight, the low and high ends of four values: value, `now`, value over
+every continuation, value if the run ends there. A number is made of those of the operands in the same
 row and in its mirror, which negation takes it from.
 """
 
@@ -248,6 +248,7 @@ def run_sample(
     """
     if channels == 0:
         channels = measure_sample(whole, real, sample, end, leaves)
+        # a run with more channels than the leaves reads copies (see `codes.in_channels`)
         for c in range(channels, CHANNELS):
             for leaf in range(leaves.shape[1]):
                 leaves[c, leaf, 0] = leaves[c % channels, leaf, 0]
@@ -310,6 +311,7 @@ class _OpenPart:
             self.state[windows.HEAD, windows.IS_BEGUN],
             (1 << self.rows[-1, codes.PART_VARIABLES]) - 1,
         )
+        # the extreme corners of a monotone table bound all others
         is_constant = is_begun and self.tables[0, 0] == self.tables[0, last]
         if is_constant and not self.rows[-1, codes.PART_HAS_NOW]:
             return None
@@ -375,6 +377,7 @@ class OnlineRun:
     def final(self) -> Floats:
         """(N, 2): lower and upper end of each node's value if the run ends here."""
         ends = [0, 0] if self._channels == 1 else [6, 7]
+        # adding zero turns -0.0 into 0.0
         return np.asarray(self._numbers[:, ends, self._newest] + 0.0)
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
@@ -396,6 +399,7 @@ class OnlineRun:
         if leaves.shape[1:] != shape or len(leaves) not in (1, 2, 4):
             raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{shape})")
         self.widen(len(leaves))
+        # a copy: kernels are compiled for writable arrays in C order
         leaves = np.array(in_channels(leaves, self._channels), np.float64, order="C")
         series, begin = empty((len(self._program.reports), SERIES, len(times_ns))), 0
         while begin < len(times_ns):
@@ -437,6 +441,7 @@ class OnlineRun:
             self._start_ns = time_ns
         numbers = np.empty(self._shape)
         phases = BEGIN if self._open else BEGIN | FINISH
+        # a sample that needs more channels than the run has is run again after `widen`
         while True:
             room.channels = channels = run_sample(
                 *room.arguments, *self._arrays, numbers,

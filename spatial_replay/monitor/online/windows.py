@@ -44,14 +44,14 @@ RESULT_NOW = 1
 """The row of a part's value at the newest sample, after its value at the first one and before its bounds."""
 EXTRA_ROWS = SETS + 5
 
-# rows of the state: the first holds single numbers, the others a number for each node; it has changed at the
-# newest sample, and from CHANGED to before CHANGED_END (the newest sample and 0 if nowhere else)
+# rows of the state: the first holds single numbers, the others one number for each node. The newest sample
+# changed its own position, and those from CHANGED to before CHANGED_END (newest sample and 0: no others)
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
-STARTS = 9  # and then, of each window in seconds: where it starts at each position, and what comes after it
-# columns of the first row: how many samples are forgotten, the base, whether anything is absorbed,
-# how many samples windows in seconds know
+STARTS = 9  # then two rows a window in seconds: its first position, and the one after its last
+# columns of the first row: forgotten samples, the base, whether anything is absorbed, and the samples that
+# are entered into windows in seconds
 OFFSET, BASE, IS_BEGUN, ENTERED = range(4)
-KNOWN = 4  # for each set, up to where its columns are known
+KNOWN = 4  # for each set, the newest sample that its columns include
 NEXT = KNOWN + SETS  # of each window in seconds, the next positions to begin and to close
 
 
@@ -84,7 +84,7 @@ def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int,
     """
     sign = 1.0 if is_greatest else -1.0
     v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = sign * start
-    # a compiler that knows that no position is negative joins several numbers at once
+    # numba wraps negative indices around; where it knows that there are none, the loop is vectorised
     k = max(begin, 0)
     while k + 8 <= end:
         v0, v1 = max(v0, sign * columns[row, k]), max(v1, sign * columns[row, k + 1])
@@ -254,13 +254,13 @@ def _run_open(
     value, is_same = -np.inf if is_greatest else np.inf, False
     for position in range(begin if is_fresh else last, last + 1):
         columns[column, position] = value
-    # after those that have begun
+    # windows that begin after the newest sample are empty: skip them
     position, at = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
     while position > begin and not is_same:
         stop = max(position - STRIDE, begin)
         first = _start(state, window, stop, last)
         if at <= last and extremum(is_greatest, columns, child, first, at, value) == value:
-            # as much as the one after them
+            # none of these numbers exceeds the extremum, so all these windows have it
             start = _start(state, window, position - 1, last)
             is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
             for k in range(position if is_same else stop, position):
@@ -321,7 +321,7 @@ def _run_window(
     changed, changed_end = state[CHANGED, rows[d, codes.NODE_A]], state[CHANGED_END, rows[d, codes.NODE_A]]
     seen, is_ahead = SEEN * nodes + column, window[0]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-    # whether what may come outdoes all that an open window holds
+    # whether the bound of an open window is infinite, whatever the window holds so far
     is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
     tail = last + 1
     if is_decided:
@@ -333,7 +333,7 @@ def _run_window(
     if not is_fresh:
         begin = min(max(min(_first_holding(state, window, changed, last), last), lowest), tail)
     if is_ahead and not is_fresh:
-        closing = tail  # with the last sample, or not before it
+        closing = tail  # windows from here on close with the newest sample or later
         if is_decided and last > 0:
             closing = min(max(_first_holding(state, window, last - 1, last), lowest), tail)
         end = min(_first_starting(state, window, changed_end, last), closing)
@@ -460,7 +460,7 @@ def _bring_up(
             value, begin = _start_of_past(rows, d, state, tables), min(state[CHANGED, b], last)
             if a >= 0:
                 begin = min(begin, state[CHANGED, a])
-            # what its table says follows what is to come, if that matters to its operands
+            # the start value is read from a table: it depends on later samples if the operands do
             if start >= 0 and (is_fresh or columns[column, start] != value):
                 columns[column, start], begin = value, start
             begin = start + 1 if is_fresh else max(begin, start + 1)
@@ -566,7 +566,7 @@ def run_windows(
     for k in range(count):
         last = begin + k
         if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corners - 1]:
-            # it is the same whatever is still to come
+            # the extreme corners agree: no later sample can change the value
             columns[first_result, k] = columns[first_result + 2, k] = columns[first_result + 3, k] = tables[
                 0, 0
             ]
@@ -621,7 +621,7 @@ def _reach(
         if rows[d, codes.NODE_VARIABLE] >= 0 and state[HEAD, IS_BEGUN]:
             state[LOW, d] = min(state[LOW, d], state[BOUNDARY, d])
         if rows[d, codes.NODE_TABLE] >= 0:
-            # what it starts from stands in its column, too
+            # the column also holds the value that the operator starts from
             state[LOW, d] = min(state[LOW, d], max(state[STATE, d], 0))
         low, high = state[LOW, d], state[HIGH, d]
         if code == codes.LITERAL:
@@ -753,6 +753,7 @@ def _absorb(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
     """Move the base over every position whose windows have all closed, many at a time."""
+    # the largest closed run first: a table is renewed once for many positions
     size, old_base = CLOSING, state[HEAD, BASE]
     while size > 0:
         base = state[HEAD, BASE]

@@ -83,6 +83,7 @@ class Evidence:
 
     def scenes(self, times_ns: Collection[int]) -> dict[int, TraceScene]:
         """Return the sample of each of some times, as `scene` does, in one pass over the log."""
+        # in reverse, so that `pop` takes the earliest
         pending, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
         for scene in self._scenes() if pending else ():
             trace = scene.trace
@@ -110,7 +111,7 @@ class Evidence:
         bindings = self.instance.bindings
         if not any(isinstance(formula, Quantified) for formula in formulas):
             return leaf_values(scene, formulas, bindings)
-        # how many bindings there may be is limited for one formula, and these are variants of one
+        # one call a formula: the limit of bindings counts all formulas of a call
         return joined_channels([leaf_values(scene, [formula], bindings) for formula in formulas], axis=1)
 
     def first_ns(self) -> int:

@@ -217,6 +217,7 @@ class _Walk:
                         extremum, end, lambda index: self._nodes.interval(index, sample)
                     )
                 ]
+                # `min` returns the first of equal samples: ties go to the first operand
                 operand_path = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal():
                 lasting = self._lasting(node, sample, end) if self._nodes.goes_on else None

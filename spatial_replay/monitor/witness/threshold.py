@@ -297,7 +297,7 @@ class _Search:
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
         slopes = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
-        # from the formula: equal leaves share the place of the first, wherever it was written
+        # slopes of the formula, not of the leaves: equal leaves share a place, wherever they were written
         self._moving: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
         for index, leaf in enumerate(self._order):
@@ -335,7 +335,7 @@ class _Search:
         nearest = [number for side in self._directions if (number := self._nearest(side)) is not None]
         for number in sorted(nearest, key=lambda number: abs(number - dial.value)):
             candidates = list(filter(self._is_possible, _short_numbers(number, dial.value)))
-            # one of the first two flips it nearly always; each measures all bindings of a quantifier again
+            # nearly always one of the first two flips it; each costs a measurement of all bindings
             for batch in filter(None, (candidates[:2], candidates[2:])):
                 verdicts = self._verdicts(batch, is_shifted=False)
                 for candidate, verdict in zip(batch, verdicts, strict=True):
@@ -400,6 +400,7 @@ class _Search:
             if slope
         ]
         sizes = np.sort(np.concatenate(moves))
+        # the tolerance keeps the deciding sample, whose quotient may be rounded down
         sizes = sizes[np.isfinite(sizes) & (sizes >= self._least * (1.0 - 1e-9))]
         candidates = np.concatenate([[self._least], sizes])
 
@@ -583,6 +584,7 @@ def _short_numbers(number: float, value: float) -> Iterator[float]:
     leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
     last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):
+        # the nearest short number may not flip the verdict; the one beyond does
         for rounding in (ROUND_HALF_EVEN, rounding_away):
             rounded = exact.quantize(Decimal(1).scaleb(place), context=Context(_PRECISION, rounding))
             yield float(rounded) + 0.0

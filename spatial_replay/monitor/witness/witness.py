@@ -367,7 +367,7 @@ def time_of_least(
         prefix = evaluate_prefix(instance.formula, order, leaves[..., until], times_ns[until])
         return bool(prefix.ends(node)[1][0] <= least)
 
-    # most often no more samples are needed than decide it
+    # most often the samples that decide it suffice: one evaluation instead of a search
     later = range(earliest, earliest if is_reached(earliest) else len(times_ns) - 1)
     return int(times_ns[earliest + bisect_left(later, True, key=is_reached)])
 
