@@ -191,14 +191,16 @@ def _with_atoms(
     """Yield intervals with the atom that decides the worst sample of each."""
     bindings, condition = evidence.instance.bindings, invariant.condition
     paths = [deciding_path(nodes, invariant.operand, invariant.end, sample=sample) for sample in worst]
-    responses = [missed_response(path, nodes, bindings)[1] for path in paths]
-    conditions = [
+    response_paths = [missed_response(path, nodes, bindings)[1] for path in paths]
+    condition_paths = [
         path if condition is None else deciding_path(nodes, condition, End.LOW, sample=sample)
         for path, sample in zip(paths, worst, strict=True)
     ]
-    ends = [path.steps[-1].sample for path in (*paths, *responses, *conditions) if path is not None]
-    scene_at = evidence.scenes(set(nodes.times_ns[ends].tolist())).__getitem__
-    for interval, path, condition_path in zip(intervals, paths, conditions, strict=True):
+    deciding_samples = [
+        path.steps[-1].sample for path in (*paths, *response_paths, *condition_paths) if path is not None
+    ]
+    scene_at = evidence.scenes(set(nodes.times_ns[deciding_samples].tolist())).__getitem__
+    for interval, path, condition_path in zip(intervals, paths, condition_paths, strict=True):
         deciding = atom_of_path(evidence, nodes, path, scene_at)
         deciding_ns = int(nodes.times_ns[path.steps[-1].sample])
         closest = find_missed_response(evidence, nodes, path, scene_at).closest

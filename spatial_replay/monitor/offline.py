@@ -228,16 +228,16 @@ class OfflineTable(SignalTable):
         """
         # reversed, so that the first of several equal nodes owns the row
         column = {row: node for node, row in reversed(list(enumerate(nodes)))}
-        others = (row for row in range(len(self._rows)) if row not in column)
-        column |= dict(zip(others, count(len(nodes)), strict=False))
-        result = []
+        other_rows = (row for row in range(len(self._rows)) if row not in column)
+        column |= dict(zip(other_rows, count(len(nodes)), strict=False))
+        rows = []
         for number, (code, a, b, *window) in enumerate(self._rows):
             operands = (a, b) if code == codes.LEAF else (column[a], column[b])
-            result.append((code, *operands, *window, column[number]))
+            rows.append((code, *operands, *window, column[number]))
         # equal nodes share a row, but each has a column of its own
         copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
-        result += [copy for copy in copies if copy[1] != copy[-1]]
-        return array_of_rows(result, codes.OFFLINE_WIDTH)
+        rows += [copy for copy in copies if copy[1] != copy[-1]]
+        return array_of_rows(rows, codes.OFFLINE_WIDTH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -539,9 +539,11 @@ def window_signal(
     leaves = np.ascontiguousarray(leaves[:2])
     starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
     columns = np.empty((len(leaves), compiled.width, len(times_ns)))
-    result = np.empty((len(leaves), compiled.nodes, len(times_ns)))
-    run_windows(compiled.table, leaves, writable(times_ns), starts, columns, np.empty(len(times_ns)), result)
-    return _determined_numbers(result)
+    window_ends = np.empty((len(leaves), compiled.nodes, len(times_ns)))
+    run_windows(
+        compiled.table, leaves, writable(times_ns), starts, columns, np.empty(len(times_ns)), window_ends
+    )
+    return _determined_numbers(window_ends)
 
 
 def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:

@@ -183,14 +183,14 @@ class LogNumbers:
         self._past = extended_trace
         scene = TraceScene(extended_trace, self._regions, len(extended_trace) - len(trace))
         for key, threshold_range in self._ranges.items():
-            number = replace(
+            quantity_atom = replace(
                 threshold_range.atom,
                 expression=_compared_quantity(threshold_range.atom) or threshold_range.atom.expression,
             )
             # one call a formula, as in a replay: the limit of bindings counts all formulas of a call
             least, greatest, all_hold, any_holds = (
                 leaf_values(scene, [over_bindings(quantifier, threshold_range.bound, atom)], {})[:, 0]
-                for atom in (number, threshold_range.atom)
+                for atom in (quantity_atom, threshold_range.atom)
                 for quantifier in ("forall", "exists")
             )
             # low and high ends differ where something is unknown; without any object they are infinite
@@ -201,11 +201,11 @@ class LogNumbers:
             # `forall` of nothing is +inf, `exists` -inf
             is_empty = (all_hold == np.inf).all(axis=0) & (any_holds == -np.inf).all(axis=0)
             is_sure &= ~is_empty
-            numbers = is_sure & (not is_text)
+            has_number = is_sure & (not is_text)
             self._ranges[key] = replace(
                 threshold_range,
-                least=min(threshold_range.least, float(least[0, numbers].min(initial=inf))),
-                greatest=max(threshold_range.greatest, float(greatest[0, numbers].max(initial=-inf))),
+                least=min(threshold_range.least, float(least[0, has_number].min(initial=inf))),
+                greatest=max(threshold_range.greatest, float(greatest[0, has_number].max(initial=-inf))),
                 known=threshold_range.known + int(is_sure.sum()),
                 holding=threshold_range.holding + int((all_hold[0, is_sure] >= 0.0).sum()),
                 failing=threshold_range.failing + int((any_holds[0, is_sure] < 0.0).sum()),

@@ -379,10 +379,10 @@ class SpecResult(Displayed):
         """
         leaves, times_ns = self._stored
         lower, upper = self.final[0].tolist()
-        infinite = End.LOW if lower == np.inf else End.HIGH if upper == -np.inf else None
+        infinite_end = End.LOW if lower == np.inf else End.HIGH if upper == -np.inf else None
         # no path leads through atoms that the paper's semantics leaves out
-        infinite = None if np.isnan(leaves).any() else infinite
-        return find_vacuous(self.evidence, leaves, times_ns, infinite=infinite)
+        infinite_end = None if np.isnan(leaves).any() else infinite_end
+        return find_vacuous(self.evidence, leaves, times_ns, infinite=infinite_end)
 
     @property
     def tested(self) -> Tested:

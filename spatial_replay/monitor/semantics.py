@@ -437,11 +437,11 @@ def total(
     is_least: bool, numbers: Floats, lost: Flags, first: int, last: int
 ) -> tuple[float, int]:  # fmt: skip
     """Return the least or the greatest number from `first` to `last`."""
-    result, is_lost = np.nan, 0
+    extremum, is_lost = np.nan, 0
     for t in range(first, last + 1):
-        result = pick(is_least, result, numbers[t])
+        extremum = pick(is_least, extremum, numbers[t])
         is_lost |= lost[t]
-    return result, is_lost
+    return extremum, is_lost
 
 
 @piece
@@ -449,11 +449,11 @@ def scan(
     is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, target: Floats, target_lost: Flags
 ) -> None:
     """Compute, from each sample from `first` on, the least or greatest number up to `last`."""
-    result, is_lost = np.nan, 0
+    extremum, is_lost = np.nan, 0
     for t in range(last, first - 1, -1):
-        result = pick(is_least, result, numbers[t])
+        extremum = pick(is_least, extremum, numbers[t])
         is_lost |= lost[t]
-        target[t], target_lost[t] = result, is_lost
+        target[t], target_lost[t] = extremum, is_lost
 
 
 @piece

@@ -238,14 +238,16 @@ def sentences_of(
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
     title += f" for {witness.object}" if witness.object is not None else ""
     title += f" ({requirement})" if requirement else ""
-    numbers = _robustness(witness.lower, witness.upper, witness.unit)
+    robustness_text = _robustness(witness.lower, witness.upper, witness.unit)
     if witness.settled_ns is not None:
         sentences = [_permanence_sentence(title, witness.verdict, Instant(witness.settled_ns, first_ns))]
     elif is_open:
-        sentences = [Sentence(f"{title} is pending: {numbers} so far, and later samples decide.")]
+        sentences = [Sentence(f"{title} is pending: {robustness_text} so far, and later samples decide.")]
     else:
-        sentences = [Sentence(f"{title} is {witness.verdict}{_ENDED if has_ended else ''}: {numbers}.")]
-    flipping, witness = witness, least or witness
+        sentences = [
+            Sentence(f"{title} is {witness.verdict}{_ENDED if has_ended else ''}: {robustness_text}.")
+        ]
+    flipping_witness, witness = witness, least or witness
     if witness.missed is not None and not is_open:
         sentences += missed_sentences(witness, witness.missed, first_ns)
     if witness.deciding is None:
@@ -265,13 +267,17 @@ def sentences_of(
         if witness.missed is None or not witness.missed.is_condition or is_open:
             sentences.append(Sentence(f"{subject} is `{witness.deciding.text}`, which ", outcome))
         if least is not None:
-            sentences.append(_first_failure(flipping, first_ns))
-        if flipping.closest is not None and flipping.closest_threshold is not None:
-            flip = _flip(flipping, flipping.closest[0], flipping.closest_threshold)
-            sentences.append(Sentence(flip))
-        elif flipping.deciding is not None and flipping.obstacle != "infinity":
-            flip = _flip(flipping, flipping.deciding, flipping.threshold, is_open=is_open)
-            sentences.append(Sentence(flip))
+            sentences.append(_first_failure(flipping_witness, first_ns))
+        if flipping_witness.closest is not None and flipping_witness.closest_threshold is not None:
+            flip_text = _flip(
+                flipping_witness, flipping_witness.closest[0], flipping_witness.closest_threshold
+            )
+            sentences.append(Sentence(flip_text))
+        elif flipping_witness.deciding is not None and flipping_witness.obstacle != "infinity":
+            flip_text = _flip(
+                flipping_witness, flipping_witness.deciding, flipping_witness.threshold, is_open=is_open
+            )
+            sentences.append(Sentence(flip_text))
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns, witness.units))
     return tuple(sentences)

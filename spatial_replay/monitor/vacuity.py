@@ -514,15 +514,15 @@ def _empty_groups(
         for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True))
         if isinstance(node, Atom | Quantified) and scope.any()
     }
-    all_groups = list(dict.fromkeys(group for of_node in open_groups.values() for group in of_node))
-    groups = {
+    all_groups = list(dict.fromkeys(group for node_groups in open_groups.values() for group in node_groups))
+    has_members = {
         group: bool(members.any())
         for group, members in zip(all_groups, evidence.members(all_groups), strict=True)
     }
     for identifier, node_groups in open_groups.items():
-        empty = [group for group in node_groups if not groups[group]]
-        if empty:
-            names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty))
+        empty_groups = [group for group in node_groups if not has_members[group]]
+        if empty_groups:
+            names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty_groups))
             predicate = f"decided nothing: no object was ever in {names}."
             yield _Idle(identifier, "no members", (predicate,))
 
@@ -655,20 +655,20 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
     """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers, empty groups, rates."""
     low, high = low_and_high(len(leaves), wide=True)
-    result = roomy((2, *leaves.shape[1:]), np.float64)
-    result[0], result[1] = -np.inf, np.inf
+    unknown_leaves = roomy((2, *leaves.shape[1:]), np.float64)
+    unknown_leaves[0], unknown_leaves[1] = -np.inf, np.inf
     for place, leaf in enumerate(order):
         bound = evidence.bound(leaf)
         groups = list(dict.fromkeys(_open_groups(bound)))
         if is_about_having_rates(bound):
-            result[:, place] = leaves[[low, high], place]
+            unknown_leaves[:, place] = leaves[[low, high], place]
         elif isinstance(bound, Quantified):
             column = evidence.columns([_without_tests(bound)])
-            result[:, place] = in_channels(column, 4)[2:, 0]
+            unknown_leaves[:, place] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)
-            result[:, place, is_empty] = leaves[[low, high], place][:, is_empty]
-    return result
+            unknown_leaves[:, place, is_empty] = leaves[[low, high], place][:, is_empty]
+    return unknown_leaves
 
 
 def _without_tests(formula: Formula) -> Formula:

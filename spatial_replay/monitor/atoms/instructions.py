@@ -413,10 +413,10 @@ class LeafCode:
         """Return a row that is a number where all objects of a rate, or its signal, are in the sample."""
         if rate.signal is not None:
             return self._expression(rate.signal, bindings)
-        first, *other_rows = [self._expression(Projection(term, "x", "min"), bindings) for term in rate.terms]
+        row, *other_rows = [self._expression(Projection(term, "x", "min"), bindings) for term in rate.terms]
         for other_row in other_rows:
-            first = self._row(ADD, first, other_row)
-        return first
+            row = self._row(ADD, row, other_row)
+        return row
 
     def _expansion_row(self, formula: Formula, rows: Mapping[int, int]) -> int:
         """Return the row of an expansion, given the rows of the operands that were written, by `id`.
@@ -425,13 +425,13 @@ class LeafCode:
         """
         if id(formula) in rows:
             return rows[id(formula)]
-        first, *other_rows = [self._expansion_row(operand, rows) for operand in operands_of(formula)]
+        row, *other_rows = [self._expansion_row(operand, rows) for operand in operands_of(formula)]
         operator = operator_of(formula)
         if operator == "not":
-            return self._row(NEGATE, first)
+            return self._row(NEGATE, row)
         for other_row in other_rows:
-            first = self._row(AND if operator == "and" else OR, first, other_row)
-        return first
+            row = self._row(AND if operator == "and" else OR, row, other_row)
+        return row
 
     def _quantifier(self, formula: Quantified, bindings: Bindings) -> int:
         is_forall = formula.quantifier == "forall"
@@ -446,16 +446,16 @@ class LeafCode:
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER
-        result = self._constant(inf if is_forall else -inf)
+        row = self._constant(inf if is_forall else -inf)
         if self._groups.may_be_unknown(group):
-            result = self._row(op, result, result, self._member(group, ()))
+            row = self._row(op, row, row, self._member(group, ()))
         # permutations: different variables stand for different members
         for candidates in permutations(range(len(names)), len(formula.variables)):
             members = [TrackedName(names[n]) for n in candidates]
             inner = {**bindings, **dict(zip(formula.variables, members, strict=True))}
             body = self._add(formula.judged, inner)
-            result = self._row(op, result, body, self._member(group, candidates))
-        return result
+            row = self._row(op, row, body, self._member(group, candidates))
+        return row
 
     def _member(self, group: Group | Earlier, candidates: tuple[int, ...]) -> int:
         return self.members.setdefault(Membership(group, candidates), len(self.members))

@@ -1008,9 +1008,9 @@ class SampleLeaves:
         code_of, takes_any, spec_names = self._code_of, self._takes_any, self._spec_names
         for sample in filter(None, samples):
             objects: Any = sample.objects
-            coded = [code_of(tracked.class_name) for tracked in objects.values()]
-            coded += map(code_of, sample.unknown.values())
-            for name, code in zip(chain(objects, sample.unknown), coded, strict=True):
+            codes = [code_of(tracked.class_name) for tracked in objects.values()]
+            codes += map(code_of, sample.unknown.values())
+            for name, code in zip(chain(objects, sample.unknown), codes, strict=True):
                 if not (code or takes_any):
                     continue
                 if name in spec_names:
@@ -1021,10 +1021,10 @@ class SampleLeaves:
                     classes_by_name[name] = tuple(sorted((*classes_by_name[name], code)))
         if not self._spec_members.issuperset(spec_members):
             self._spec_members |= frozenset(spec_members)
-        kinds: dict[_Classes, list[str]] = {}
-        for name, kind in classes_by_name.items():
-            kinds.setdefault(kind, []).append(name)
-        return kinds
+        names_by_classes: dict[_Classes, list[str]] = {}
+        for name, classes in classes_by_name.items():
+            names_by_classes.setdefault(classes, []).append(name)
+        return names_by_classes
 
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
         """Return the plan for the given number of unnamed members of each kind."""

@@ -66,14 +66,14 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     Returns:
         (2, T) each, or (1, T), the values alone, where the scene is sure.
     """
-    numbers: dict[Term, int] = {}
+    operand_numbers: dict[Term, int] = {}
     operands: list[Operand] = []
 
     def operand(term: Term) -> int:
-        if term not in numbers:
-            numbers[term] = len(operands)
+        if term not in operand_numbers:
+            operand_numbers[term] = len(operands)
             operands.append(scene.resolve(term).operand)
-        return numbers[term]
+        return operand_numbers[term]
 
     requests = [
         MeasureRequest(measurement.quantity, *map(operand, measurement.terms))
@@ -81,7 +81,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
         if not measurement.needs_orientation
     ]
     values = iter(measure(scene.batch, operands, requests) if requests else ())
-    result = []
+    arrays = []
     for measurement in measurements:
         resolved_terms = [scene.resolve(term) for term in measurement.terms]
         if measurement.needs_orientation:
@@ -93,8 +93,8 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
             value = np.where(unknown, np.nan, value)
         array = np.array([value] if scene.is_sure else [value, spread])
         array.flags.writeable = False
-        result.append(array)
-    return result
+        arrays.append(array)
+    return arrays
 
 
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
@@ -143,10 +143,10 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     is_known = is_known and not has_texts and (closest[:, 0] == closest[:, 1]).all()
     is_sure = (scene.is_sure or not spreads.any()) and (closest[:, :2] == closest[:, 2:]).all()
     channels = 4 if not is_sure else 1 if is_known else 2
-    result = np.empty((channels, len(outputs), count))
+    numbers = np.empty((channels, len(outputs), count))
     arguments = (
         rows.reshape(-1), constants, values.reshape(-1), spreads.reshape(-1), signals.reshape(-1),
-        closest.reshape(-1), members.reshape(-1), outputs, result,
+        closest.reshape(-1), members.reshape(-1), outputs, numbers,
     )  # fmt: skip
     over_cores(
         run_instructions,
@@ -154,7 +154,7 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
         count,
         _SHARE // max(len(rows), 1) + 1,
     )
-    return result
+    return numbers
 
 
 def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:
@@ -163,11 +163,11 @@ def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:
     ends = cache.get(key)
     if ends is None:
         rows, uncertainty = scene.resolve(pair.group).operand.rows, scene.trace.uncertainty
-        least, low, high = closest_pairs(scene.batch, rows, uncertainty, pair.enlargement).T
+        nominal, low, high = closest_pairs(scene.batch, rows, uncertainty, pair.enlargement).T
         # a member with an unknown position may be one of the closest two
         is_hidden = (rows < ABSENT).any(axis=1) & ((rows != ABSENT).sum(axis=1) > 1)
-        nominal_low, wide_low = (np.where(is_hidden, -np.inf, distances) for distances in (least, low))
-        ends = np.stack((nominal_low, least, wide_low, high))
+        nominal_low, wide_low = (np.where(is_hidden, -np.inf, distances) for distances in (nominal, low))
+        ends = np.stack((nominal_low, nominal, wide_low, high))
         ends.flags.writeable = False
         cache.put(key, ends)
     return ends

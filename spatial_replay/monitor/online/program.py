@@ -105,7 +105,7 @@ class SignalTable:
         """Return the table (S, SIGNAL_WIDTH), with its rings numbered.
 
         Args:
-            kept: the rows that parts look at behind the newest sample.
+            kept_rows: those that parts look at behind the newest sample.
         """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
         looked_at = set(kept_rows)
@@ -176,15 +176,15 @@ class SignalTable:
     def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
         """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and phi S
         psi before. Min distributes over max, so both are exact for robustness too."""
-        result = self.row(codes.SINCE + ahead, left, right)
+        row = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
-            delayed = self.delay(result, unit, low, ahead)
+            delayed = self.delay(row, unit, low, ahead)
             since = self.row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
-            result = self.row(codes.AND, since, delayed)
+            row = self.row(codes.AND, since, delayed)
         if high is not None:
             window_row = self.row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
-            result = self.row(codes.AND, window_row, result)
-        return result
+            row = self.row(codes.AND, window_row, row)
+        return row
 
     def infinity_after(self, unit: int, distance: int, sign: int) -> int:
         """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
@@ -246,11 +246,11 @@ class PartRows:
         """Return rows with the numbers of their variable and table, and whether they depend on either."""
         variable = 0
         table = 1  # 0 is the part's own table
-        result: list[Row] = []
+        numbered_rows: list[Row] = []
         for *fields, is_variable in self._rows:
             has_table = fields[0] in _RECURRENT_PAST
-            depends_below = any(result[operand_row][-1] for operand_row in operand_rows(*fields[:3]))
-            result.append(
+            depends_below = any(numbered_rows[operand_row][-1] for operand_row in operand_rows(*fields[:3]))
+            numbered_rows.append(
                 (
                     *fields,
                     variable if is_variable else NOTHING,
@@ -260,7 +260,7 @@ class PartRows:
             )
             variable += is_variable
             table += has_table
-        return tuple(result)
+        return tuple(numbered_rows)
 
     @property
     def is_flat(self) -> bool:
@@ -356,13 +356,13 @@ class PartRows:
         window_row = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
         if window_row is not None and left == NOTHING:
             return window_row
-        result = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
+        since_row = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
         if low > 0:
-            result = self.row(codes.PAST_DELAY, result, 0, weak, unit, low)
+            since_row = self.row(codes.PAST_DELAY, since_row, 0, weak, unit, low)
             if left != NOTHING:
                 lead_row = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
-                result = self._join(lead_row, result, is_both=is_since)
-        return result if window_row is None else self._join(window_row, result, is_both=is_since)
+                since_row = self._join(lead_row, since_row, is_both=is_since)
+        return since_row if window_row is None else self._join(window_row, since_row, is_both=is_since)
 
     def _ending(self, formula: Formula, positive: bool) -> int:
         """Return the row of a bounded operator of which only the value at the first sample is needed.

@@ -172,15 +172,15 @@ def read_table(tables: Floats, row: int, first: int, variables: int, points: Flo
         points, point: the row of the point.
     """
     # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
-    result, corner = tables[row, first], 0
+    value, corner = tables[row, first], 0
     for _ in range(variables):
         greatest = -1
         for j in range(variables):
             if not corner >> j & 1 and (greatest < 0 or points[point, j] > points[point, greatest]):
                 greatest = j
         corner |= 1 << greatest
-        result = max(result, min(points[point, greatest], tables[row, first + corner]))
-    return float(result)
+        value = max(value, min(points[point, greatest], tables[row, first + corner]))
+    return float(value)
 
 
 @inlined
