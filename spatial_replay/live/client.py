@@ -1,148 +1,26 @@
-"""A client of Foxglove's WebSocket protocol: frames, connections, messages."""
+"""A client of a robot's Foxglove server: connections, and arrived messages until they are read."""
 
 from __future__ import annotations
 
 import asyncio
-import base64
-import binascii
-import json
-import struct
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.errors import LogError, RemoteError, UsageError, importing, system_reason
-from spatial_replay.logs.messages import Channel, Schema
-from spatial_replay.trace.trace import LATEST_NS
-
-SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""In the order of preference: that of the Foxglove SDK, and that of foxglove_bridge before it."""
-
-_SCHEMA_ENCODINGS: Final = {
-    "json": "jsonschema",
-    "protobuf": "protobuf",
-    "flatbuffer": "flatbuffer",
-    "ros1": "ros1msg",
-    "cdr": "ros2msg",
-}
-"""The encoding of schemas where a server does not name it."""
-
-_BINARY_SCHEMAS: Final = frozenset({"protobuf", "flatbuffer"})
-_MESSAGE: Final = 1
-_HEAD: Final = struct.Struct("<IQ")
-_LONGEST_TEXT: Final = 200
-
-
-class Connected(NamedTuple):
-    """A connection stands; channels are advertised next."""
-
-    server: str
-
-
-class Warned(NamedTuple):
-    """The server says something about itself, or sends what breaks the protocol."""
-
-    text: str
-
-
-class Advertised(NamedTuple):
-    """Channels that a server offers, by their numbers in this connection."""
-
-    channels: dict[int, Channel]
-
-
-class Unadvertised(NamedTuple):
-    """Channels that a server offers no longer."""
-
-    numbers: tuple[int, ...]
-
-
-class MessageData(NamedTuple):
-    """A message of a subscription."""
-
-    subscription: int
-    time_ns: int
-    payload: bytes
-
-
-Frame: TypeAlias = Connected | Advertised | Unadvertised | Warned | MessageData
-
-
-def decode_frame(raw: str | bytes) -> Frame | None:
-    """Decode a frame of a server; None for those that a monitor has no use for.
-
-    Raises:
-        LogError: it does not keep to the protocol; what is wrong with it.
-    """
-    if isinstance(raw, str):
-        return _decode_text(raw)
-    if not raw:
-        raise LogError("a binary frame is empty")
-    if raw[0] != _MESSAGE:
-        return None
-    if len(raw) < 1 + _HEAD.size:
-        raise LogError(f"a message has {len(raw)} bytes; its head alone has {1 + _HEAD.size}")
-    subscription, time_ns = _HEAD.unpack_from(raw, 1)
-    if time_ns > LATEST_NS:
-        raise LogError(f"a message has the time {time_ns} ns; times of a log end at 2**63 - 1")
-    return MessageData(subscription, time_ns, raw[1 + _HEAD.size :])
-
-
-def subscribe(numbers: Iterable[int]) -> str:
-    """Return the request to subscribe to channels, each under its own number."""
-    subscriptions = [{"id": number, "channelId": number} for number in numbers]
-    return json.dumps({"op": "subscribe", "subscriptions": subscriptions})
-
-
-def _decode_text(raw: str) -> Frame | None:
-    try:
-        frame: Any = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise LogError(f"a text frame is not JSON: {error!s:.100}") from None
-    try:
-        match frame:
-            case {"op": "serverInfo"}:
-                return Connected(str(frame.get("name", ""))[:_LONGEST_TEXT])
-            case {"op": "advertise", "channels": channels}:
-                return Advertised({_number(offer["id"]): _channel(offer) for offer in channels})
-            case {"op": "unadvertise", "channelIds": numbers}:
-                return Unadvertised(tuple(map(_number, numbers)))
-            case {"op": "status", "message": text}:
-                # information, such as about a subscription, is no warning
-                return Warned(str(text)[:_LONGEST_TEXT]) if int(frame.get("level", 0)) > 0 else None
-            case {"op": _}:
-                return None
-        raise ValueError("it has no `op`")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise LogError(f"a text frame breaks the protocol: {reason:.200}") from None
-
-
-def _number(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        raise ValueError(f"{value!r:.40} is not the number of a channel")
-    return value
-
-
-def _channel(described: Any) -> Channel:
-    topic, encoding = described["topic"], described["encoding"]
-    name, text = described.get("schemaName") or "", described.get("schema") or ""
-    for part in (topic, encoding, name, text):
-        if not isinstance(part, str):
-            raise ValueError(f"{part!r:.40} in a channel is not a text")
-    schema_encoding = described.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, "")
-    if not name and not text:
-        return Channel(topic, encoding, None)
-    data = text.encode("utf-8", "replace")
-    if schema_encoding in _BINARY_SCHEMAS:
-        try:
-            data = base64.b64decode(text, validate=True)
-        except binascii.Error as error:
-            raise ValueError(f"the schema of {topic!r:.100} is not Base64: {error}") from None
-    return Channel(topic, encoding, Schema(name, str(schema_encoding), data))
-
+from spatial_replay.live.protocol import (
+    SUBPROTOCOLS,
+    Advertised,
+    Connected,
+    MessageData,
+    Unadvertised,
+    Warned,
+    decode_frame,
+    subscribe,
+)
+from spatial_replay.logs.messages import Channel
 
 with importing("a running robot is listened to with websockets", extra="live"):
     from websockets.asyncio.client import ClientConnection, connect

@@ -22,7 +22,8 @@ import numpy as np
 from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
 from spatial_replay.bags.reader import DISORDER_NS, Message
 from spatial_replay.errors import LogError, UsageError, importing
-from spatial_replay.live.client import Client, Connected, Disconnected, Inbox, Offered, Received, Warned
+from spatial_replay.live.client import Client, Disconnected, Inbox, Offered, Received
+from spatial_replay.live.protocol import Connected, Warned
 from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages, is_kept
 from spatial_replay.logs.objects import OBJECTS_CHANNEL, decode_objects
 from spatial_replay.logs.read_options import FaultKinds
