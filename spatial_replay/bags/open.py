@@ -18,7 +18,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Topic, full_type_name, topic_of, topics_by_name
+from spatial_replay.bags.decoders import Topic, topic_of, topics_by_name
+from spatial_replay.bags.definitions import full_type_name
 from spatial_replay.bags.reader import (
     Columns,
     MessageColumns,

@@ -21,7 +21,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Decoder, Topic, decoder_of
+from spatial_replay.bags.decoders import Topic, decoder_of
+from spatial_replay.bags.definitions import Decoder
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.logs.mcap.read import too_many_waiting

@@ -21,7 +21,8 @@ import lz4.frame
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.bags.decoders import Topic, channel_of, full_type_name, topics_by_name
+from spatial_replay.bags.decoders import Topic, channel_of, topics_by_name
+from spatial_replay.bags.definitions import full_type_name
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Integers

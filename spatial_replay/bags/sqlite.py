@@ -25,14 +25,8 @@ from urllib.parse import quote
 import numpy as np
 import zstandard
 
-from spatial_replay.bags.decoders import (
-    LONGEST_TEXT,
-    Topic,
-    channel_of,
-    full_type_name,
-    is_latched,
-    topics_by_name,
-)
+from spatial_replay.bags.decoders import Topic, channel_of, is_latched, topics_by_name
+from spatial_replay.bags.definitions import LONGEST_TEXT, full_type_name
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader
 from spatial_replay.errors import LogError, OutputError
 from spatial_replay.logs.mcap.index import LARGEST_CHUNK

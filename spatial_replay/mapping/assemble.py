@@ -20,7 +20,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Decoder, Topic
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.bags.definitions import Decoder
 from spatial_replay.bags.reader import DISORDER_NS, JUMP_REMEDY, Message, MessageColumns
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Integers, select

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Topic, full_type_name, why_unreadable
+from spatial_replay.bags.decoders import Topic, why_unreadable
+from spatial_replay.bags.definitions import full_type_name
 from spatial_replay.bags.open import files_of_bag_around, open_messages
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_pieces, without_jumps
 from spatial_replay.errors import LogError, UsageError

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Decoder
+from spatial_replay.bags.definitions import Decoder
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.mapping.binding import (

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Topic, decoder_of, full_type_name
+from spatial_replay.bags.decoders import Topic, decoder_of
+from spatial_replay.bags.definitions import full_type_name
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.read import McapSource

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Decoder, Topic
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.bags.definitions import Decoder
 from spatial_replay.bags.open import McapLog, open_messages
 from spatial_replay.bags.reader import Message, MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError

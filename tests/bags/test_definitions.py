@@ -9,15 +9,13 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spatial_replay import LogError
-from spatial_replay.bags.decoders import (
+from spatial_replay.bags.definitions import (
     check_definitions,
     definitions_from_msg,
     full_type_name,
     msg_from_definitions,
-    ros_decoder,
-    ros_definitions,
-    standard_schema,
 )
+from spatial_replay.bags.ros_decoders import ros_decoder, ros_definitions, standard_schema
 from spatial_replay.logs.messages import Schema
 
 SEPARATOR = "=" * 80

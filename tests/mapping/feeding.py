@@ -11,7 +11,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from spatial_replay import Trace
-from spatial_replay.bags.decoders import Decoder, Topic
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.bags.definitions import Decoder
 from spatial_replay.bags.reader import Message
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping

@@ -1,0 +1,258 @@
+"""Definitions of message types: texts in MSG form in, fields with bounded sizes out.
+
+A definition comes with the log and is not trusted: it gets through only if names are plain identifiers,
+references resolve without a cycle, and sizes are bounded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from spatial_replay.errors import LogError
+
+Decoder = Callable[[bytes], object]
+"""A payload to an object with fields: attributes of ROS and protobuf messages, keys of a JSON object."""
+
+
+Kind: TypeAlias = Literal["scalar", "array", "sequence"]
+
+LONGEST_TEXT = 2**18
+MOST_TYPES = 1_000
+MOST_FIELDS = 4_000
+MOST_VALUES = 4_000
+"""Values in one message that its definition alone, not its bytes, asks for: each becomes lines of code."""
+MOST_VALUES_IN_ALL = 12_000
+"""The same, over a type and all those that it uses."""
+
+BASE_BYTES: Mapping[str, int] = {
+    **dict.fromkeys(("bool", "byte", "char", "octet", "int8", "uint8"), 1),
+    **dict.fromkeys(("int16", "uint16"), 2),
+    **dict.fromkeys(("int32", "uint32", "float32", "string"), 4),
+    **dict.fromkeys(("int64", "uint64", "float64"), 8),
+}
+"""The least number of bytes that a value takes; a string has at least its length."""
+_NOT_READ = frozenset({"wstring", "wchar", "char16", "float128"})
+"""Base types of ROS that are not read."""
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}")
+_FIELD = re.compile(
+    r"\s*(?P<type>[A-Za-z][A-Za-z0-9_/]*)(?:<=(?P<longest>[0-9]{1,10}))?"
+    r"(?P<brackets>\[(?P<limit>(?:<=)?[0-9]{1,10})?\])?[ \t]+(?P<name>[A-Za-z][A-Za-z0-9_]*)"
+    r"[ \t]*(?P<rest>.*)"
+)
+_ANNOTATIONS = re.compile(r"^\s*(?:@[A-Za-z_]\w*(?:\s*\([^()]*\))?\s*)+", re.ASCII)
+_SEPARATOR = re.compile(r"^={20,}[ \t]*\r?$", re.MULTILINE)
+_HEAD = re.compile(r"\s*(?:MSG|IDL): *(?P<name>\S+)[ \t]*\r?(?:\n|\Z)")
+_BUILT_IN = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A field of a message type.
+
+    Attributes:
+        type: a base type, or the full name of a message type.
+        size: of an array; the bound of a sequence, 0 for none.
+        longest: bound of a string's length, 0 for none.
+    """
+
+    name: str
+    type: str
+    kind: Kind = "scalar"
+    size: int = 0
+    longest: int = 0
+
+
+Definitions: TypeAlias = Mapping[str, tuple[Field, ...]]
+"""Message types with their fields, by full name."""
+
+
+def full_type_name(name: str) -> str:
+    """Return a ROS type's name with its middle part: geometry_msgs/Pose becomes geometry_msgs/msg/Pose."""
+    parts = name.split("/")
+    return "/".join([parts[0], "msg", parts[1]]) if len(parts) == 2 else name
+
+
+def definitions_from_msg(text: str, type_name: str) -> Definitions:
+    """Parse the types in a .msg text: its own, and those that it uses, after lines of equals signs.
+
+    Constants and default values are left out: no message depends on them.
+
+    Raises:
+        LogError: a line that is not a field, a malformed name.
+    """
+    sections = list(iter_sections(text, type_name))
+    section_names = {name for name, _ in sections}
+    fields_by_type: dict[str, tuple[Field, ...]] = {}
+    for name, body in sections:
+        if name not in fields_by_type:
+            fields_by_type[name] = tuple(_iter_fields(body, name, section_names))
+    return fields_by_type
+
+
+def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
+    """Yield each type's name and text; the first may lack a head line."""
+    if len(text) > LONGEST_TEXT:
+        raise LogError(
+            f"the definition of {type_name!r:.100} has {len(text)} characters;"
+            f" at most {LONGEST_TEXT} are read"
+        )
+    for section in _SEPARATOR.split(text):
+        head = _HEAD.match(section)
+        if head:
+            yield checked_type_name(full_type_name(head["name"])), section[head.end() :]
+        elif section.strip():
+            yield checked_type_name(full_type_name(type_name)), section
+
+
+def checked_type_name(name: str) -> str:
+    """Return the name, if it is one that a message type may have.
+
+    Raises:
+        LogError: it is not.
+    """
+    if len(name) > 256 or not _TYPE_NAME.fullmatch(name):
+        raise LogError(f"{name!r:.100} is not a name of a message type, such as geometry_msgs/msg/Pose")
+    return name
+
+
+def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
+    for number, line in enumerate(body.splitlines(), 1):
+        # an annotation may stand on the line of its field; no encoding of ROS depends on it so far
+        bare = _ANNOTATIONS.sub("", line.partition("#")[0])
+        if not bare.strip():
+            continue
+        field_match = _FIELD.fullmatch(bare)
+        if field_match is None:
+            raise LogError(
+                f"the definition of {owner!r}, line {number}: {line.strip()!r:.100} is not a field"
+            )
+        if field_match["rest"].startswith("="):
+            continue
+        limit, longest = field_match["limit"] or "", int(field_match["longest"] or 0)
+        kind: Kind = "scalar" if not field_match["brackets"] else "array" if limit.isdigit() else "sequence"
+        type_name = _resolve(field_match["type"], owner, known)
+        yield Field(field_match["name"], type_name, kind, int(limit.removeprefix("<=") or 0), longest)
+
+
+def _resolve(name: str, owner: str, known: set[str]) -> str:
+    if name in BASE_BYTES or name in _NOT_READ:
+        return name
+    if name in _BUILT_IN:
+        return _BUILT_IN[name]
+    if "/" in name:
+        return full_type_name(name)
+    neighbour = f"{owner.rpartition('/')[0]}/{name}"
+    return "std_msgs/msg/Header" if name == "Header" and neighbour not in known else neighbour
+
+
+def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: int) -> Definitions:
+    """Return the type and those that it uses, if it is safe to generate decoders from them.
+
+    Args:
+        empty_bytes: what a message without fields takes: 0 in ROS 1, 1 in ROS 2.
+
+    Raises:
+        LogError: a type that is missing, contains itself, or asks for too much; a name that is none.
+    """
+    walk = _Walk(definitions, empty_bytes)
+    walk.measure(type_name, ())
+    return walk.used
+
+
+class _Walk:
+    """Visits each type that is used; knows how many values it asks for, and how few bytes they may take."""
+
+    def __init__(self, definitions: Definitions, empty_bytes: int) -> None:
+        self._definitions = definitions
+        self._empty_bytes = empty_bytes
+        self._measured: dict[str, tuple[int, int]] = {}
+        self._in_all = 0
+        self.used: dict[str, tuple[Field, ...]] = {}
+
+    def measure(self, name: str, above: tuple[str, ...]) -> tuple[int, int]:
+        """Return how many values and at least how many bytes a type takes."""
+        if name in self._measured:
+            return self._measured[name]
+        if name not in self._definitions:
+            raise LogError(f"the definition of {name!r:.100} is missing" + _used_by(above))
+        if name in above or len(above) >= 64:
+            raise LogError(f"the type {name!r} contains itself" + _used_by(above))
+        if len(self.used) >= MOST_TYPES:
+            raise LogError(f"the definition uses more than {MOST_TYPES} types")
+        fields = self._definitions[name]
+        if len(fields) > MOST_FIELDS:
+            raise LogError(f"{name!r:.100} has {len(fields)} fields; at most {MOST_FIELDS} are read")
+        self.used[checked_type_name(name)] = fields
+        _check_field_names(name, fields)
+        values = least = 0
+        for member in fields:
+            field_values, field_least = self._field(member, name, (*above, name))
+            values += field_values
+            least += field_least
+        if values > MOST_VALUES:
+            raise LogError(f"{name!r} asks for {values} values in a message; at most {MOST_VALUES} are read")
+        self._in_all += values
+        if self._in_all > MOST_VALUES_IN_ALL:
+            raise LogError(
+                f"{name!r} and the types beside it ask for {self._in_all} values; at most"
+                f" {MOST_VALUES_IN_ALL} are read"
+            )
+        self._measured[name] = values, least if fields else self._empty_bytes
+        return self._measured[name]
+
+    def _field(self, field: Field, owner: str, above: tuple[str, ...]) -> tuple[int, int]:
+        if field.type in _NOT_READ:
+            raise LogError(f"{field.name!r} of {owner!r} is a {field.type}, which is not read")
+        if field.type in BASE_BYTES:
+            values, least = 1, BASE_BYTES[field.type]
+            by_block = field.type != "string"
+        else:
+            values, least = self.measure(field.type, above)
+            by_block = False
+        if field.kind == "array":
+            return (1 if by_block else max(1, values) * field.size), least * field.size
+        if field.kind == "sequence":
+            if not least:
+                raise LogError(f"{field.name!r} of {owner!r} is a sequence of items that take no bytes")
+            return values, 4
+        return values, least
+
+
+def _check_field_names(name: str, fields: tuple[Field, ...]) -> None:
+    seen: set[str] = set()
+    for member in fields:
+        if len(member.name) > 256 or not _NAME.fullmatch(member.name):
+            raise LogError(f"{member.name!r:.100} is not a name of a field; it is in {name!r}")
+        if member.name in seen:
+            raise LogError(f"the type {name!r} has two fields {member.name!r}")
+        seen.add(member.name)
+
+
+def _used_by(above: tuple[str, ...]) -> str:
+    return f"; it is used by {above[-1]!r}" if above else ""
+
+
+def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
+    """Write a .msg text of a type and those that it uses, as `definitions_from_msg` reads it."""
+    lines: list[str] = []
+    for name in sorted(definitions, key=lambda name: name != type_name):
+        if name != type_name:
+            lines += ["=" * 80, f"MSG: {name.replace('/msg/', '/')}"]
+        lines += [f"{_field_text(field)} {field.name}" for field in definitions[name]]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _field_text(field: Field) -> str:
+    name = field.type.replace("/msg/", "/") + (f"<={field.longest}" if field.longest else "")
+    match field.kind:
+        case "scalar":
+            return name
+        case "array":
+            return f"{name}[{field.size}]"
+        case "sequence":
+            return f"{name}[<={field.size}]" if field.size else f"{name}[]"
