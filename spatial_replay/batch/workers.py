@@ -22,7 +22,7 @@ from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
 from spatial_replay.batch.forking import forking_context
 from spatial_replay.errors import ClusterError, UsageError, importing
-from spatial_replay.recording.recorder import uninterrupted
+from spatial_replay.recording.interruption import uninterrupted
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
     from spatial_replay.monitor.verdict import Semantics
-    from spatial_replay.recording.recorder import Recorded
+    from spatial_replay.recording.source_recording import Recorded
     from spatial_replay.replay.engine import Replayed
     from spatial_replay.replay.selection import ReplayOptions, Window
     from spatial_replay.spec.formula import Specification

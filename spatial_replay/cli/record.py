@@ -480,7 +480,7 @@ def tracks(
       spatial-replay record tracks annotations.txt -o run.mcap --read lost=keep
     """
     # imported here so that --help stays fast
-    from spatial_replay.recording.recorder import record_source
+    from spatial_replay.recording.source_recording import record_source
     from spatial_replay.sources.open_log import open_source
 
     inputs = input_files(file, *specs, reading=reading)

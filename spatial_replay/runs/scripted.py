@@ -18,8 +18,9 @@ from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.recording.interruption import leaving, terminable, uninterrupted
 from spatial_replay.recording.log import Recording, refuse_templates
-from spatial_replay.recording.recorder import leaving, recording_in, terminable, uninterrupted
+from spatial_replay.recording.source_recording import recording_in
 from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.simulation.tabletop import default_specification, make_world
 from spatial_replay.simulation.world import Conditions

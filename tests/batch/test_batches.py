@@ -28,7 +28,7 @@ import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
 from logs.servers import s3_server
 from spatial_replay.logs.messages import MemorySource
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 from spatial_replay.testing import assert_satisfied
 from spatial_replay.text import Sentence
 from spatial_replay.trace.doubts import Doubt

@@ -21,7 +21,7 @@ from spatial_replay import (
     read_trace,
 )
 from spatial_replay.logs.messages import BLOCK_SAMPLES
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 from spatial_replay.sources import open_source
 
 Write = Callable[..., Path]

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
 from spatial_replay.logs.messages import Block, Source
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 from spatial_replay.trace.trace import within
 
 STEP_NS = 250_000_000

@@ -25,7 +25,7 @@ from spatial_replay import (
     parse_specification,
 )
 from spatial_replay.logs.messages import Block
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.engine import Replayed, load_files, run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window

@@ -23,7 +23,7 @@ from spatial_replay.batch.suite import Conditions, Suite
 from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
 from spatial_replay.compiled import only
 from spatial_replay.logs.messages import MemorySource
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 
 LOGS, FEW_LOGS, BARE_LOGS = 1_000, 16, 400
 ROWS = 100_000

@@ -17,7 +17,7 @@ import numpy as np
 import spatial_replay as sr
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Block, Source
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 SAMPLES = 100_000

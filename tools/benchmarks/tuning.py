@@ -13,7 +13,7 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.logs.messages import MemorySource
-from spatial_replay.recording.recorder import record_source
+from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.loaded_log import LoadedLog
 from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.tuned import Tuning

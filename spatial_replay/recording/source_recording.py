@@ -1,0 +1,197 @@
+"""Recordings of a source, such as a bag: its samples with verdicts as a log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.errors import LogError, OutputError, UsageError
+from spatial_replay.logs.mcap.write import LogWriter
+from spatial_replay.logs.messages import DOUBTS, Source, read_blocks
+from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
+from spatial_replay.recording.interruption import leaving, uninterrupted
+from spatial_replay.recording.log import Recording, RunEnd, refuse_templates
+from spatial_replay.spec import check_names
+from spatial_replay.spec.diagnostics import Diagnostic
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted_from
+from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
+from spatial_replay.trace.trace import Trace, checked_units
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The result of a recording.
+
+    Attributes:
+        samples: number of samples.
+        start_ns, end_ns: times of the first and the last.
+        objects: names of the objects.
+        faults: what was lost while reading, each with its place.
+        unreadable: number of observations with a number that is not finite.
+        missing: names in the specifications that no sample had.
+        remarks: what the source reports about its samples where nothing was lost.
+    """
+
+    samples: int
+    start_ns: int
+    end_ns: int
+    objects: tuple[str, ...]
+    faults: tuple[str, ...]
+    unreadable: int
+    missing: tuple[Diagnostic, ...]
+    remarks: tuple[str, ...] = ()
+
+
+def record_source(
+    source: Source,
+    output: Path,
+    files: Sequence[Specification] = (),
+    *,
+    inputs: Sequence[Path] = (),
+    unit: str = "",
+    advance: Callable[[int], None] = lambda samples: None,
+    durability: Durability = "process",
+) -> Recorded:
+    """Record the samples of a source, in place under the final name.
+
+    Equal sources and specifications give equal bytes. An interruption leaves a shorter log, closed properly
+    and marked as interrupted.
+
+    Args:
+        inputs: files that the output must not be.
+        unit: that of lengths, for readers, where the source declares none.
+        advance: called with the number of samples of each block that is done.
+        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
+
+    Raises:
+        UsageError: the output is an input, a specification cannot be recorded, or the source declares another
+            unit.
+        LogError: the source has no sample, or it cannot be read to its end.
+        OutputError: the output cannot be written.
+    """
+    refuse_inputs(output, inputs)
+    refuse_templates(files)
+    tally = _Tally()
+    traces = _traces(source, tally)
+    # a source without samples raises here, before the output is touched
+    first = next(traces)
+    about = {"source": source.name, "options": json.dumps(dict(source.options))}
+    about |= _units_metadata(source, unit)
+    stream = open_output(output, durability)
+    try:
+        with leaving(output), stream, recording_in(stream, files, about) as (_, recording):
+            for trace in chain([first], traces):
+                with uninterrupted():
+                    recording.add(trace)
+                advance(len(trace))
+            if tally.doubts:
+                recording.add_metadata(DOUBTS, tally.doubts_metadata())
+    except OutputError:
+        # a disk that is full: half of a log that can be recorded again is worth less than none
+        if output.is_file():
+            output.unlink(missing_ok=True)
+        raise
+    return tally.summary(source.name, files)
+
+
+def _units_metadata(source: Source, unit: str) -> dict[str, str]:
+    """Return the entries for the log's metadata with axes and units; `unit` is that of lengths, if given."""
+    axes = source.axes
+    if unit and axes.unit not in ("", unit):
+        raise UsageError(f"{source.name} declares lengths in {axes.unit}, and not in {unit}; leave that out")
+    unit = checked_units({"": unit})[""] if unit else axes.unit
+    return replace(axes, unit=unit).metadata()
+
+
+def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
+    """Read the samples of a source, in blocks of one or more.
+
+    Raises:
+        LogError: there are none, or they cannot be read.
+    """
+    any_sample = False
+    for block in read_blocks(source):
+        tally.add(block.trace)
+        tally.remarks += block.remarks
+        tally.doubts += block.doubts
+        if len(block.trace):
+            any_sample = True
+            yield block.trace
+    if not any_sample:
+        raise LogError("; ".join([f"{source.name} has no sample", *tally.faults[:1]]))
+
+
+@contextmanager
+def recording_in(
+    stream: BinaryIO,
+    files: Sequence[Specification],
+    about: Mapping[str, str] | None,
+    known: Sequence[SpecAutomaton] = (),
+) -> Iterator[tuple[LogWriter, Recording]]:
+    """Begin a log, and write its end however the block ends; after an error it is marked as interrupted."""
+    interrupted = True
+
+    def end() -> None:
+        with uninterrupted():
+            recording.end(RunEnd(interrupted))
+            writer.close()
+
+    with ExitStack() as ending:
+        # an interruption between two records would leave a log whose index does not fit
+        with uninterrupted():
+            writer = LogWriter(stream)
+            recording = Recording(writer, files, about, known)
+            ending.callback(end)
+        yield writer, recording
+        interrupted = False
+
+
+class _Tally:
+    """Counts of what was recorded so far."""
+
+    def __init__(self) -> None:
+        self._times: list[int] = []
+        self._names: set[str] = set()
+        self._signals: set[str] = set()
+        self.faults: list[str] = []
+        self.remarks: list[str] = []
+        self.doubts: list[Doubt] = []
+        self._samples = self._unreadable = 0
+
+    def add(self, trace: Trace) -> None:
+        self._samples += len(trace)
+        self.faults += trace.faults
+        self._unreadable += trace.unreadable_count
+        self._names.update(trace.names)
+        self._signals.update(trace.signals)
+        if len(trace):
+            self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
+
+    def summary(self, name: str, files: Sequence[Specification]) -> Recorded:
+        names, signals = sorted(self._names), sorted(self._signals)
+        remarks = [remark for file in files for remark in check_names(file, names, signals)]
+        doubts = (doubt.remark(name) for doubt in dict.fromkeys(self.doubts))
+        return Recorded(
+            self._samples,
+            self._times[0],
+            self._times[-1],
+            tuple(names),
+            counted_from(self.faults, self._times[0]),
+            self._unreadable,
+            tuple(remark for remark in remarks if remark.severity == "error"),
+            counted_from((*doubts, *self.remarks), self._times[0]),
+        )
+
+    def doubts_metadata(self) -> dict[str, str]:
+        """Return the metadata record of the doubts; {} without any."""
+        return metadata_from_doubts(distinct_doubts(self.doubts, self._times[0]))
