@@ -14,9 +14,10 @@ from spatial_replay.compare.clips import Clip, cut_clip
 from spatial_replay.compare.runs import LogDiff, diff_sources
 from spatial_replay.compare.specifications import SpecificationDiff, diff_over_source
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import MAPPED, MemorySource, Source
 from spatial_replay.logs.read_options import Reading
 from spatial_replay.logs.remote import LogFile, local_copy, local_files, log_file, sendable
+from spatial_replay.logs.source import MemorySource, Source
+from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, Semantics, checked_kinds
 from spatial_replay.replay.engine import Replayed, load_files, recorded_texts, run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window

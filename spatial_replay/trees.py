@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 from spatial_replay.errors import UsageError, importing
 from spatial_replay.logs.behaviour_tree import TreeTick, tree_nodes
-from spatial_replay.logs.messages import BEHAVIOUR_TREE
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+from spatial_replay.logs.topics import BEHAVIOUR_TREE
 from spatial_replay.planning.decisions import Outcome, Stage, Step
 from spatial_replay.recording.recorder import Recorder
 

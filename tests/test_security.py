@@ -14,7 +14,7 @@ from mcap.writer import Writer
 import spatial_replay as sr
 from cli.program import run_program
 from report.report_pages import page_of
-from spatial_replay.logs.messages import RECORDED_PREFIX
+from spatial_replay.logs.topics import RECORDED_PREFIX
 
 TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text()
 ROW = re.compile(

@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import spatial_replay as sr
 from bags.bag_files import write_ros2
 from report.report_pages import page_of
-from spatial_replay.logs.messages import BEHAVIOUR_TREE
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+from spatial_replay.logs.topics import BEHAVIOUR_TREE
 from spatial_replay.planning import Grid, Workspace, moved_object, read_decisions
 from spatial_replay.planning.decisions import points_along
 from spatial_replay.sources import open_source

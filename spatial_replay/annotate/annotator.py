@@ -28,7 +28,11 @@ from spatial_replay.annotate.specification import ReportedTree, encode_specifica
 from spatial_replay.annotate.standing import StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, ShadeTracker, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Channel, Messages, messages_of
+from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvent, RecentEvents, Robustness, StandingUpdate
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
+from spatial_replay.logs.topics import (
     AUTOMATON,
     DERIVED,
     EVENT_LOG,
@@ -39,14 +43,8 @@ from spatial_replay.logs.messages import (
     SCENE,
     SPECIFICATION,
     STANDING,
-    Channel,
-    Messages,
-    messages_of,
     protobuf_channel,
 )
-from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvent, RecentEvents, Robustness, StandingUpdate
-from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.wire import Payloads
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import Instance, SeriesBlock

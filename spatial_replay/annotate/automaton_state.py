@@ -16,9 +16,10 @@ from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers, combined, equal_places
-from spatial_replay.logs.messages import AUTOMATA_PREFIX, Attachment
+from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.topics import AUTOMATA_PREFIX
 from spatial_replay.logs.wire import WireTemplate, join_in_order
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.result import SpecResult

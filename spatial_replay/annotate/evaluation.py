@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final
 from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.messages import AUTOMATON, DERIVED, SCENE, Attachment, Channel
+from spatial_replay.logs.messages import Attachment, Channel
+from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
 from spatial_replay.monitor.stream import EvaluationStream, Instance, SeriesBlock
 from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec.formula import Specification

@@ -14,7 +14,9 @@ from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_template import FRAMES, SceneBounds
 from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
 from spatial_replay.annotate.standing import FinalStanding, part_title
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Attachment
+from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
+from spatial_replay.logs.topics import (
     CAMERA_ANNOTATIONS,
     CAMERA_CALIBRATION,
     CAMERA_VIDEO,
@@ -29,10 +31,8 @@ from spatial_replay.logs.messages import (
     SCENE,
     SPECIFICATION,
     STANDING,
-    Attachment,
     topic_of_camera,
 )
-from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.palette import CURVES, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
 from spatial_replay.spec.walks import looks_ahead

@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.errors import importing
-from spatial_replay.logs.messages import EVENT_LOG, STANDING
 from spatial_replay.logs.schemas.Robustness_pb2 import Standing, StandingUpdate
+from spatial_replay.logs.topics import EVENT_LOG, STANDING
 from spatial_replay.palette import CURVES, hexadecimal
 
 _SOURCE: Final = f"{StandingUpdate.DESCRIPTOR.full_name}:message"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import CURVES_TOPIC, Channel, protobuf_channel
+from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.schemas.Curves_pb2 import Curves, NodeCurves, SpecificationCurves
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     HOLDS_SO_FAR,
@@ -23,6 +23,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
     Robustness,
 )
+from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
 from spatial_replay.logs.wire import Payloads, WireTemplate, words_of
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, iter_nodes

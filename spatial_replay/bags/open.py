@@ -51,9 +51,10 @@ from spatial_replay.logs.mcap.index import (
     read_directory,
 )
 from spatial_replay.logs.mcap.read import ChunkWalk, directory_remarks, most_waiting
-from spatial_replay.logs.messages import MAGIC, Attachment, Channel, Messages
+from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import BAG_METADATA, LogFile, open_file
+from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import Instant, Sentence
 
 

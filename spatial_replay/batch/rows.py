@@ -25,8 +25,9 @@ from spatial_replay.errors import (
     UnfitLogError,
     UsageError,
 )
-from spatial_replay.logs.messages import MAPPED, Source
 from spatial_replay.logs.remote import log_file
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import MAPPED
 from spatial_replay.mapping.episode_source import read_together
 from spatial_replay.monitor.result import RESULT_COLUMNS, SpecResult
 from spatial_replay.monitor.vacuity import Tested, UntestedPart

@@ -48,8 +48,8 @@ from spatial_replay.text import Sentence, counted, counted_from, json_fields
 from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
+    from spatial_replay.logs.source import Source
     from spatial_replay.monitor.ends import RunEnds
     from spatial_replay.monitor.plausibility import ThresholdRange
     from spatial_replay.monitor.stream import SeriesBlock

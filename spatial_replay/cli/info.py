@@ -16,15 +16,7 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.evidence import evidence_lines
 from spatial_replay.cli.options import JsonCommand, LogPath, input_files, output_option, reading_options
 from spatial_replay.cli.output import MANY, WORST_FIRST, align_rows
-from spatial_replay.cli.terminal import (
-    printing_to,
-    progress,
-    show,
-    show_file,
-    show_json,
-    show_result,
-    warn,
-)
+from spatial_replay.cli.terminal import printing_to, progress, show, show_file, show_json, show_result, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.verdict import counts_text
@@ -33,8 +25,8 @@ from spatial_replay.trace.doubts import json_doubt
 
 if TYPE_CHECKING:
     from spatial_replay.logs.mcap.read import LogSummary
-    from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
+    from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
     from spatial_replay.spec.formula import NamedSpec
     from spatial_replay.spec.load import SpecificationText
@@ -295,9 +287,9 @@ def _write_blueprint(log: LogFile, output: Path | None) -> int:
     """Write which panels show an annotated log in Rerun."""
     from spatial_replay.annotate.rerun_blueprint import blueprint_rows, write_blueprint
     from spatial_replay.logs.mcap.read import McapSource
-    from spatial_replay.logs.messages import STANDING
     from spatial_replay.logs.output_file import refuse_inputs
     from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
+    from spatial_replay.logs.topics import STANDING
     from spatial_replay.sources.open_log import open_source
 
     if output is None:
@@ -317,7 +309,7 @@ def _write_blueprint(log: LogFile, output: Path | None) -> int:
 def _print_layout(log: LogFile, *, panels: bool) -> int:
     """Print the layout stored in a log, or the one for viewers that have the extension."""
     from spatial_replay.annotate.foxglove_layout import layout_text, with_panels
-    from spatial_replay.logs.messages import LAYOUT
+    from spatial_replay.logs.topics import LAYOUT
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
@@ -379,7 +371,7 @@ def _requirements(source: Source) -> dict[str, NamedSpec]:
 
 def _verdicts(container: LogSummary, about: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
     """Yield the verdicts stored in a log, each with the requirement that it is about."""
-    from spatial_replay.logs.messages import VERDICTS
+    from spatial_replay.logs.topics import VERDICTS
 
     for data in (data for name, data in container.metadata if name == VERDICTS):
         for result, verdict in data.items():
@@ -532,7 +524,7 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
 
 
 def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, topics: bool) -> Iterator[str]:
-    from spatial_replay.logs.messages import VERDICTS
+    from spatial_replay.logs.topics import VERDICTS
 
     if verdicts := list(_verdicts(container, about)):
         kinds = [(verdict["verdict"] or "").split(",")[0] for verdict in verdicts]

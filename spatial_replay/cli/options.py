@@ -24,8 +24,8 @@ from spatial_replay.trace.trace import time_point_from_text
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
+    from spatial_replay.logs.source import Source
     from spatial_replay.monitor.verdict import Semantics
     from spatial_replay.recording.source_recording import Recorded
     from spatial_replay.replay.engine import Replayed

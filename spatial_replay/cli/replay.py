@@ -382,7 +382,7 @@ def replay(
       spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial --watch
     """
     # imported here so that --help stays fast
-    from spatial_replay.logs.messages import MAPPED
+    from spatial_replay.logs.topics import MAPPED
     from spatial_replay.replay.engine import run_replay
     from spatial_replay.replay.selection import default_keep
 
@@ -602,7 +602,7 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
       spatial-replay explain run.mcap --spec blocks.spatial --result reach --at 12.3s
     """
     # imported here so that --help stays fast
-    from spatial_replay.logs.messages import MAPPED
+    from spatial_replay.logs.topics import MAPPED
     from spatial_replay.replay.document import explain_results, idle_document, verdict_of
     from spatial_replay.replay.engine import run_replay
     from spatial_replay.replay.selection import has_samples_from

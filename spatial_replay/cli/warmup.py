@@ -22,7 +22,7 @@ from spatial_replay.compare.runs import diff_sources
 from spatial_replay.compiled import cache_folder, compilations, only, write_note
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.monitor.result import evaluate
 from spatial_replay.recording.recorder import Recorder

@@ -14,8 +14,9 @@ import numpy as np
 from spatial_replay.compare.runs import file_of
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import ZERO, Source
 from spatial_replay.logs.remote import RemoteFile
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import ZERO
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene, look_back
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline, evaluate_prefix

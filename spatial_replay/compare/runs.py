@@ -18,8 +18,8 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed, Printed
-from spatial_replay.logs.messages import Source
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
+from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import Evaluation, SpecResult
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.verdict import require_ltlf

@@ -24,7 +24,7 @@ from spatial_replay.compare.edits import (
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.lazy import Displayed, Printed
-from spatial_replay.logs.messages import Source
+from spatial_replay.logs.source import Source
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import Evaluation, SpecResult, evaluate

@@ -24,9 +24,10 @@ from spatial_replay.bags.reader import DISORDER_NS, Message
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.live.client import Client, Disconnected, Inbox, Offered, Received
 from spatial_replay.live.protocol import Connected, Warned
-from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages, is_kept
+from spatial_replay.logs.messages import Channel, MemorySink, Messages
 from spatial_replay.logs.objects import OBJECTS_CHANNEL, decode_objects
 from spatial_replay.logs.read_options import FaultKinds
+from spatial_replay.logs.topics import OBJECTS, is_kept
 from spatial_replay.mapping.assemble import LiveAssembler, rehearse
 from spatial_replay.mapping.mapping_file import LogMapping, Sampling, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type

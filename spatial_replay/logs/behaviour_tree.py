@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
-from spatial_replay.logs.messages import BEHAVIOUR_TREE, protobuf_channel
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+from spatial_replay.logs.topics import BEHAVIOUR_TREE, protobuf_channel
 
 TREE_CHANNEL: Final = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
 

@@ -24,8 +24,9 @@ from spatial_replay.geometry.arrays import (
     starts_from_counts,
 )
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
-from spatial_replay.logs.messages import OBJECTS, Messages, messages_of, protobuf_channel
+from spatial_replay.logs.messages import Messages, messages_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.logs.wire import Bytes, LayoutError, Payloads, WireTemplate, Words, join_in_order, rows_of
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations

@@ -19,8 +19,9 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated, select
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
-from spatial_replay.logs.messages import Block, Source, noting_pauses
+from spatial_replay.logs.messages import Block
 from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
+from spatial_replay.logs.source import Source, noting_pauses
 from spatial_replay.mapping.detections import Detections
 from spatial_replay.mapping.episode_evidence import jump_remark, order_remarks
 from spatial_replay.mapping.feature_reader import (

@@ -23,24 +23,18 @@ from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, i
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import concatenated, select
 from spatial_replay.logs.behaviour_tree import NAV2_LOG, TREE_CHANNEL, Nav2Tree, TreeNode, TreeTick
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, Row, merge
+from spatial_replay.logs.read_options import FaultList, late_ns
+from spatial_replay.logs.remote import RemoteFile
+from spatial_replay.logs.source import FileSource, noting_pauses
+from spatial_replay.logs.topics import (
     MAPPED,
     METADATA,
-    Attachment,
-    Block,
-    Channel,
-    FileSource,
-    Messages,
-    Row,
     copied_channel,
     has_our_type,
     is_kept,
-    merge,
-    noting_pauses,
     remarks_on_copies,
 )
-from spatial_replay.logs.read_options import FaultList, late_ns
-from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import Clock, LogMapping
 from spatial_replay.mapping.reading_plan import ReadingPlan

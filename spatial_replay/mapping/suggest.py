@@ -19,7 +19,8 @@ import numpy as np
 from spatial_replay.bags.decoders import Topic
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.messages import Channel, has_our_type
+from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.topics import has_our_type
 from spatial_replay.mapping.binding import BY_PLACE, Codes, Namer
 from spatial_replay.mapping.field_paths import (
     INDEX,

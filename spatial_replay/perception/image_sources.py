@@ -15,8 +15,8 @@ from spatial_replay.bags.decoders import Topic
 from spatial_replay.bags.open import is_log, open_messages
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.messages import is_image_type
 from spatial_replay.logs.remote import LogFile, local_copy, log_file
+from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
 from spatial_replay.perception.opencv import (
     FAMILIES,

@@ -24,16 +24,7 @@ from spatial_replay.annotate.scene.scene_frames import cell_colours
 from spatial_replay.annotate.scene.scene_template import FRAME, outlines_of
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object
-from spatial_replay.logs.messages import (
-    EVENT_LOG,
-    GRADIENT_MAP,
-    PLAN_DECISION,
-    PLAN_PATH,
-    Messages,
-    merge,
-    messages_of,
-    protobuf_channel,
-)
+from spatial_replay.logs.messages import Messages, merge, messages_of
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
     PlanCause,
@@ -49,6 +40,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanTarget,
     PrunedEdge,
 )
+from spatial_replay.logs.topics import EVENT_LOG, GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.palette import NEUTRAL, POSITIVE
 from spatial_replay.planning.decisions import (
     Candidate,

@@ -17,7 +17,10 @@ from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.geometry.arrays import select
 from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Block, Messages, merge
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision
+from spatial_replay.logs.source import Source, SourceOf, read_blocks
+from spatial_replay.logs.topics import (
     ENDING,
     GRADIENT_MAP,
     METADATA,
@@ -28,14 +31,7 @@ from spatial_replay.logs.messages import (
     REDONE_DECISION,
     REDONE_MAP,
     REDONE_PATH,
-    Block,
-    Messages,
-    Source,
-    SourceOf,
-    merge,
-    read_blocks,
 )
-from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision
 from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,

@@ -16,8 +16,9 @@ from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.errors import OutputError, UsageError, system_reason
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import TRIGGER, ZERO, Channel, Messages, Row
+from spatial_replay.logs.messages import Channel, Messages, Row
 from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.topics import TRIGGER, ZERO
 from spatial_replay.monitor.monitor import Monitor, Update
 from spatial_replay.recording.log import (
     GATHER_S,

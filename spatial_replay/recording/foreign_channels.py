@@ -12,14 +12,8 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import (
-    GRADIENT_MAP,
-    PLAN_DECISION,
-    PLAN_PATH,
-    Channel,
-    Schema,
-    protobuf_channel,
-)
+from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.text import listed
 
 if TYPE_CHECKING:

@@ -33,7 +33,10 @@ from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.geometry.measure import Operand, contacts
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge
+from spatial_replay.logs.objects import sample_messages
+from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
+from spatial_replay.logs.topics import (
     AUTOMATA,
     CERTIFICATE,
     DERIVED,
@@ -44,15 +47,8 @@ from spatial_replay.logs.messages import (
     RECORDED_PREFIX,
     VERDICTS,
     ZERO,
-    Attachment,
-    Channel,
-    Messages,
-    Sink,
     image_topics,
-    merge,
 )
-from spatial_replay.logs.objects import sample_messages
-from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
 from spatial_replay.monitor.monitor import SpecUpdate, Update
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.stream import find_instances

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, BinaryIO
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.errors import LogError, OutputError, UsageError
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import DOUBTS, Source, read_blocks
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
+from spatial_replay.logs.source import Source, read_blocks
+from spatial_replay.logs.topics import DOUBTS
 from spatial_replay.recording.interruption import leaving, uninterrupted
 from spatial_replay.recording.log import Recording, RunEnd, refuse_templates
 from spatial_replay.spec import check_names

@@ -24,7 +24,9 @@ from spatial_replay.annotate.specification import (
 )
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Attachment, Block, Messages, Sink, merge
+from spatial_replay.logs.source import Source, read_ahead
+from spatial_replay.logs.topics import (
     AUTOMATA,
     AUTOMATA_PREFIX,
     CERTIFICATE,
@@ -37,14 +39,7 @@ from spatial_replay.logs.messages import (
     REPLAYED_PREFIX,
     VERDICTS,
     ZERO,
-    Attachment,
-    Block,
-    Messages,
-    Sink,
-    Source,
     image_topics,
-    merge,
-    read_ahead,
 )
 from spatial_replay.monitor.departures import Departure, Departures
 from spatial_replay.monitor.doubtful import doubts_of_instances

@@ -26,19 +26,9 @@ from spatial_replay.annotate.scene.scene_update import scene_start
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
-from spatial_replay.logs.messages import (
-    RECENT_EVENTS,
-    Attachment,
-    Block,
-    Channel,
-    MemorySource,
-    Messages,
-    Source,
-    join,
-    merge,
-    read_ahead,
-    read_blocks,
-)
+from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge
+from spatial_replay.logs.source import MemorySource, Source, read_ahead, read_blocks
+from spatial_replay.logs.topics import RECENT_EVENTS
 from spatial_replay.monitor.ends import Needs
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock

@@ -20,26 +20,11 @@ from spatial_replay.bags.definitions import full_type_name
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import (
-    ALL,
-    MAPPED,
-    METADATA,
-    OBJECTS,
-    SAMPLES_A_GAP,
-    ZERO,
-    Block,
-    Channel,
-    MemorySource,
-    Messages,
-    Source,
-    SourceOf,
-    is_kept,
-    merge,
-    read_ahead,
-    read_blocks,
-)
+from spatial_replay.logs.messages import Block, Channel, Messages, merge
 from spatial_replay.logs.objects import sample_messages
 from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.source import SAMPLES_A_GAP, MemorySource, Source, SourceOf, read_ahead, read_blocks
+from spatial_replay.logs.topics import ALL, MAPPED, METADATA, OBJECTS, ZERO, is_kept
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.atoms.terms import look_back

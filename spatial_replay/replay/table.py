@@ -19,10 +19,11 @@ from spatial_replay.annotate.robustness import RobustnessSeries, decode_robustne
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import AUTOMATON, ROBUSTNESS, SPECIFICATION, Source
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification, SpecificationResult
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import AUTOMATON, ROBUSTNESS, SPECIFICATION
 from spatial_replay.replay.selection import named_zero_ns
 from spatial_replay.text import counted_from, cut
 

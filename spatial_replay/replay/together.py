@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from spatial_replay.annotate.specification import reported_trees
-from spatial_replay.logs.messages import Source
+from spatial_replay.logs.source import Source
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.stream import InstanceStream, SeriesBlock, one_after_another, run_together
 from spatial_replay.replay.engine import LogAccount, Replayed, ReplayPlan, replayed_specs

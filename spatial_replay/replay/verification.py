@@ -24,7 +24,14 @@ from spatial_replay.bags.open import McapLog
 from spatial_replay.bags.reader import Message
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.read_options import KEYS
+from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import (
     CERTIFICATE,
     DERIVED,
     METADATA,
@@ -32,14 +39,7 @@ from spatial_replay.logs.messages import (
     PLAN_METADATA,
     ROBUSTNESS,
     SPECIFICATION,
-    Messages,
-    Source,
 )
-from spatial_replay.logs.read_options import KEYS
-from spatial_replay.logs.remote import LogFile
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
-from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.replay.engine import Replay, load_files, run_replay
 from spatial_replay.replay.selection import CLIP_METADATA, KEEP_ALL, ReplayOptions, Window, clipped_source

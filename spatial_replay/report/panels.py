@@ -41,7 +41,6 @@ from spatial_replay.automata.drawing import draw_automaton
 from spatial_replay.bags.open import is_log, open_messages
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import CAMERA_VIDEO, Source, is_image_type
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
@@ -50,6 +49,8 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import CAMERA_VIDEO, is_image_type
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.verdict import final_verdict

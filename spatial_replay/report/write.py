@@ -19,10 +19,11 @@ from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
 from spatial_replay.errors import UsageError
 from spatial_replay.html import Html, element
-from spatial_replay.logs import messages as log_topics
-from spatial_replay.logs.messages import Messages, Source
+from spatial_replay.logs import topics as log_topics
+from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict

@@ -21,8 +21,8 @@ from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.behaviour_tree import TREE_CHANNEL, TreeTick
-from spatial_replay.logs.messages import PLAN_METADATA
 from spatial_replay.logs.output_file import Durability
+from spatial_replay.logs.topics import PLAN_METADATA
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
 from spatial_replay.planning.decisions import Kind, Outcome, Step, sentence_of

@@ -21,18 +21,18 @@ from spatial_replay.annotate.requirements import Requirement, Standing, requirem
 from spatial_replay.annotate.scene.scene_template import FRAME
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.output_file import Durability
+from spatial_replay.logs.topics import (
     CAMERA_ANNOTATIONS,
     CAMERA_CALIBRATION,
     CAMERA_FRAMES,
     CAMERA_PREFIX,
     CAMERA_VIDEO,
     OWN_PREFIX,
-    Channel,
     protobuf_channel,
     topic_of_camera,
 )
-from spatial_replay.logs.output_file import Durability
 from spatial_replay.monitor.monitor import Ending, Monitor, Update
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.perception.observer import Observation, TagObserver, View, camera_names, simultaneous

@@ -20,7 +20,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Integers, select
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Channel, Messages, messages_of
+from spatial_replay.logs.topics import (
     CAMERA_ANNOTATIONS,
     CURVES_TOPIC,
     EVENT_LOG,
@@ -33,10 +34,7 @@ from spatial_replay.logs.messages import (
     REDONE_PATH,
     SCENE,
     STANDING,
-    Channel,
-    Messages,
     is_image_type,
-    messages_of,
 )
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
 

@@ -26,7 +26,8 @@ from jsonschema.exceptions import best_match
 from spatial_replay.annotate.automaton_state import automata_attachments
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, UsageError, system_reason
-from spatial_replay.logs.messages import EVENT_LOG, EVENTS, LAYOUT, Channel, Messages, Schema
+from spatial_replay.logs.messages import Channel, Messages, Schema
+from spatial_replay.logs.topics import EVENT_LOG, EVENTS, LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, Playback, constant_values
 from spatial_replay.serve.player import (

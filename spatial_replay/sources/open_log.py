@@ -31,7 +31,6 @@ from spatial_replay.logs.formats.tracks import (
     iter_jsonl,
     open_text,
 )
-from spatial_replay.logs.messages import MAGIC, IterTraces, Source, TrackSource
 from spatial_replay.logs.read_options import Reading, ReadOptions, count_of
 from spatial_replay.logs.remote import (
     BAG_METADATA,
@@ -42,6 +41,8 @@ from spatial_replay.logs.remote import (
     is_web,
     log_file,
 )
+from spatial_replay.logs.source import IterTraces, Source, TrackSource
+from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted, counted_from, printable
 from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace

@@ -21,9 +21,10 @@ from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.formats.datasets import data_set_address
 from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap
-from spatial_replay.logs.messages import OBJECTS, Source, TrackSource, read_blocks
 from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import RemoteFile, log_file
+from spatial_replay.logs.source import Source, TrackSource, read_blocks
+from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence

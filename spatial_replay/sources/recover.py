@@ -18,10 +18,11 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.mcap.read import decode_samples, is_samples, without
 from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
-from spatial_replay.logs.messages import ENDING, METADATA, RECOVERY, Channel, Messages
+from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, local_files
+from spatial_replay.logs.topics import ENDING, METADATA, RECOVERY
 from spatial_replay.sources.open_log import format_of, is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence, counted, counted_from
 from spatial_replay.trace.trace import FOREVER

@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from mcap.records import Message
 
 import spatial_replay as sr
-from spatial_replay.logs.messages import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window
 

@@ -15,8 +15,9 @@ from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_live
 from spatial_replay.cli import run as run_command
-from spatial_replay.logs.messages import SPECIFICATION, MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import Standing
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.topics import SPECIFICATION
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.selection import ReplayOptions
 from spatial_replay.sources import open_source

@@ -19,7 +19,7 @@ from spatial_replay.annotate.deciding_leaf import leaf_pairs
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.scene.scene_update import PERIOD_NS, SceneEncoder
 from spatial_replay.annotate.violations import EvaluatedResult
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock, find_instances
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 import spatial_replay as sr
-from spatial_replay.logs.messages import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     HOLDS_SO_FAR,
     PENDING,
@@ -25,6 +24,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     Standing,
     StandingUpdate,
 )
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.wire import round_numbers
 from spatial_replay.replay.engine import run_replay
 

@@ -26,7 +26,7 @@ from bags.bag_files import (
     write_ros2,
 )
 from cli.program import environment
-from spatial_replay.logs.messages import OBJECTS
+from spatial_replay.logs.topics import OBJECTS
 
 MOST_MIB = 900
 STEPS = 50

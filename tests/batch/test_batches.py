@@ -27,7 +27,7 @@ from pyarrow import parquet
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
 from logs.servers import s3_server
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.testing import assert_satisfied
 from spatial_replay.text import Sentence

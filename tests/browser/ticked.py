@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import spatial_replay as sr
-from spatial_replay.logs.messages import BEHAVIOUR_TREE
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+from spatial_replay.logs.topics import BEHAVIOUR_TREE
 
 
 def write_ticked_log(log: Path) -> None:

@@ -17,9 +17,9 @@ from annotate.layouts import layout_of
 from bags.bag_files import SECOND, write_json_mcap
 from spatial_replay import read_trace
 from spatial_replay.cli import run
-from spatial_replay.logs.messages import EVENT_LOG, EVENTS, OBJECTS, SCENE, STANDING, protobuf_channel
 from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
+from spatial_replay.logs.topics import EVENT_LOG, EVENTS, OBJECTS, SCENE, STANDING, protobuf_channel
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other

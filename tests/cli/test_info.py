@@ -17,8 +17,8 @@ from replay.runs import run as recorded_run
 from spatial_replay import parse_specification
 from spatial_replay.annotate.rerun_blueprint import blueprint_rows
 from spatial_replay.cli import run
-from spatial_replay.logs.messages import STANDING
 from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
+from spatial_replay.logs.topics import STANDING
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.sources import open_source

@@ -19,7 +19,7 @@ from cli.program import PROGRAM, run_process, run_program
 from replay.runs import SPECIFICATION, content_of, run, write_tracks
 from spatial_replay import Trace
 from spatial_replay.cli import run as run_in_process
-from spatial_replay.logs.messages import SCENE
+from spatial_replay.logs.topics import SCENE
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ import pytest
 from cli.program import run_program
 from replay.runs import SPECIFICATION, content_of, record, run, write_tracks
 from spatial_replay.cli import run as run_in_process
-from spatial_replay.logs.messages import METADATA, ROBUSTNESS
 from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, Robustness
+from spatial_replay.logs.topics import METADATA, ROBUSTNESS
 
 REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
 

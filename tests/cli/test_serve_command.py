@@ -16,7 +16,7 @@ import pytest
 
 from cli.program import PROGRAM, environment, run_program
 from serve.viewer import State, viewer
-from spatial_replay.logs.messages import CURVES_TOPIC
+from spatial_replay.logs.topics import CURVES_TOPIC
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 TABLE = ("serve", str(RECORDINGS / "table.jsonl"), "--spec", str(RECORDINGS / "table.spatial"))

@@ -18,8 +18,8 @@ from planning.plans import PUSH, record_plan_of, write_usual_run
 from spatial_replay.bags.open import open_messages
 from spatial_replay.cli.application import application
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import CERTIFICATE, OBJECTS
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.topics import CERTIFICATE, OBJECTS
 from spatial_replay.replay.verification import statement
 
 

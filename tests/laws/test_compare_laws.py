@@ -17,7 +17,7 @@ from laws.strategies_spec import formula_texts
 from spatial_replay import Specification
 from spatial_replay.compare.clips import cut_clip
 from spatial_replay.compare.edits import unify_regions
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, NamedSpec
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from examples import examples
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.departures import Departures
 from spatial_replay.replay.engine import Replay
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, Selection

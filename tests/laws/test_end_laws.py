@@ -13,7 +13,7 @@ from bags.bag_files import SECOND, write_json_mcap
 from examples import examples
 from mapping.feeding import Feed, make, pose_stamped
 from spatial_replay import Trace, parse_specification, read_trace
-from spatial_replay.logs.messages import read_blocks
+from spatial_replay.logs.source import read_blocks
 from spatial_replay.monitor.ends import Needs, RunEnds
 from spatial_replay.sources.open_log import open_source
 

@@ -24,9 +24,11 @@ from laws.strategies_trace import traces
 from spatial_replay import LogError, Sample, Trace, read_trace
 from spatial_replay.logs.mcap.read import McapSource, summarise_mcap
 from spatial_replay.logs.mcap.write import CHUNK_BYTES, LogWriter
-from spatial_replay.logs.messages import OBJECTS, Channel, MemorySource, Messages, protobuf_channel
+from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.objects import decode_objects, encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.logs.wire import WireTemplate
 from spatial_replay.sources import open_source
 

@@ -13,7 +13,9 @@ from examples import examples
 from laws.strategies_monitor import HEADER, WORDS, Recording, formula_texts, recordings, specifications
 from spatial_replay import Specification, SpecificationError, parse_specification
 from spatial_replay.annotate.scene.scene_frames import DrawnViolation, SceneFrames
-from spatial_replay.logs.messages import EVENT_LOG, EVENTS, MemorySource, Messages
+from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.topics import EVENT_LOG, EVENTS
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.replay.document import document_from_replay
 from spatial_replay.replay.engine import Replay, Replayed

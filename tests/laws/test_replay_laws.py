@@ -19,7 +19,7 @@ from examples import examples
 from laws.strategies_monitor import NAMES, Recording, recordings, specifications
 from replay.runs import PiecewiseSource, content_of, record, run, write_tracks
 from spatial_replay import Recorder, Sample, Specification, SpecificationError, Trace, parse_specification
-from spatial_replay.logs.messages import EVENT_LOG, EVENTS, RECENT_EVENTS
+from spatial_replay.logs.topics import EVENT_LOG, EVENTS, RECENT_EVENTS
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.engine import Replayed, load_files, run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window

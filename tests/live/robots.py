@@ -23,7 +23,7 @@ from websockets.typing import Subprotocol
 
 from spatial_replay.bags.decoders import channel_of
 from spatial_replay.bags.open import open_messages
-from spatial_replay.logs.messages import EVENTS
+from spatial_replay.logs.topics import EVENTS
 
 PATIENCE_S = 300.0
 PLAYER = Path(__file__).with_name("player.py")

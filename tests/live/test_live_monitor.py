@@ -49,7 +49,8 @@ from spatial_replay.bags.open import open_messages
 from spatial_replay.cli import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
 from spatial_replay.live.client import LARGEST_FRAME, Client, Inbox, Received
-from spatial_replay.logs.messages import OBJECTS, ROBUSTNESS, SCENE, Channel
+from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE
 
 TURTLES = """
 topics:

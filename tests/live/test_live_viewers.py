@@ -21,7 +21,8 @@ from live.robots import MAPPING, SPEC, Robot, files, messages_of, occurrence, ro
 from serve.viewer import PROTOCOL, viewer
 from spatial_replay.cli import run
 from spatial_replay.live.session import open_viewing
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents, Robustness
+from spatial_replay.logs.topics import (
     AUTOMATON,
     EVENTS,
     OBJECTS,
@@ -31,7 +32,6 @@ from spatial_replay.logs.messages import (
     SPECIFICATION,
     STANDING,
 )
-from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents, Robustness
 
 SHOWN = (OBJECTS, ROBUSTNESS, STANDING, AUTOMATON, SCENE)
 

@@ -20,7 +20,7 @@ from spatial_replay import (
     parse_specification,
     read_trace,
 )
-from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.source import BLOCK_SAMPLES
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.sources import open_source
 

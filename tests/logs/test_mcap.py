@@ -40,20 +40,12 @@ from spatial_replay.cli import run
 from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.read import McapSource, summarise_mcap
 from spatial_replay.logs.mcap.write import CHUNK_BYTES, LogWriter
-from spatial_replay.logs.messages import (
-    BLOCK_SAMPLES,
-    OBJECTS,
-    ROBUSTNESS,
-    Channel,
-    MemorySource,
-    Messages,
-    Schema,
-    protobuf_channel,
-    read_ahead,
-)
+from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.source import BLOCK_SAMPLES, MemorySource, read_ahead
+from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
 from spatial_replay.sources import open_source
 
 SAMPLES = protobuf_channel(OBJECTS, ObjectStates)

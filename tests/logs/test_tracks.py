@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from spatial_replay import Footprint, LogError, MissingFileError, Trace, UsageError, read_trace
-from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import MOST_FAULTS
+from spatial_replay.logs.source import BLOCK_SAMPLES
 from spatial_replay.sources import open_source
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table
 from spatial_replay import Planner, Settings
-from spatial_replay.logs.messages import PLAN_METADATA
+from spatial_replay.logs.topics import PLAN_METADATA
 from spatial_replay.planning import Grid, Workspace
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
 from spatial_replay.planning.settings import text_from_settings

@@ -16,8 +16,8 @@ from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of, write_usual_run
 from spatial_replay import LogError, Settings, UsageError, load_specification
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
 from spatial_replay.planning import Grid, Reason, Workspace, read_decisions, recompute_decisions
 from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.planning.read import planner_of

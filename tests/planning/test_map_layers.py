@@ -13,7 +13,7 @@ from shapely.geometry import Point, box
 from planning.kinematics import block
 from planning.plans import record_plan_of
 from spatial_replay import Settings
-from spatial_replay.logs.messages import GRADIENT_MAP
+from spatial_replay.logs.topics import GRADIENT_MAP
 from spatial_replay.planning import Grid, Workspace, read_decisions, recompute_decisions
 from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.sources import open_source

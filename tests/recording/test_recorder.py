@@ -30,7 +30,7 @@ from spatial_replay import (
     parse_specification,
     read_trace,
 )
-from spatial_replay.logs.messages import ENDING
+from spatial_replay.logs.topics import ENDING
 from spatial_replay.replay.engine import load_files, run_replay
 from spatial_replay.sources import open_source
 from spatial_replay.spec import format_specification

@@ -6,7 +6,8 @@ import pytest
 
 from replay.runs import SPECIFICATION, run
 from spatial_replay import TraceError, parse_specification
-from spatial_replay.logs.messages import ENDING, MemorySink
+from spatial_replay.logs.messages import MemorySink
+from spatial_replay.logs.topics import ENDING
 from spatial_replay.recording.log import Recording, RunEnd
 
 

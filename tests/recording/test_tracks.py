@@ -13,7 +13,8 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, content_of, run, write_tracks
 from spatial_replay import LogError, OutputError, Recorder, Trace, UsageError, parse_specification, read_trace
-from spatial_replay.logs.messages import ENDING, VERDICTS, Block
+from spatial_replay.logs.messages import Block
+from spatial_replay.logs.topics import ENDING, VERDICTS
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.sources import open_source

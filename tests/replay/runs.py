@@ -11,7 +11,8 @@ from typing import Any
 from mcap.reader import make_reader
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
-from spatial_replay.logs.messages import Block, Source
+from spatial_replay.logs.messages import Block
+from spatial_replay.logs.source import Source
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.trace.trace import within
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from spatial_replay import Footprint, Sample, Trace, TrackedObject, evaluate, parse_specification, read_trace
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.document import document_from_replay
 from spatial_replay.replay.engine import Replayed, run_replay

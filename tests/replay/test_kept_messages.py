@@ -21,7 +21,7 @@ from bags.bag_files import SECOND, START_NS, TEXT, Sent, drive, text, write_ros1
 from replay.runs import content_of, sample
 from spatial_replay import UsageError
 from spatial_replay.cli import run
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.loaded_log import LoadedLog, Playback
 from spatial_replay.replay.selection import ReplayOptions, Window

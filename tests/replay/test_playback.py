@@ -24,7 +24,12 @@ from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import (
     CURVES_TOPIC,
     EVENT_LOG,
     EVENTS,
@@ -34,17 +39,8 @@ from spatial_replay.logs.messages import (
     SCENE,
     SPECIFICATION,
     STANDING,
-    Block,
-    Channel,
-    Messages,
-    Source,
-    merge,
-    messages_of,
     protobuf_channel,
 )
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.output_file import open_output
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.loaded_log import LoadedLog, Playback
 from spatial_replay.replay.selection import ReplayOptions, Window

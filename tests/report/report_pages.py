@@ -15,7 +15,7 @@ import numpy as np
 import spatial_replay as sr
 from spatial_replay import Trace
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay.engine import load_files
 from spatial_replay.replay.selection import ReplayOptions
 from spatial_replay.report.write import write_report

@@ -36,24 +36,23 @@ from serve.viewer import (
 from spatial_replay import UsageError
 from spatial_replay.annotate.robustness import MOST_POINTS
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import (
-    CURVES_TOPIC,
-    OBJECTS,
-    ROBUSTNESS,
-    SCENE,
-    SPECIFICATION,
-    STANDING,
-    Channel,
-    MemorySource,
-    Schema,
-    protobuf_channel,
-)
+from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.Curves_pb2 import Curves
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.topics import (
+    CURVES_TOPIC,
+    OBJECTS,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+    STANDING,
+    protobuf_channel,
+)
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.loaded_log import LoadedLog
 from spatial_replay.serve.server import Serving, open_server

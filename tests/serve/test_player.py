@@ -23,8 +23,9 @@ from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, run
 from spatial_replay import UsageError
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
-from spatial_replay.logs.messages import ROBUSTNESS, SCENE, STANDING, Messages
+from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.topics import ROBUSTNESS, SCENE, STANDING
 from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, Playback
 from spatial_replay.serve.player import (
     MOST_A_SECOND,

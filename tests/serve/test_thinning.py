@@ -11,16 +11,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.logs.messages import (
-    EVENTS,
-    OBJECTS,
-    ROBUSTNESS,
-    SCENE,
-    STANDING,
-    Channel,
-    Messages,
-    messages_of,
-)
+from spatial_replay.logs.messages import Channel, Messages, messages_of
+from spatial_replay.logs.topics import EVENTS, OBJECTS, ROBUSTNESS, SCENE, STANDING
 from spatial_replay.serve.player import MOST_A_SECOND, MOST_DRAWN_A_SECOND, MOST_LATE_S, PlaybackThinning
 
 CHANNELS = {

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay.loaded_log import LoadedLog
 from spatial_replay.replay.specification_files import SpecificationFiles
 from spatial_replay.serve.player import FASTEST, SLOWEST, Session, Status, Transport

@@ -41,7 +41,7 @@ class Clients:
         self._serving: Any = None
 
     def ready(self) -> None:
-        from spatial_replay.logs.messages import MemorySource
+        from spatial_replay.logs.source import MemorySource
         from spatial_replay.replay.loaded_log import LoadedLog
         from spatial_replay.serve.server import open_server
 

@@ -22,7 +22,7 @@ from spatial_replay.batch.store import ResultsFolder, run_columns
 from spatial_replay.batch.suite import Conditions, Suite
 from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
 from spatial_replay.compiled import only
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording.source_recording import record_source
 
 LOGS, FEW_LOGS, BARE_LOGS = 1_000, 16, 400

@@ -16,7 +16,8 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.messages import BLOCK_SAMPLES, Block, Source
+from spatial_replay.logs.messages import Block
+from spatial_replay.logs.source import BLOCK_SAMPLES, Source
 from spatial_replay.recording.source_recording import record_source
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

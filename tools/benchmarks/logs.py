@@ -20,7 +20,8 @@ import zstandard
 from mcap.reader import make_reader
 
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.messages import Block, Source
+from spatial_replay.logs.messages import Block
+from spatial_replay.logs.source import Source
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.sources.open_log import open_source

@@ -17,9 +17,10 @@ from mcap.reader import make_reader
 
 import spatial_replay as sr
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import OBJECTS, Channel, Schema, messages_of, protobuf_channel
+from spatial_replay.logs.messages import Channel, Schema, messages_of
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.sources.open_log import open_source
 
 LATENCY_S = 0.03

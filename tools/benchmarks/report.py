@@ -14,7 +14,7 @@ from playwright.sync_api import sync_playwright
 
 import spatial_replay as sr
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.report.write import write_report
 
 SAMPLES = 100_000

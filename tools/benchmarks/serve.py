@@ -20,7 +20,8 @@ from websockets.typing import Subprotocol
 
 import spatial_replay as sr
 from spatial_replay.annotate.standing import StandingEncoder
-from spatial_replay.logs.messages import CURVES_TOPIC, SCENE, MemorySource
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
 from spatial_replay.replay.loaded_log import LoadedLog
 from spatial_replay.serve.server import open_server
 from spatial_replay.trace.trace import Trace

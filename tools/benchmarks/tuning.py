@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
-from spatial_replay.logs.messages import MemorySource
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.replay.loaded_log import LoadedLog
 from spatial_replay.trace.trace import Trace

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, flat_index, starts_from_counts
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
-from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList, Lost, frame_times
+from spatial_replay.logs.source import BLOCK_SAMPLES
 from spatial_replay.text import Instant, Sentence, cut, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import LATEST_NS, Trace, class_order, require_few

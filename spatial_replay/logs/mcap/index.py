@@ -22,8 +22,9 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from spatial_replay.logs.messages import LIBRARY, MAGIC, Attachment
+from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.topics import LIBRARY, MAGIC
 from spatial_replay.text import Instant, Sentence
 
 RECORD_HEAD = struct.Struct("<BQ")

@@ -44,9 +44,13 @@ from spatial_replay.logs.mcap.index import (
     iter_metadata,
     read_directory,
 )
-from spatial_replay.logs.messages import (
+from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, Schema
+from spatial_replay.logs.objects import decode_objects
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.remote import RemoteFile, each_ahead, open_file, plan_reads
+from spatial_replay.logs.source import BLOCK_SAMPLES, FileSource, noting_pauses
+from spatial_replay.logs.topics import (
     ALL,
-    BLOCK_SAMPLES,
     DERIVED,
     DOUBTS,
     METADATA,
@@ -54,21 +58,11 @@ from spatial_replay.logs.messages import (
     OBJECTS_TYPE,
     ORIGINAL_PREFIX,
     RECOVERY,
-    Attachment,
-    Block,
-    Channel,
-    FileSource,
-    Messages,
-    Schema,
     copied_channel,
     has_our_type,
     is_kept,
-    noting_pauses,
     remarks_on_copies,
 )
-from spatial_replay.logs.objects import decode_objects
-from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.remote import RemoteFile, each_ahead, open_file, plan_reads
 from spatial_replay.text import Instant, Sentence, counted, listed
 from spatial_replay.trace.doubts import doubts_from_metadata
 from spatial_replay.trace.trace import LATEST_NS, Trace

@@ -27,8 +27,9 @@ from spatial_replay.compiled import cores
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.mcap.index import RECORD_HEAD, encode_records
-from spatial_replay.logs.messages import LIBRARY, MAGIC, OWN_PREFIX, Channel, Messages, Schema, messages_of
+from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of
 from spatial_replay.logs.output_file import output_error
+from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
 from spatial_replay.logs.wire import Bytes, Payloads, stretches
 from spatial_replay.trace.trace import FOREVER
 

@@ -1,0 +1,311 @@
+"""Sources: logs that can be read, any number of times, in blocks of bounded size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import wraps
+from itertools import repeat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.messages import Attachment, Block
+from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
+from spatial_replay.logs.remote import LogFile, each_ahead
+from spatial_replay.text import Sentence, encodable
+from spatial_replay.trace.trace import Pauses, ReportsBack, Sample, Trace, within
+from spatial_replay.trace.track_evidence import TrackEvidence
+from spatial_replay.trace.units import OUR_AXES, Axes
+
+if TYPE_CHECKING:
+    pass
+
+BLOCK_SAMPLES = 12_288
+"""A block holds at most this many samples, so that memory stays bounded whatever the log's length."""
+
+
+SAMPLES_A_GAP: Final = 10
+"""Samples that fill a gap of the length that is allowed."""
+_MOST_IN_GAP = 10_000
+"""Samples that fill one gap."""
+
+IterBlocks = Callable[..., Iterator[Block]]
+
+
+def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
+    """Let `iter_blocks` of a source remark pauses and steps back, and fill pauses beyond its `max_gap_ns`."""
+
+    @wraps(iter_blocks)
+    def wrapper(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        pauses, reports = Pauses(), ReportsBack()
+        before: Trace | None = None
+        for block in iter_blocks(self, start_ns, end_ns):
+            trace = block.trace
+            pauses.add(trace.times_ns, trace.is_unknown)
+            reports.add(trace)
+            if self.max_gap_ns is not None and len(trace):
+                block = replace(block, trace=_without_gaps(before or Trace.empty(), trace, self.max_gap_ns))
+                before = trace.slice(len(trace) - 1, len(trace))
+            yield block
+        pause = pauses.remark("samples", self.max_gap_ns)
+        remarks = [*([] if pause is None else [pause]), *reports.remarks()]
+        if remarks:
+            said = tuple(Sentence(f"{self.name}: ", remark) for remark in remarks)
+            yield Block(Trace.empty(), remarks=said)
+
+    return wrapper
+
+
+def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
+    """Fill gaps between samples with samples in which every object and signal is unknown.
+
+    Args:
+        before: the sample before those of `trace`, or none.
+    """
+    times = np.concatenate([before.times_ns, trace.times_ns])
+    gaps = np.flatnonzero(np.diff(times) > max_gap_ns).tolist()
+    parts, filled_to = [], 0
+    for gap in gaps:
+        begin = gap + 1 - len(before)
+        last = trace.slice(begin - 1, begin) if begin else before
+        first_ns, next_ns = times[gap : gap + 2].tolist()
+        step_ns = max(max_gap_ns // SAMPLES_A_GAP, (next_ns - first_ns) // _MOST_IN_GAP, 1)
+        # right after the last sample, and right before the next one
+        steps = np.union1d(np.arange(first_ns + step_ns, next_ns, step_ns), [first_ns + 1, next_ns - 1])
+        rows = np.repeat(np.where(last.rows >= 0, -2 - last.rows, last.rows), len(steps), axis=0)
+        signals = {name: np.full(len(steps), np.nan) for name in last.signals}
+        unknown = replace(
+            last,
+            times_ns=steps,
+            rows=rows,
+            signals=signals,
+            reported_ns=None,
+            signals_reported_ns={},
+            faults=(),
+            remarks=(),
+        )
+        parts += [trace.slice(filled_to, begin), unknown]
+        filled_to = begin
+    return Trace.concatenate([*parts, trace.slice(filled_to, len(trace))]) if gaps else trace
+
+
+_Read = TypeVar("_Read")
+
+
+class Source:
+    """A log that can be read, any number of times, in blocks of bounded size."""
+
+    path: LogFile | None = None
+
+    @property
+    def name(self) -> str:
+        """The base name of its file."""
+        raise NotImplementedError
+
+    @property
+    def kind(self) -> str:
+        """The format, in a word."""
+        raise NotImplementedError
+
+    @property
+    def axes(self) -> Axes:
+        """Axes of the source, or of what a log was recorded from; its samples have ours."""
+        return OUR_AXES
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """The options of reading that are not the defaults, for a log's metadata."""
+        return {}
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        """Objects and signals are unknown in a longer pause; None for no limit."""
+        return None
+
+    @property
+    def begin_ns(self) -> int | None:
+        """A time before the first sample, close to it, if that is known without reading the samples."""
+        return None
+
+    def keeping(self, keep: tuple[str, ...] = ()) -> Source:
+        """Return a source that reads its samples and, beside them, only messages of some topics.
+
+        Args:
+            keep: as `is_kept` takes them.
+        """
+        return self
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """Return the samples from the first at or after `start_ns` to the last before `end_ns`.
+
+        Unreadable parts are in `trace.faults` of the blocks; the last block may hold nothing else.
+
+        Raises:
+            LogError: nothing in the log can be read as a sample.
+            UsageError: a log without damage that has no topic for samples.
+        """
+        raise NotImplementedError
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Return the attachments of the log."""
+        return ()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """Return the metadata records of the log, with their names."""
+        return ()
+
+
+@dataclass(frozen=True)
+class MemorySource(Source):
+    """A trace, or samples, in memory."""
+
+    trace: Trace
+    name: str = "memory"
+    kind: str = "memory"
+
+    @property
+    def axes(self) -> Axes:
+        """Ours, with the units that the trace declares."""
+        return Axes.of_units(self.trace.units)
+
+    @classmethod
+    def from_samples(cls, samples: Iterable[Sample], name: str = "memory") -> MemorySource:
+        return cls(Trace.from_samples(samples), name)
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        window = within(self.trace, start_ns, end_ns)
+        if len(window) <= BLOCK_SAMPLES:
+            yield Block(window, doubts=window.doubts)
+            return
+        for begin in range(0, len(window), BLOCK_SAMPLES):
+            block = window.slice(begin, begin + BLOCK_SAMPLES)
+            yield Block(block if begin == 0 else replace(block, faults=()), doubts=block.doubts)
+
+
+@dataclass(frozen=True)
+class FileSource(Source):
+    """The file of a log, with the options for reading it."""
+
+    path: LogFile
+    kind: str = ""
+    reading: ReadOptions = DEFAULTS
+
+    @property
+    def name(self) -> str:
+        return encodable(self.path.name or Path(self.path).absolute().name)
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """See `Source.options`."""
+        concave = self.reading.concave
+        return {**self._given, **({} if concave == "decompose" else {"concave": concave})}
+
+    @property
+    def _given(self) -> Mapping[str, object]:
+        return self.reading.non_defaults()
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        """See `Source.max_gap_ns`."""
+        return gap_ns(self.reading.max_gap)
+
+
+IterTraces = Callable[..., Iterator[Trace]]
+
+
+@dataclass(frozen=True)
+class TrackSource(FileSource):
+    """A track file.
+
+    Attributes:
+        axes: those of the file; samples have ours.
+    """
+
+    _: KW_ONLY
+    iter_traces: IterTraces
+    axes: Axes = OUR_AXES
+
+    @noting_pauses
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        faults = FaultList()
+        any_sample = False
+        first_fault: str | None = None
+        evidence = TrackEvidence()
+        for trace in self.iter_traces(self.path, faults, concave=self.reading.concave):
+            any_sample = any_sample or len(trace) > 0
+            lost = faults.take()
+            first_fault = first_fault or next(iter(lost), None)
+            window = self.axes.convert_trace(within(trace, start_ns, end_ns))
+            evidence.add(trace)
+            yield Block(replace(window, faults=lost))
+        if doubts := tuple(evidence.doubts()):
+            yield Block(Trace.empty(), doubts=doubts)
+        rest = faults.take(last=True)
+        if not any_sample:
+            reason = first_fault or next(iter(rest), f"{self.name} is empty")
+            raise LogError(f"{self.name} holds no sample: {reason}")
+        if rest:
+            yield Block(replace(Trace.from_samples(()), faults=rest))
+
+
+@dataclass(frozen=True)
+class SourceOf(Source):
+    """Attributes that a derived source takes from its original: everything but its blocks."""
+
+    source: Source
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    @property
+    def kind(self) -> str:
+        return self.source.kind
+
+    @property
+    def axes(self) -> Axes:
+        return self.source.axes
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`."""
+        return self.source.attachments()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return self.source.metadata()
+
+
+def read_blocks(
+    source: Source, start_ns: int | None = None, end_ns: int | None = None
+) -> Generator[Block, None, None]:
+    """Yield the blocks of a source, as `Source.iter_blocks` does.
+
+    Raises:
+        LogError: what that raises, and if the disk fails or is gone.
+    """
+    try:
+        yield from source.iter_blocks(start_ns, end_ns)
+    except OSError as error:
+        reason = error.strerror or error
+        raise LogError(f"{source.name} could not be read: {reason}; copy it to another disk") from error
+
+
+def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
+    """Yield the same blocks, from the third on each read while the previous one is processed.
+
+    A short log has one or two, and starting a thread takes longer than reading them.
+    """
+    for _ in range(2):
+        first = next(blocks, None)
+        if first is None:
+            return
+        yield first
+    for block in each_ahead(lambda _: next(blocks, None), repeat(None)):
+        if block is None:
+            return
+        yield block
