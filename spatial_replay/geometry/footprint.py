@@ -612,9 +612,17 @@ def shifted(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
 
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
     """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
-    placed = with_poses(FootprintBatch.unknown(0), tracked, np.array([[x, y]]), np.array([turn]))
+    (moved,) = moved_copies(tracked, np.array([[x, y]]), turn)
+    return moved
+
+
+def moved_copies(tracked: TrackedObject, places: Floats, turn: float = 0.0) -> list[TrackedObject]:
+    """Return an object with its centre at each of some places (M, 2), turned by an angle in radians."""
+    batch = with_poses(FootprintBatch.unknown(0), tracked, places, np.array([turn]))
     yaw = None if tracked.yaw is None else tracked.yaw + turn
-    return replace(tracked, footprint=placed.footprint(0), yaw=yaw)
+    return [
+        replace(tracked, footprint=footprint, yaw=yaw) for footprint in batch.footprints(range(len(places)))
+    ]
 
 
 def with_poses(

@@ -24,7 +24,13 @@ import numpy as np
 
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
+from spatial_replay.geometry.footprint import (
+    TrackedObject,
+    centre_of,
+    moved_copies,
+    moved_object,
+    radius_of,
+)
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene, seam_texts
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
@@ -94,6 +100,8 @@ _STEP: Final = 0.5
 """Cost of such a step, in maps."""
 _TOWARDS: Final = (1.0 / 16.0, 1e-6)
 """By how much places between cells are to meet demands, in cells; the first that can be met counts."""
+_NUDGES: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+"""By how many small steps (x, y) an object is moved to measure slopes; the first is where it is."""
 _OLDEST_CUTS: Final = 4
 """The steps of which demands are kept, as they were there."""
 
@@ -545,14 +553,20 @@ class Arranger:
     ) -> tuple[Floats, Floats]:
         """Return (D,) by how much demands are met with objects at places (N, 2), and (D, N, 2) its slopes."""
         step = 1e-4 * self._grid.cell_size
-        moved = [places, *(places + step * direction.reshape(-1, 2) for direction in np.eye(places.size))]
-        samples = [
-            move_objects(
-                sample,
-                {n: (*at, poses[n][2]) for n, at in zip(poses, positions.tolist(), strict=True)},
-                number,
+        objects: dict[str, TrackedObject] = {}
+        nudges: list[tuple[str, TrackedObject]] = []
+        for name, place in zip(poses, places, strict=True):
+            objects[name], *nudged = moved_copies(
+                sample.objects[name], place + step * _NUDGES, poses[name][2]
             )
-            for number, positions in enumerate(moved)
+            nudges += ((name, tracked) for tracked in nudged)
+        scene = with_objects(sample, objects)
+        samples = [
+            scene,
+            *(
+                with_objects(scene, {name: tracked}, number)
+                for number, (name, tracked) in enumerate(nudges, 1)
+            ),
         ]
         trace = Trace.from_samples(samples)
         leaves = leaf_values(TraceScene(trace, self._regions), [demand.formula for demand in demands], {})

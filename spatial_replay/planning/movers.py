@@ -15,13 +15,7 @@ import numpy as np
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.footprint import (
-    FootprintBatch,
-    TrackedObject,
-    centre_of,
-    moved_object,
-    with_poses,
-)
+from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_copies, moved_object
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.planning.decisions import Target, points_along
@@ -332,8 +326,7 @@ def _copies_at(
             moved_object(tracked, *point, number * turn)
             for number, point in zip(numbers, points, strict=True)
         ]
-    batch = with_poses(FootprintBatch.unknown(0), tracked, np.array(points), np.zeros(1))
-    return [replace(tracked, footprint=footprint) for footprint in batch.footprints(range(len(points)))]
+    return moved_copies(tracked, np.array(points))
 
 
 def _ways_aside(start: tuple[float, float], pace: float) -> list[tuple[tuple[float, float], ...]]:
