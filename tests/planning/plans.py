@@ -17,7 +17,7 @@ from spatial_replay.planning.settings import text_from_settings
 from spatial_replay.runs.scripted import run_log
 
 PUSH = Settings(
-    Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.005)), "push", margin=0.01, constraint_margin=0.005
+    Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.01)), "push", margin=0.01, constraint_margin=0.005
 )
 
 

@@ -38,7 +38,7 @@ def planned(text, names, always="", **options):
 
 
 @pytest.mark.parametrize("skill", ["place", "push"])
-@pytest.mark.parametrize("apart", [0.02, 0.5, 1.5])
+@pytest.mark.parametrize("apart", [0.02, 1.5])
 def test_two_objects_change_places_that_always_have_to_be_apart(apart, skill):
     moved = planned(SWAP, "ab", f"a dist b >= {apart}", skill=skill)
     assert (moved[0], len(moved)) == (moved[2], 3)
@@ -103,7 +103,7 @@ def begins(step):
 
 @pytest.mark.parametrize(
     "text",
-    ["F (a enclosedin at_b)", SWAP, f"({SWAP}) and G (a dist b >= 0.3)", "F (a leftof b) and F (b above c)"],
+    ["F (a enclosedin at_b)", f"({SWAP}) and G (a dist b >= 0.3)", "F (a leftof b) and F (b above c)"],
 )
 @pytest.mark.parametrize("skill", ["place", "push"])
 def test_a_motion_that_failed_is_not_made_again_while_nothing_has_changed(text, skill):
