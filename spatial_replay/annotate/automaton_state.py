@@ -15,7 +15,7 @@ from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, T
 from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.geometry.arrays import Flags, Floats, Integers, combined, equal_places
+from spatial_replay.geometry.arrays import Flags, Floats, Integers, combined_code, equal_places
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -288,7 +288,7 @@ def _members(states: NDArray[np.bool_] | Integers) -> Integers:
 def _alike(before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers) -> Iterator[Integers]:
     """Return the samples of each distinct step."""
     if before.ndim == 1:
-        return equal_places(combined([before, after], len(before)))
+        return equal_places(combined_code([before, after], len(before)))
     rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
     _, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
     return equal_places(groups.ravel())

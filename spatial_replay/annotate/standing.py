@@ -17,7 +17,7 @@ from spatial_replay.annotate.robustness import Codes, curved_nodes, standing_cod
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
-from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.geometry.arrays import Floats, Integers, combined_code, equal_places
 from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, StandingUpdate
 from spatial_replay.logs.wire import WireTemplate, join_in_order, round_numbers, words_of
 from spatial_replay.monitor.stream import SeriesBlock
@@ -251,7 +251,7 @@ class StandingEncoder:
         encoded, of_violated = [], dict[int, tuple[Floats, Floats, Floats]]()
         is_listed = np.arange(len(order))[:, None] < counts
         keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
-        for members in equal_places(combined(keys, len(times_ns))):
+        for members in equal_places(combined_code(keys, len(times_ns))):
             first = int(members[0])
             violated = tuple((place, over[place]) for place in order[: counts[first], first].tolist())
             said = tuple(texts[which[first]] for texts, which in words)

@@ -24,7 +24,7 @@ import numpy as np
 from spatial_replay.bags.decoders import Topic, decoder_of
 from spatial_replay.bags.definitions import Decoder
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Integers, concatenated, select
+from spatial_replay.geometry.arrays import Integers, concatenate_tables, select
 from spatial_replay.logs.mcap.read import too_many_waiting
 from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
@@ -124,7 +124,7 @@ def in_order(
         held += sum(map(len, chunk.payloads))
         if held > most_bytes:
             raise too_many_waiting(name, most_bytes)
-        waiting = concatenated([waiting, chunk] if len(waiting) else [chunk]).sort_by_time()
+        waiting = concatenate_tables([waiting, chunk] if len(waiting) else [chunk]).sort_by_time()
         if number == len(starts_ns):
             break
         ready = waiting.count_before(starts_ns[number])

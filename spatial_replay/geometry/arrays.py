@@ -47,7 +47,7 @@ def roomy(shape: tuple[int, ...], dtype: type[_Number]) -> NDArray[_Number]:
     return np.empty(shape, dtype)
 
 
-def joined(parts: Sequence[NDArray[_Number]], axis: int = 0) -> NDArray[_Number]:
+def join_arrays(parts: Sequence[NDArray[_Number]], axis: int = 0) -> NDArray[_Number]:
     """Concatenate arrays of one type into a `roomy` one."""
     shape = list(parts[0].shape)
     shape[axis] = sum(part.shape[axis] for part in parts)
@@ -108,7 +108,7 @@ def count_in_rows(flags: Booleans, start: Integers) -> Integers:
 _MOST: Final = 2**62
 
 
-def combined(columns: Iterable[NDArray[Any]], length: int) -> Integers:
+def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
     """Return (length,) a number that is equal exactly where all columns of whole numbers are."""
     code, most = np.zeros(length, np.int64), 1
     for column in columns:
@@ -118,12 +118,12 @@ def combined(columns: Iterable[NDArray[Any]], length: int) -> Integers:
         width = int(column.max()) - least + 1
         places = column.astype(np.int64) - least
         if most * width > _MOST:
-            (code, most), (places, width) = _ranked(code), _ranked(places)
+            (code, most), (places, width) = _ranks(code), _ranks(places)
         code, most = code * width + places, most * width
     return code
 
 
-def _ranked(column: Integers) -> tuple[Integers, int]:
+def _ranks(column: Integers) -> tuple[Integers, int]:
     """Return the rank of each number among those that there are, and how many there are."""
     kinds, ranks = np.unique(column, return_inverse=True)
     return ranks.astype(np.int64), len(kinds)
@@ -148,34 +148,34 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
     Its arrays and sequences have one element for each row; all rows share its mappings.
     """
     if isinstance(rows, slice):
-        return _mapped(table, lambda name: getattr(table, name)[rows])
+        return _map_columns(table, lambda name: getattr(table, name)[rows])
     row_numbers = cache(rows.tolist)
 
-    def chosen(name: str) -> Any:
+    def selected_column(name: str) -> Any:
         column = getattr(table, name)
         if isinstance(column, np.ndarray):
             return column[rows]
         return column.select(rows) if hasattr(column, "select") else [column[row] for row in row_numbers()]
 
-    return _mapped(table, chosen)
+    return _map_columns(table, selected_column)
 
 
-def concatenated(tables: Sequence[_Table]) -> _Table:
+def concatenate_tables(tables: Sequence[_Table]) -> _Table:
     """Join dataclasses of columns, at least one, with the mappings of the last; see `select`."""
     if len(tables) == 1:
         return tables[0]
 
-    def joined(name: str) -> Any:
+    def joined_column(name: str) -> Any:
         columns = [getattr(table, name) for table in tables]
         if isinstance(columns[0], np.ndarray):
             return np.concatenate(columns)
         kinds = [type(column) for column in columns if hasattr(column, "concatenate")]
         return kinds[0].concatenate(columns) if kinds else list(chain.from_iterable(columns))
 
-    return _mapped(tables[-1], joined)
+    return _map_columns(tables[-1], joined_column)
 
 
-def _mapped(table: _Table, column: Callable[[str], Any]) -> _Table:
+def _map_columns(table: _Table, column: Callable[[str], Any]) -> _Table:
     names = (column_field.name for column_field in fields(cast(Any, table)))
     columns = {name: column(name) for name in names if not isinstance(getattr(table, name), Mapping)}
     return cast(_Table, replace(cast(Any, table), **columns))

@@ -77,7 +77,7 @@ class ConvexPart:
         corners, is_convex = _tidy(vertices)
         if not is_convex:
             raise GeometryError(
-                f"the vertices {_shown(corners)} are not those of a convex polygon in order; "
+                f"the vertices {_vertices_text(corners)} are not those of a convex polygon in order; "
                 "Footprint.polygon takes any polygon"
             )
         radius = _finite(radius, "a part's radius")
@@ -92,7 +92,7 @@ class ConvexPart:
 
     def __repr__(self) -> str:
         radius = f", radius={self.radius:.6g}" if self.radius else ""
-        return f"ConvexPart({_shown(self.vertices)}{radius})"
+        return f"ConvexPart({_vertices_text(self.vertices)}{radius})"
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ConvexPart):
@@ -282,9 +282,9 @@ class TrackedObject:
         object.__setattr__(self, "uncertainty", _finite(self.uncertainty, "uncertainty"))
         if self.uncertainty < 0:
             raise GeometryError(f"uncertainty is {self.uncertainty}; give 0 or more")
-        object.__setattr__(self, "packed", self._packed())
+        object.__setattr__(self, "packed", self._pack())
 
-    def _packed(self) -> tuple[bytes, ...]:
+    def _pack(self) -> tuple[bytes, ...]:
         parts, yaw, height = self.footprint.parts, self.yaw, self.height
         if len(parts) == 1 and yaw is None and height is None and self.uncertainty == 0.0:
             return _PLAIN, parts[0].packed
@@ -310,7 +310,7 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
         most = f"{MOST_CONVEX_CORNERS:,}"
         raise GeometryError(f"a polygon has {len(corners):,} corners; simplify it to at most {most}")
     if fault not in (SOUND, NOT_CONVEX):
-        raise GeometryError(f"vertices {_shown(corners)} are not all finite numbers of at most 1e100")
+        raise GeometryError(f"vertices {_vertices_text(corners)} are not all finite numbers of at most 1e100")
     return corners, fault == SOUND
 
 
@@ -335,7 +335,7 @@ def _interval(height: tuple[float, float]) -> tuple[float, float]:
     return bottom, top
 
 
-def _shown(vertices: Floats) -> str:
+def _vertices_text(vertices: Floats) -> str:
     corners = [f"({x:.6g}, {y:.6g})" for x, y in vertices[:8].tolist()]
     return ", ".join(corners + ["…"] * (len(vertices) > 8))
 
@@ -395,7 +395,7 @@ class FootprintBatch:
                 raise GeometryError(f"{name} must rise from 0 to {last}; it is {start}")
 
     @classmethod
-    def trusted(cls, **columns: Floats | Integers) -> FootprintBatch:
+    def without_checks(cls, **columns: Floats | Integers) -> FootprintBatch:
         """Build rows of new, contiguous arrays that are known to fit together.
 
         For a few rows, checking takes longer than making them.
@@ -413,7 +413,7 @@ class FootprintBatch:
         """Return the rows from one to before another, as views."""
         parts = slice(*self.part_start[[begin, end]].tolist())
         vertices = slice(*self.vertex_start[[parts.start, parts.stop]].tolist())
-        return FootprintBatch.trusted(
+        return FootprintBatch.without_checks(
             part_start=self.part_start[begin : end + 1] - parts.start,
             vertex_start=self.vertex_start[parts.start : parts.stop + 1] - vertices.start,
             vertices=self.vertices[vertices],
@@ -458,7 +458,7 @@ class FootprintBatch:
     @classmethod
     def unknown(cls, count: int) -> FootprintBatch:
         """Build rows of which nothing is known: one point each, at NaN."""
-        return cls.trusted(
+        return cls.without_checks(
             part_start=np.arange(count + 1, dtype=np.int64),
             vertex_start=np.arange(count + 1, dtype=np.int64),
             vertices=np.full((count, 2), np.nan),
@@ -475,7 +475,7 @@ class FootprintBatch:
         none = np.empty(0, np.int64)
         part_counts = np.concatenate([none, *(np.diff(batch.part_start) for batch in batches)])
         vertex_counts = np.concatenate([none, *(np.diff(batch.vertex_start) for batch in batches)])
-        return cls.trusted(
+        return cls.without_checks(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
             vertices=np.concatenate([np.empty((0, 2)), *(batch.vertices for batch in batches)]),
@@ -493,7 +493,7 @@ class FootprintBatch:
         parts = flat_index(first_part, part_counts)
         first_vertex = self.vertex_start[parts]
         vertex_counts = self.vertex_start[parts + 1] - first_vertex
-        return FootprintBatch.trusted(
+        return FootprintBatch.without_checks(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
             vertices=self.vertices.take(flat_index(first_vertex, vertex_counts), axis=0),
@@ -604,7 +604,7 @@ def radius_of(tracked: TrackedObject) -> float:
     return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)
 
 
-def shifted(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
+def shift_rows(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
     """Return the rows of a batch, each moved in the plane by its shift (R, 2)."""
     counts = np.diff(batch.vertex_start[batch.part_start])
     return replace(batch, vertices=batch.vertices + np.repeat(shifts, counts, axis=0))
@@ -651,7 +651,7 @@ def with_poses(
         turned = zip((x * cosine - y * sine).tolist(), (x * sine + y * cosine).tolist(), strict=True)
         for corner, local in enumerate(turned):
             np.add(at, complex(*local), out=filled[number, :, corner])
-    return FootprintBatch.trusted(
+    return FootprintBatch.without_checks(
         part_start=np.concatenate((batch.part_start[:-1], part_start)),
         vertex_start=np.concatenate((batch.vertex_start[:-1], vertex_start)),
         vertices=vertices,

@@ -452,13 +452,13 @@ def fill_contacts(
                             vertices, vertex_start[p], vertex_start[p + 1], vertex_start[q],
                             vertex_start[q + 1], is_protrusion,
                         )  # fmt: skip
-                        own = radius[p] + first_enlargement
-                        own = -own if is_protrusion else own
-                        other = radius[q] + second_enlargement
-                        rounded = line[4] - own - other
+                        first_radius = radius[p] + first_enlargement
+                        first_radius = -first_radius if is_protrusion else first_radius
+                        second_radius = radius[q] + second_enlargement
+                        rounded = line[4] - first_radius - second_radius
                         if rounded < least:
                             least = rounded
-                            px, py = line[0] + line[2] * own, line[1] + line[3] * own
+                            px, py = line[0] + line[2] * first_radius, line[1] + line[3] * first_radius
                             dx, dy, distance = line[2], line[3], rounded
                             upper = top[b] if math.isnan(top[a]) or top[b] > top[a] else top[a]
                 is_taken = distance > greatest if is_protrusion else distance < np.inf

@@ -303,7 +303,7 @@ def _contact(first: Footprint, second: Footprint, *, is_protrusion: bool) -> Con
     return Contact((x, y), (other_x, other_y), distance)
 
 
-def enlarged(footprint: Footprint, radius: float) -> Footprint:
+def enlarge(footprint: Footprint, radius: float) -> Footprint:
     """Return the Minkowski sum of a footprint with a disc of the given radius (at least 0)."""
     return Footprint(tuple(ConvexPart(part.vertices, part.radius + radius) for part in footprint.parts))
 

@@ -234,17 +234,17 @@ def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
     changed = True
     while changed and count > 2:
         changed = False
-        left, kept = count, 0
+        remaining, length = count, 0
         for i in range(count):
-            before = kept - 1 if kept else count - 1
+            before = length - 1 if length else count - 1
             after = i + 1 if i + 1 < count else 0
-            if left > 2 and _strays(vertices, i, before, after) <= tolerance:
-                left -= 1
+            if remaining > 2 and _strays(vertices, i, before, after) <= tolerance:
+                remaining -= 1
                 changed = True
             else:
-                _copy(vertices, i, vertices, kept, 1)
-                kept += 1
-        count = left
+                _copy(vertices, i, vertices, length, 1)
+                length += 1
+        count = remaining
     return count
 
 
@@ -342,7 +342,7 @@ def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring
     for i, j in sorted(shared, key=lambda edge: (-_squared_length(corners, *edge), edge)):
         left, right = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
         # left runs j … i, right runs i … j
-        from_j, from_i = _rotated(left, j), _rotated(right, i)
+        from_j, from_i = _rotate(left, j), _rotate(right, i)
         ring = from_j + from_i[1:-1]
         at_i = _turn(corners, from_j[-2], i, from_i[1])
         at_j = _turn(corners, from_i[-2], j, from_j[1])
@@ -359,7 +359,7 @@ def _edges(ring: _Ring) -> Iterable[tuple[int, int]]:
     return zip(ring, ring[1:] + ring[:1], strict=True)
 
 
-def _rotated(ring: _Ring, first: int) -> _Ring:
+def _rotate(ring: _Ring, first: int) -> _Ring:
     """Return the same ring, starting at one of its corners."""
     place = ring.index(first)
     return ring[place:] + ring[:place]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Integers, concatenated, equal_places, select
+from spatial_replay.geometry.arrays import Integers, concatenate_tables, equal_places, select
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import LATEST_NS, Trace
@@ -191,7 +191,7 @@ def join(streams: Sequence[Messages]) -> Messages:
     numbers = {identity: number[_rank(channel)] for identity, channel in distinct.items()}
     renumbered = [replace(stream, channel=_renumber(stream, numbers)) for stream in streams]
     channels = {place: by_rank[rank] for rank, place in number.items()}
-    return replace(concatenated([Messages(), *renumbered]), channels=channels)
+    return replace(concatenate_tables([Messages(), *renumbered]), channels=channels)
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:

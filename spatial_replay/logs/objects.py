@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
-    combined,
+    combined_code,
     equal_places,
     select,
     starts_from_counts,
@@ -448,7 +448,7 @@ def _object_pieces(trace: Trace) -> Payloads:
     is_earlier = np.zeros(len(rows), np.bool_)
     if trace.reported_ns is not None:
         is_earlier = reported_ns != trace.times_ns[np.nonzero(present)[0]]
-    layouts = combined([name, marked < 0, is_earlier, _row_layout(trace)[rows]], len(rows))
+    layouts = combined_code([name, marked < 0, is_earlier, _row_layout(trace)[rows]], len(rows))
     for places in equal_places(layouts):
         first = int(places[0])
         message = _message(trace, int(name[first]), int(rows[first]), unreadable=bool(marked[first] < 0))
@@ -491,7 +491,7 @@ def _row_layout(trace: Trace) -> Integers:
         column = np.zeros(len(counts), np.int64)
         column[has_part] = vertex_counts[shapes.part_start[:-1][has_part] + place]
         columns.append(column)
-    return combined(columns, len(counts))
+    return combined_code(columns, len(counts))
 
 
 def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectStates:

@@ -18,7 +18,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers, combined, equal_places
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, combined_code, equal_places
 
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.uint64]
@@ -214,7 +214,7 @@ class Payloads(Sequence[bytes]):
 
     def copy_into(self, target: Bytes, starts: Integers) -> None:
         """Copy the messages into a buffer, each to its start there."""
-        for places in equal_places(combined([self.buffer, self.size], len(self))):
+        for places in equal_places(combined_code([self.buffer, self.size], len(self))):
             source, size = self.buffers[self.buffer[places[0]]], int(self.size[places[0]])
             if len(places) < _FEW:
                 for begin, end in zip(self.start[places].tolist(), starts[places].tolist(), strict=True):

@@ -110,7 +110,7 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     for piece, ring in zip(hulls.tolist(), rings, strict=True):
         vertices[start[piece] : start[piece] + len(ring)] = ring
     bottom, top = _height_intervals(solids, count)
-    return FootprintBatch.trusted(
+    return FootprintBatch.without_checks(
         part_start=starts_from_counts(np.bincount(solids.owner, minlength=count)),
         vertex_start=start,
         vertices=vertices,

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated, select
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenate_tables, select
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.formats.episodes import Body, DataSet, EpisodeColumns
 from spatial_replay.logs.messages import Block
@@ -239,7 +239,7 @@ class EpisodeSource(Source):
             together = join_objects([detections[name] for name in group])
             parts.append(rows_from_detections(together, None, self.axes, self.reading.concave, report_row))
             names += group
-        return names, parts[0] if len(parts) == 1 else concatenated([_NO_ROWS, *parts])
+        return names, parts[0] if len(parts) == 1 else concatenate_tables([_NO_ROWS, *parts])
 
     def _report(self, name: str, frame: int, what: str, *, times_ns: Integers, faults: FaultList) -> None:
         moment = Instant(int(times_ns[frame]), 0)
@@ -393,7 +393,7 @@ def _rows_of_body(body: Body, axes: Axes) -> ObservationRows:
         _, yaw = matrices_from_quaternions(body.quaternions)
     shapes = body.shapes
     if shapes is None:
-        shapes = FootprintBatch.trusted(
+        shapes = FootprintBatch.without_checks(
             part_start=np.arange(count + 1, dtype=np.int64),
             vertex_start=np.arange(count + 1, dtype=np.int64),
             vertices=np.ascontiguousarray(body.positions[:, :2]),

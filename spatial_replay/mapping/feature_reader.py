@@ -15,7 +15,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Floats, concatenated
+from spatial_replay.geometry.arrays import Floats, concatenate_tables
 from spatial_replay.logs.formats.episodes import Body, DataSet, Feature
 from spatial_replay.mapping.binding import Binding
 from spatial_replay.mapping.detections import (
@@ -265,7 +265,7 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
         message=np.concatenate([thing.message for thing in objects]),
         name=np.repeat(np.arange(len(objects)), counts),
         class_code=np.concatenate([thing.class_code for thing in objects]),
-        poses=concatenated([thing.poses for thing in objects]),
+        poses=concatenate_tables([thing.poses for thing in objects]),
         solids=Solids(
             owner=np.concatenate([part.owner + begin for part, begin in zip(solids, first, strict=False)]),
             kind=np.concatenate([part.kind for part in solids]),

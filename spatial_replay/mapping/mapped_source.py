@@ -21,7 +21,7 @@ from spatial_replay.bags.definitions import full_type_name
 from spatial_replay.bags.open import files_of_bag_around, open_messages
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_pieces, without_jumps
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import concatenated, select
+from spatial_replay.geometry.arrays import concatenate_tables, select
 from spatial_replay.logs.behaviour_tree import NAV2_LOG, TREE_CHANNEL, Nav2Tree, TreeNode, TreeTick
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, Row, merge
 from spatial_replay.logs.read_options import FaultList, late_ns
@@ -263,7 +263,7 @@ class _CopiedMessages:
         is_all = last or self._waiting_bytes > _WAITING_BYTES
         if not (is_all or len(trace)):
             return Messages()
-        waiting = concatenated(self._waiting)
+        waiting = concatenate_tables(self._waiting)
         times = waiting.log_time_ns
         if not (times[1:] >= times[:-1]).all():
             waiting = select(waiting, np.argsort(times, kind="stable"))

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated, select
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenate_tables, select
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, footprints_from_solids
@@ -30,7 +30,7 @@ from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.observations import Observations, check_observations
 from spatial_replay.trace.spans import TopicSpan
-from spatial_replay.trace.trace import ABSENT, LONG_PAUSE, Pauses, Trace, class_order, renumbered
+from spatial_replay.trace.trace import ABSENT, LONG_PAUSE, Pauses, Trace, class_order, renumber_rows
 from spatial_replay.trace.units import Axes
 
 LEFT = -1
@@ -67,7 +67,7 @@ class Events:
 
     def after(self, before: Events) -> Events:
         """Join earlier events of the same topic and these."""
-        joined = concatenated([before, self])
+        joined = concatenate_tables([before, self])
         # those of a system that runs may come late
         return select(joined, np.lexsort((joined.time_ns, joined.name)))
 
@@ -277,7 +277,7 @@ def rows_from_detections(
     if not faults and not unknown.any():
         return rows
     unknown[list(faults)] = True
-    both = concatenated([rows, ObservationRows.blank(detections.class_code)])
+    both = concatenate_tables([rows, ObservationRows.blank(detections.class_code)])
     return replace(select(both, np.where(unknown, count + indices, indices)), is_valid=readable & ~unknown)
 
 
@@ -443,13 +443,13 @@ class Tracker:
             # of stale objects only the class is known: one blank row for each class, after the others
             numbered = np.where(is_stale, -2 - (len(stored) + classes), numbered)
             blank = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
-            stored = concatenated([stored, blank])
+            stored = concatenate_tables([stored, blank])
         # codes follow the log; a trace must not depend on the order of its messages
         by_code = self.classes.by_code
         classes_of = class_order(by_code)
         places = {name: place for place, name in enumerate(classes_of)}
         rank = np.array([places[name] for name in by_code], np.int64)
-        used, numbered = renumbered(numbered)
+        used, numbered = renumber_rows(numbered)
         stored = select(stored, used)
         signals, signals_reported_ns = self._signal_columns(times_ns, newest_ns)
         return Trace(
@@ -639,7 +639,7 @@ class Tracker:
 
     def _store_additions(self) -> None:
         if self._added:
-            self._rows = concatenated([self._rows, *self._added])
+            self._rows = concatenate_tables([self._rows, *self._added])
             self._added = []
 
     def _add(self, rows: ObservationRows) -> Integers:
@@ -815,11 +815,11 @@ class Remarks:
 
     def add_pauses(self) -> None:
         """Remark pauses of topics, but for those in which there are no samples either."""
-        pauses = self.samples.found()
+        pauses = self.samples.longest_first()
         for topic, messages in sorted(self.messages.items()):
             if topic in self.lasting:
                 continue
-            topic_pauses = messages.found()
+            topic_pauses = messages.longest_first()
             is_common = all(
                 any(at < start + length and start < at + long for at, long in pauses)
                 for start, length in topic_pauses

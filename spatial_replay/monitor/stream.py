@@ -16,7 +16,7 @@ from typing import cast
 import numpy as np
 
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.geometry.arrays import Empty, Floats, Integers, joined
+from spatial_replay.geometry.arrays import Empty, Floats, Integers, join_arrays
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import Bindings, Reach, TraceScene, look_back, tail
@@ -206,8 +206,8 @@ class SeriesBlock:
 def join_blocks(blocks: Sequence[SeriesBlock]) -> SeriesBlock:
     """Join one or more consecutive blocks of the same instance."""
     return SeriesBlock(
-        joined([block.times_ns for block in blocks]),
-        joined([block.series for block in blocks], axis=2),
+        join_arrays([block.times_ns for block in blocks]),
+        join_arrays([block.series for block in blocks], axis=2),
         joined_channels([block.leaves for block in blocks], axis=2),
     )
 

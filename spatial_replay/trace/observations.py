@@ -70,7 +70,7 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     Returns:
         the trace of the other samples, and the fault of each sample left out, by its index.
     """
-    observed = _ordered(observed)
+    observed = _sort_observations(observed)
     faults = _duplicates(observed)
     readable, shapes, wrong = check_observations(observed, concave=concave)
     faults = wrong | faults
@@ -113,11 +113,11 @@ def check_observations(
     """
     readable = _finite(observed) & ~observed.invalid
     faults = _wrong_numbers(observed, readable)
-    shapes, misshapen = _normalised(observed, readable, concave)
+    shapes, misshapen = _normalise_shapes(observed, readable, concave)
     return readable, shapes, misshapen | faults
 
 
-def _ordered(observed: Observations) -> Observations:
+def _sort_observations(observed: Observations) -> Observations:
     """Sort the observations by sample, then name, with names in order of code points."""
     order = sorted(range(len(observed.names)), key=observed.names.__getitem__)
     names = [observed.names[index] for index in order]
@@ -189,7 +189,7 @@ def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]
     return faults
 
 
-def _normalised(
+def _normalise_shapes(
     observed: Observations, readable: Booleans, concave: Concave
 ) -> tuple[FootprintBatch, dict[int, str]]:
     """Return normalised polygons and the samples' faults; cut up those that are not convex."""

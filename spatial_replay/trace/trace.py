@@ -164,7 +164,7 @@ class Sample:
         for name, reported_ns in self.reported_ns.items():
             if name not in objects and name not in signals and name not in self.unknown:
                 raise TraceError(f"reported_ns has {name!r}, which the sample does not have; leave it out")
-            self._check_reported(name, reported_ns)
+            self._check_report_time(name, reported_ns)
         object.__setattr__(self, "time_ns", int(self.time_ns))
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
@@ -178,7 +178,7 @@ class Sample:
         object.__setattr__(self, "reported_ns", MappingProxyType(others))
         object.__setattr__(self, "lasting", frozenset(self.lasting) & objects.keys())
 
-    def _check_reported(self, name: str, reported_ns: object) -> None:
+    def _check_report_time(self, name: str, reported_ns: object) -> None:
         if isinstance(reported_ns, bool) or not isinstance(reported_ns, (int, np.integer)):
             raise TraceError(f"reported_ns of {name!r} is {shortened(reported_ns)}; give integer nanoseconds")
         if not 0 <= reported_ns <= self.time_ns:
@@ -559,7 +559,7 @@ class Trace(Displayed):
     def take(self, samples: Integers) -> Trace:
         """Return the samples with the given indices (K,), which must increase."""
         rows = self.rows[samples]
-        used, numbered = renumbered(rows)
+        used, numbered = renumber_rows(rows)
         return replace(
             self,
             times_ns=self.times_ns[samples],
@@ -585,14 +585,14 @@ class Trace(Displayed):
             names=tuple(name for name, used in zip(self.names, observed.tolist(), strict=True) if used),
             rows=self.rows[:, observed],
             signals={name: values for name, values in self.signals.items() if not np.isnan(values).all()},
-            **self._own_reported(observed),
+            **self._report_times(observed),
         ).take(np.arange(len(self), dtype=np.int64))
         codes, inverse = np.unique(whole.class_code, return_inverse=True)
         classes = class_order(self.classes[code] for code in codes.tolist())
         order = np.array([classes.index(self.classes[code]) for code in codes.tolist()], np.int64)
         return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
 
-    def _own_reported(self, observed: NDArray[np.bool_]) -> dict[str, Any]:
+    def _report_times(self, observed: NDArray[np.bool_]) -> dict[str, Any]:
         """Return the columns of the observed objects and of signals, the sample's time where nothing is."""
         own_ns = self.times_ns[:, None]
         reported_ns = None
@@ -796,7 +796,7 @@ def _same_samples(a: Trace, b: Trace) -> bool:
     return all(np.array_equal(first, second, equal_nan=first.dtype.kind == "f") for first, second in pairs)
 
 
-def renumbered(rows: Integers) -> tuple[Integers, Integers]:
+def renumber_rows(rows: Integers) -> tuple[Integers, Integers]:
     """Return the rows in use, by sample and name, and the row numbers that point at them."""
     present = rows != ABSENT
     marked = rows[present]
@@ -852,24 +852,24 @@ class Pauses:
             self._pieces = []
             self._hold(held)
 
-    def _hold(self, found: Integers) -> None:
+    def _hold(self, intervals: Integers) -> None:
         if self._first_usual_ns is not None:
-            found = found[:, found[1] > LONG_PAUSE * self._first_usual_ns]
-        if found.size:
-            self._pieces.append(found)
+            intervals = intervals[:, intervals[1] > LONG_PAUSE * self._first_usual_ns]
+        if intervals.size:
+            self._pieces.append(intervals)
 
     @property
     def _held(self) -> Integers:
         """(2, N): starts and lengths."""
         return np.concatenate([np.empty((2, 0), np.int64), *self._pieces], axis=1)
 
-    def found(self) -> list[tuple[int, int]]:
+    def longest_first(self) -> list[tuple[int, int]]:
         """Return the start and the length of each pause, the longest first."""
         held = self._held
         if not self.is_regular:
             return []
         starts, lengths = held[:, held[1] > LONG_PAUSE * self.usual_ns].tolist()
-        return sorted(zip(starts, lengths, strict=True), key=lambda each: -each[1])
+        return sorted(zip(starts, lengths, strict=True), key=lambda pause: -pause[1])
 
     @property
     def last_ns(self) -> int | None:
@@ -891,7 +891,7 @@ class Pauses:
 
     def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
         """Return a sentence about the pauses of `what`; None without any."""
-        pauses = self.found()
+        pauses = self.longest_first()
         if not pauses:
             return None
         parts: list[str | Instant] = []

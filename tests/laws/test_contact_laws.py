@@ -15,7 +15,7 @@ from spatial_replay.geometry.measure import (
     Operand,
     contact,
     contacts,
-    enlarged,
+    enlarge,
     measure,
     protrusion_contact,
 )
@@ -51,7 +51,7 @@ def test_the_contact_translation_separates_overlapping_footprints(a, b):
         push = np.subtract(found.first, found.second)
         moved = Footprint.polygon(b.parts[0].vertices + push) if len(b.parts[0].vertices) > 2 else None
         if moved is not None:
-            moved = enlarged(moved, b.parts[0].radius)
+            moved = enlarge(moved, b.parts[0].radius)
             assert abs(measured("signed_distance", a, moved)) < TOLERANCE
 
 
@@ -65,7 +65,7 @@ def test_the_protrusion_contact_has_the_measured_protrusion(inner, outer):
 
 @given(footprints, footprints, radii)
 def test_enlarging_reduces_the_distance(a, b, radius):
-    before, after = contact(a, b).distance, contact(a, enlarged(b, radius)).distance
+    before, after = contact(a, b).distance, contact(a, enlarge(b, radius)).distance
     assert math.isclose(after, before - radius, abs_tol=TOLERANCE)
 
 

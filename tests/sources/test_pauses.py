@@ -148,8 +148,8 @@ def test_pauses_of_a_long_log_are_found_and_take_no_memory() -> None:
         tracemalloc.stop()
     assert held_bytes < 2_000_000
     assert pauses.usual_ns == 33_000_000
-    assert [length for _, length in pauses.found()] == [3 * 10**9, 2 * 10**9, 10**9]
-    assert pauses.found()[1][0] == times_ns[499_999]
+    assert [length for _, length in pauses.longest_first()] == [3 * 10**9, 2 * 10**9, 10**9]
+    assert pauses.longest_first()[1][0] == times_ns[499_999]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 50, 403])
@@ -161,4 +161,4 @@ def test_pauses_do_not_depend_on_blocks(size: int) -> None:
     for first in range(0, len(times_ns), size):
         pauses.add(times_ns[first : first + size])
     assert pauses.usual_ns == 33_000_000
-    assert [length for _, length in pauses.found()] == [5 * 10**9, 10**9]
+    assert [length for _, length in pauses.longest_first()] == [5 * 10**9, 10**9]

@@ -25,7 +25,7 @@ from spatial_replay.annotate.scene.scene_template import (
     rings_of,
 )
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
-from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.geometry.arrays import Floats, Integers, combined_code, equal_places
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
@@ -117,7 +117,7 @@ def arrow_texts(
     of = found.result, found.leaf, found.holds, found.moment_ns, found.atom
     columns = [column[messages] for column in of]
     causes, cause = list[CauseText](), np.zeros(len(found.result), np.int64)
-    for places in equal_places(combined([*columns, lengths], len(messages))):
+    for places in equal_places(combined_code([*columns, lengths], len(messages))):
         cause[messages[places]] = len(causes)
         result, leaf, holds, moment_ns, atom = (int(column[places[0]]) for column in columns)
         pairs = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None

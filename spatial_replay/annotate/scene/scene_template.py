@@ -26,7 +26,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
-    combined,
+    combined_code,
     equal_places,
     flat_index,
     starts_from_counts,
@@ -175,7 +175,7 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
         at = np.where(has_part, footprints.part_start[:-1] + part, 0)
         columns.append(np.where(has_part, lengths[at], 0))
     form, forms = np.zeros(len(footprints), np.int64), list[Form]()
-    for places in equal_places(combined(columns, len(footprints))):
+    for places in equal_places(combined_code(columns, len(footprints))):
         form[places], row = len(forms), int(places[0])
         rings = lengths[footprints.part_start[row] : footprints.part_start[row + 1]]
         forms.append(Form(tuple(rings.tolist()), bool(has_height[row])))

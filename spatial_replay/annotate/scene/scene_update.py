@@ -57,7 +57,7 @@ from spatial_replay.annotate.violations import (
     first_violations,
     worst_robustness,
 )
-from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.geometry.arrays import Floats, Integers, combined_code, equal_places
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.wire import Words, join_in_order, words_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
@@ -563,7 +563,7 @@ def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
     lengths = np.array([*map(len, content.last.rows), -1])[content.missing]
     keys = [*content.forms.T, *content.styles.T, *lengths.T, content.arrow]
-    for samples in equal_places(combined(keys, len(content.arrow))):
+    for samples in equal_places(combined_code(keys, len(content.arrow))):
         yield _layout(content, int(samples[0])), samples
 
 

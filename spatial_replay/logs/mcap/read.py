@@ -29,7 +29,7 @@ from mcap.opcode import Opcode
 
 from spatial_replay.compiled import cores
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Integers, concatenated, select
+from spatial_replay.geometry.arrays import Integers, concatenate_tables, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.mcap.index import (
     CHUNK_HEAD,
@@ -530,7 +530,7 @@ def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str],
 
 def _in_order(several: Sequence[Messages]) -> Messages:
     """Join messages by log time, channel and sequence; those that share all three keep their order."""
-    joined = concatenated([Messages(), *several])
+    joined = concatenate_tables([Messages(), *several])
     times = joined.log_time_ns
     if (times[1:] > times[:-1]).all():
         return joined

@@ -13,7 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.geometry.footprint import FootprintBatch, TrackedObject, centre_of, packed_centre, shifted
+from spatial_replay.geometry.footprint import (
+    FootprintBatch,
+    TrackedObject,
+    centre_of,
+    packed_centre,
+    shift_rows,
+)
 from spatial_replay.spec.formula import ANY_CLASS, ComputedSignal, Group, Signal, Term, TrackedName
 from spatial_replay.spec.relations import computed_signal
 from spatial_replay.spec.walks import named_members
@@ -167,7 +173,7 @@ class RecentReports:
         (x, y), (previous_x, previous_y) = (centre_of(tracked.footprint) for tracked in (current, previous))
         share = shortest / seconds
         shift = np.array([[(previous_x - x) * share, (previous_y - y) * share]])
-        moved = shifted(FootprintBatch.from_footprints([current.footprint]), shift)
+        moved = shift_rows(FootprintBatch.from_footprints([current.footprint]), shift)
         uncertainty = max(current.uncertainty, previous.uncertainty)
         return replace(current, footprint=moved.footprint(0), uncertainty=uncertainty)
 

@@ -19,7 +19,7 @@ from spatial_replay.geometry.footprint import (
     Footprint,
     FootprintBatch,
     centres_of,
-    shifted,
+    shift_rows,
 )
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.monitor.atoms.reports import Reports, before_last_reports, is_signal_known, left_out_of
@@ -398,7 +398,9 @@ class TraceScene:
         """Move some rows by a share of the way back to others; return their new rows."""
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
-        moved_batch = shifted(self._whole.select(newer), (centres[older] - centres[newer]) * share[:, None])
+        moved_batch = shift_rows(
+            self._whole.select(newer), (centres[older] - centres[newer]) * share[:, None]
+        )
         pairs = np.arange(2 * len(newer)).reshape(2, -1).T.ravel()
         self._moved.append(FootprintBatch.concatenate([moved_batch, centres_of(moved_batch)]).select(pairs))
         first = 2 * len(self._whole) + self._moved_count

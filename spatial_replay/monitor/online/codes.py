@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Floats, joined
+from spatial_replay.geometry.arrays import Floats, join_arrays
 
 SAMPLES, NANOSECONDS = 0, 1
 
@@ -116,7 +116,7 @@ def distinct_channels(numbers: Floats) -> Floats:
 def joined_channels(parts: Sequence[Floats], axis: int) -> Floats:
     """Concatenate arrays (C, …) in as many channels as the widest has, into a `roomy` one."""
     channels = max(map(len, parts))
-    return joined([in_channels(part, channels) for part in parts], axis)
+    return join_arrays([in_channels(part, channels) for part in parts], axis)
 
 
 def low_and_high(channels: int, *, wide: bool) -> tuple[int, int]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.geometry.measure import Contact, candidate_pairs, contact, enlarged, protrusion_contact
+from spatial_replay.geometry.measure import Contact, candidate_pairs, contact, enlarge, protrusion_contact
 from spatial_replay.monitor.atoms.instructions import closest_pair_of
 from spatial_replay.monitor.atoms.measurements import leaf_values, measurement_values
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
@@ -750,4 +750,4 @@ def _footprint(scene: TraceScene, term: Term) -> Footprint | None:
     rows = operand.rows[0]
     if len(rows) != 1 or rows[0] < 0:
         return None
-    return enlarged(scene.batch.footprint(int(rows[0])), operand.enlargement)
+    return enlarge(scene.batch.footprint(int(rows[0])), operand.enlargement)
