@@ -20,7 +20,7 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.recording.recorder import Recorder
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import require_specification
-from spatial_replay.text import listed, nearest_hint
+from spatial_replay.text import listing, nearest_hint
 from spatial_replay.trace.trace import Sample
 
 with importing("judging environments takes gymnasium", extra="gym"):
@@ -226,7 +226,7 @@ class _Episodes:
             raise UsageError("no objects and no signals; give objects=, a function of observation and info")
         for name, value, values in (("until", until, _UNTIL), ("reward", reward, _REWARDS)):
             if value is not None and value not in values:
-                raise UsageError(f"{name} is {value!r}; give {listed(values)}, or None")
+                raise UsageError(f"{name} is {value!r}; give {listing(values)}, or None")
         self._specification = _with_only_result(specification, result)
         self._spec = self._specification.results[-1].name
         self._monitor = Monitor(self._specification, missing_after=1)
@@ -326,7 +326,7 @@ def _with_only_result(specification: Specification, result: str | None) -> Speci
     names = [spec.name for spec in specification.results]
     name = names[-1] if result is None else result
     if name not in names:
-        hint = nearest_hint(name, names) or f"results are {listed(names)}"
+        hint = nearest_hint(name, names) or f"results are {listing(names)}"
         raise UsageError(f"result is {name!r}, and no result has this name; {hint}")
     specs = tuple(spec for spec in specification.specs if not spec.is_result or spec.name == name)
     return replace(specification, specs=specs)

@@ -116,7 +116,7 @@ def without_repetition(texts: Iterable[str]) -> list[str]:
     ]
 
 
-def counted(count: int, noun: str) -> str:
+def plural(count: int, noun: str) -> str:
     """Return a count with its noun: "1 sample", "1,579 samples"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
@@ -202,7 +202,7 @@ def cut(text: str, longest: int) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
-def listed(names: Sequence[str], most: int = 8) -> str:
+def listing(names: Sequence[str], most: int = 8) -> str:
     """Return the first of some names, with an ellipsis where there are more."""
     return ", ".join([*names[:most], *["…"] * (len(names) > most)])
 
@@ -213,7 +213,7 @@ def first_lines(lines: Sequence[str], most: int) -> list[str]:
     return [*lines[:most], *more]
 
 
-def escaped(text: str, kept: str = "") -> str:
+def escape_text(text: str, kept: str = "") -> str:
     """Return a text with escapes such as `\\x1b` in place of unprintable characters, but those in `kept`."""
     if text.isprintable():
         return text
@@ -288,7 +288,7 @@ def named_arguments(called: _Called) -> _Called:
     function = called.__init__ if isinstance(called, type) else called  # type: ignore[misc]
 
     @wraps(function)
-    def checked(*values: Any, **named: Any) -> Any:
+    def checked_call(*values: Any, **named: Any) -> Any:
         try:
             return function(*values, **named)
         except TypeError:
@@ -296,8 +296,8 @@ def named_arguments(called: _Called) -> _Called:
             raise
 
     if not isinstance(called, type):
-        return cast("_Called", checked)
-    setattr(called, "__init__", checked)  # noqa: B010
+        return cast("_Called", checked_call)
+    setattr(called, "__init__", checked_call)  # noqa: B010
     return called
 
 

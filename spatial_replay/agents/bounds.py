@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, escaped
+from spatial_replay.text import escape_text, plural
 
 MOST_BYTES: Final = 20_000
 """Size of an answer as JSON, bytes."""
@@ -188,7 +188,7 @@ class Bounds:
 
 
 def _quote(text: str) -> str:
-    text = escaped(text)
+    text = escape_text(text)
     return repr(text if len(text) <= 80 else f"{text[:79]}…")
 
 
@@ -277,7 +277,7 @@ def page_of(
         texts_of_warnings = [_cut(warning, "warning", 400, 0, []) for warning in warnings]
         warnings_here = list(_prefix(texts_of_warnings, _WARNINGS))
         if len(warnings_here) < len(texts_of_warnings):
-            left_off.append(f"{counted(len(texts_of_warnings) - len(warnings_here), 'line')} of the warnings")
+            left_off.append(f"{plural(len(texts_of_warnings) - len(warnings_here), 'line')} of the warnings")
     rows = list(document.get(rows_key) or ())
     others = {key: value for key, value in document.items() if key != rows_key}
     part = _fit(others, _OTHERS, left_off)
@@ -341,7 +341,7 @@ def _cut(value: Any, name: str, characters: int, entries: int, notes: list[str])
     """Return a value with shorter texts and lists, and without signs that do not print."""
     match value:
         case str():
-            text = escaped(value)
+            text = escape_text(value)
             return text if len(text) <= characters else f"{text[: characters - 1]}…"
         case list() | tuple():
             if len(value) > entries:

@@ -25,7 +25,7 @@ from spatial_replay.agents.bounds import Bounds, Files, page_of
 from spatial_replay.agents.calls import Call, Outcome, Outcomes, Processes, Work
 from spatial_replay.agents.pages import PAGES, page_text, relation_picture
 from spatial_replay.errors import UsageError
-from spatial_replay.text import escaped, nearest_hint
+from spatial_replay.text import escape_text, nearest_hint
 from spatial_replay.version import __version__
 
 _Log = Annotated[
@@ -165,7 +165,7 @@ class Tools:
             if not outcomes.outcomes or outcomes.outcomes[0].code:
                 return _failure(outcomes.reason or self._error(outcomes.outcomes[0].err, files))
             outcome = outcomes.outcomes[0]
-            text = "\n".join(escaped(line, "\t") for line in outcome.out.splitlines())
+            text = "\n".join(escape_text(line, "\t") for line in outcome.out.splitlines())
             # the lines hold all of it; as one text it can be given to the other tools
             document = {"mapping": text if len(text.encode()) < _MAPPING else None}
             lines = text.split("\n")

@@ -35,7 +35,7 @@ from spatial_replay.spec.formula import (
     iter_nodes,
 )
 from spatial_replay.spec.walks import nodes_of, rates_of
-from spatial_replay.text import listed
+from spatial_replay.text import listing
 
 _NOW = 1
 """The place of `now` among the numbers of a node."""
@@ -162,7 +162,7 @@ class AutomatonRun:
 
     def _described(self, states: tuple[int, ...]) -> str:
         """Return some states in words: what they decide, or what is still to be done."""
-        numbers = listed([*map(str, states)], _MOST_NAMED)
+        numbers = listing([*map(str, states)], _MOST_NAMED)
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
         accepting, can_accept, can_reject = self._about[list(states)].T
         possible = {

@@ -18,7 +18,7 @@ from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
 from spatial_replay.monitor.stream import EvaluationStream, Instance, SeriesBlock
 from spatial_replay.monitor.verdict import Semantics
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import listed, nearest_hint
+from spatial_replay.text import listing, nearest_hint
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -91,7 +91,7 @@ class AnnotatedEvaluation:
         """
         if title and not any(tree.is_called(title) for tree in self.trees):
             titles = [tree.title for tree in self.trees]
-            hint = nearest_hint(title, titles) or f"the results are: {listed(titles, _MOST_NAMED)}"
+            hint = nearest_hint(title, titles) or f"the results are: {listing(titles, _MOST_NAMED)}"
             raise UsageError(f"there is no result {title!r} for the arrow to point at; {hint}")
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:

@@ -24,7 +24,7 @@ from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.lazy import Displayed, drawn_as_svg
 from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 MAX_PROPOSITIONS = 64
 """How many propositions an automaton reads at most."""
@@ -476,7 +476,7 @@ def words_text(automaton: Automaton) -> str:
 
 def size_words(automaton: Automaton) -> str:
     """Return its size: "33 states, 6 propositions"."""
-    return f"{counted(len(automaton.states), 'state')}, {counted(len(automaton.propositions), 'proposition')}"
+    return f"{plural(len(automaton.states), 'state')}, {plural(len(automaton.propositions), 'proposition')}"
 
 
 def state_words(automaton: Automaton, state: int) -> str:
@@ -561,7 +561,7 @@ def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
 
 def _left_out(automaton: Automaton) -> str:
     most = len(automaton.states[:MOST_STATES])
-    rest = f"{counted(len(automaton.states) - most, 'more state')}, " if len(automaton.states) > most else ""
+    rest = f"{plural(len(automaton.states) - most, 'more state')}, " if len(automaton.states) > most else ""
     return f"{rest}more transitions and the rest of long guards are left out: there are too many"
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from spatial_replay.batch.run_table import Difference, Key, Tolerance, compare, keys_of, result_name
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, first_lines, json_fields, with_unit
+from spatial_replay.text import first_lines, json_fields, plural, with_unit
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -110,7 +110,7 @@ class RunDiff:
 
     def table(self) -> Iterator[str]:
         """Yield how many results of each spec differ, in lines."""
-        yield f"{counted(self.logs, 'log')}, {counted(self.results, 'result')}"
+        yield f"{plural(self.logs, 'log')}, {plural(self.results, 'result')}"
         counts: dict[tuple[str, str, str], Counter[str]] = {spec: Counter() for spec in self.specs}
         edited = set()
         for change in self.changes:

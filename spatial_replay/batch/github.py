@@ -25,7 +25,7 @@ from spatial_replay.batch.run_table import (
 from spatial_replay.errors import OutputError
 from spatial_replay.logs.remote import is_address
 from spatial_replay.report.panels import sentence_parts
-from spatial_replay.text import counted, first_lines, printable
+from spatial_replay.text import first_lines, plural, printable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -130,7 +130,7 @@ def markdown(table: pa.Table) -> str:
         count = len(table) - table.column("failure").null_count
         lines += [
             "",
-            f"{counted(count, 'result')} failed; the worst:",
+            f"{plural(count, 'result')} failed; the worst:",
             "",
             "| log | spec | requirement | verdict | failure | reason |",
             "|---|---|---|---|---|---|",

@@ -18,7 +18,7 @@ from spatial_replay.batch.run_table import (
 )
 from spatial_replay.batch.suite import DAMAGED, DOUBTFUL, DROPPED, UNTESTED, VACUOUS
 from spatial_replay.logs.output_file import replacing
-from spatial_replay.text import counted, cut, printable
+from spatial_replay.text import cut, plural, printable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -109,7 +109,7 @@ def _lines(
         for row in listed_rows:
             yield from _case(row, class_name, reports, limit)
         if len(listed_rows) < len(rows):
-            left_out = counted(len(rows) - len(listed_rows), "test case")
+            left_out = plural(len(rows) - len(listed_rows), "test case")
             yield f"<system-out>{left_out} that passed left out, to keep this report small</system-out>\n"
         yield "</testsuite>\n"
     yield "</testsuites>\n"

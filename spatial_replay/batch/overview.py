@@ -31,7 +31,7 @@ from spatial_replay.batch.run_table import (
 from spatial_replay.html import Html, element
 from spatial_replay.report.page import asset, html_page, text
 from spatial_replay.report.panels import sentence_parts
-from spatial_replay.text import counted, first_lines, with_unit
+from spatial_replay.text import first_lines, plural, with_unit
 from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
@@ -74,14 +74,14 @@ def overview_page(
 
 def _headline(table: pa.Table) -> str:
     failures = len(table) - table.column("failure").null_count
-    return f"{failures:,} of {counted(len(table), 'result')} failed" if failures else "everything passed"
+    return f"{failures:,} of {plural(len(table), 'result')} failed" if failures else "everything passed"
 
 
 def _header(table: pa.Table, name: str) -> Html:
     failed = table.column("failure").null_count < len(table)
     chip = element("span", _headline(table), **{"class": f"chip is-{'violated' if failed else 'satisfied'}"})
     logs = len(set(table.column("log").to_pylist()))
-    about = " · ".join([counted(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
+    about = " · ".join([plural(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
     title = element("div", element("h1", text(name)), chip, **{"class": "title"})
     return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})
 
@@ -235,7 +235,7 @@ def _matrix(
         log.setdefault(column, row)
     logs = len(set(table.column("log").to_pylist()))
     if logs > len(cells):
-        words = f"The {len(cells):,} worst of {counted(logs, 'log')}; the table of the run has them all."
+        words = f"The {len(cells):,} worst of {plural(logs, 'log')}; the table of the run has them all."
         yield element("p", words)
     cases = {case for case, _, _ in columns}
     yield _filter()

@@ -58,7 +58,7 @@ from spatial_replay.spec.format import format_formula, format_specification
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import SpecificationText
 from spatial_replay.spec.walks import other_names
-from spatial_replay.text import counted, encodable, first_lines
+from spatial_replay.text import encodable, first_lines, plural
 from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
             faults.append(f"{place}{_nothing(pattern.text, folder)}")
         logs_by_path.update((log.path, log) for log in logs if log.path not in logs_by_path)
         if len(logs_by_path) > _MOST_LOGS:
-            raise UsageError(f"{pattern.text}: more than {counted(_MOST_LOGS, 'log')}; split the batch")
+            raise UsageError(f"{pattern.text}: more than {plural(_MOST_LOGS, 'log')}; split the batch")
     if faults:
         raise UsageError("\n".join(first_lines(faults, _MOST_FAULTS)))
     return list(logs_by_path.values())
@@ -353,7 +353,7 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
                     faults.add(line)
             else:
                 if len(logs) < case.at_least_logs:
-                    place, count = case.place("at_least_logs"), counted(len(logs), "log")
+                    place, count = case.place("at_least_logs"), plural(len(logs), "log")
                     faults.add(
                         f"{place}{count}, and at_least_logs is {case.at_least_logs}; check the patterns"
                     )

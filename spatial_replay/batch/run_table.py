@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
 from spatial_replay.batch.suite import DOUBTFUL, UNTESTED
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, interval_text, listed, nearest_hint, requirement_text
+from spatial_replay.text import interval_text, listing, nearest_hint, plural, requirement_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -130,10 +130,10 @@ def summary_text(table: pa.Table) -> str:
         for name in VERDICTS
         if total[name]
     ]
-    parts += [counted(total["error"], "error")] if total["error"] else []
+    parts += [plural(total["error"], "error")] if total["error"] else []
     parts += [f"{total['gone']:,} gone"] if total["gone"] else []
     parts += [f"{damaged:,} of damaged logs"] if damaged else []
-    return f"{counted(len(table), 'result')}: {', '.join(parts) or 'none'}"
+    return f"{plural(len(table), 'result')}: {', '.join(parts) or 'none'}"
 
 
 def _count_text(text: str, total: int, passed: int) -> str:
@@ -331,7 +331,7 @@ def absent_values(table: pa.Table, condition: str) -> Iterator[str]:
         if any(text in str(value) for value in values):
             remedy = f"write '\"{text}\" in {name}' for a part of it"
         else:
-            remedy = nearest_hint(text, map(str, values)) or f"there are {listed(values, _MOST_VALUES)}"
+            remedy = nearest_hint(text, map(str, values)) or f"there are {listing(values, _MOST_VALUES)}"
         yield f"--where: no {name} is {text!r}; {remedy}"
 
 

@@ -31,7 +31,7 @@ from spatial_replay.errors import (
     TraceError,
     UsageError,
 )
-from spatial_replay.text import counted, nearest_hint
+from spatial_replay.text import nearest_hint, plural
 from spatial_replay.version import __version__
 
 COMPLETION_VARIABLE = "_SPATIAL_REPLAY_COMPLETE"
@@ -333,7 +333,7 @@ def message_from_error(error: BaseException) -> str:
         case click.ClickException():
             return error.format_message()
         case SpecificationError(diagnoses=[_, *_] as diagnoses):
-            return f"the specification has {counted(len(diagnoses), 'error')}, shown above"
+            return f"the specification has {plural(len(diagnoses), 'error')}, shown above"
         case SpatialReplayError():
             return str(error)
         case OSError(strerror=str(reason)):

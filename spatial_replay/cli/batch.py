@@ -34,7 +34,7 @@ from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
-from spatial_replay.text import counted, first_lines, json_value, without_numbers
+from spatial_replay.text import first_lines, json_value, plural, without_numbers
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
@@ -454,11 +454,11 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     # a log that is gone is on the page and in the summary, too
     gone = len(set(result.table["log"].to_pylist()) - set(evaluated.table["log"].to_pylist()))
     news = f"{news}, {gone:,} gone" if gone else news
-    show(f"{counted(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
+    show(f"{plural(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
     print_totals(result.table, "spec")
     cut = pc.sum(pc.equal(result.table["tested"], "cut")).as_py()
     if cut:
-        show(f"{counted(cut, 'result')} decided by a window that the end of the log cut: see --fail-on cut")
+        show(f"{plural(cut, 'result')} decided by a window that the end of the log cut: see --fail-on cut")
     failures = len(result.failures)
     if failures:
         summary = f"{failures:,} failed"

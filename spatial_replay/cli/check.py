@@ -44,7 +44,7 @@ from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.spec.walks import nodes_of
-from spatial_replay.text import Sentence, counted, counted_from, json_fields
+from spatial_replay.text import Sentence, counted_from, json_fields, plural
 from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
@@ -296,11 +296,11 @@ def _compare_with_log(
         *plausibility_warnings(specification, numbers, zero_ns),
         *evaluation.warnings(source, ends, zero_ns),
     )
-    counts = [counted(missing, "name") + " that it never has"] if missing else []
+    counts = [plural(missing, "name") + " that it never has"] if missing else []
     others = len(unknown) - missing + len(doubtful)
-    counts += [counted(others, "other warning" if missing else "warning")] if others else []
+    counts += [plural(others, "other warning" if missing else "warning")] if others else []
     summary = (
-        f"compared with {counted(numbers.samples, 'sample')} of {source.name} over {numbers.seconds:.3f} s: "
+        f"compared with {plural(numbers.samples, 'sample')} of {source.name} over {numbers.seconds:.3f} s: "
     )
     return _Compared(
         (*unknown, *doubtful),

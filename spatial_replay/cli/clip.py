@@ -23,7 +23,7 @@ from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
-from spatial_replay.text import counted, counted_from, time_text
+from spatial_replay.text import counted_from, plural, time_text
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def _summary(found: Clip) -> str:
         size += f"; the log itself, {found.source_bytes:,} bytes, is smaller than its schemas and annotations"
     elif found.source_bytes:
         size += f", {found.clip_bytes / found.source_bytes:.2%} of the log's {found.source_bytes:,}"
-    samples = f"{found.replayed.samples:,} of {counted(found.whole.samples, 'sample')}"
+    samples = f"{found.replayed.samples:,} of {plural(found.whole.samples, 'sample')}"
     return f"  {', '.join(found.kept)}: {samples}, {window} of the log; {size}"
 
 
@@ -148,7 +148,7 @@ def recover(log: LogFile, output: Path) -> int:
 
 def _lines(recovery: Recovery, output: Path) -> Iterator[str]:
     topics = sum(count > 0 for count in recovery.saved.values())
-    saved = f"{counted(recovery.messages, 'message')} on {counted(topics, 'topic')}"
+    saved = f"{plural(recovery.messages, 'message')} on {plural(topics, 'topic')}"
     if recovery.is_whole:
         yield f"{recovery.name}: nothing is missing; {output.name} holds {saved}"
         return
@@ -158,7 +158,7 @@ def _lines(recovery: Recovery, output: Path) -> Iterator[str]:
     counts = ((topic, missing + recovery.saved[topic]) for topic, missing in recovery.missing.items())
     yield from _entry_lines(
         "topic",
-        (f"{topic}: {recovery.missing[topic]:,} of {counted(all_, 'message')}" for topic, all_ in counts),
+        (f"{topic}: {recovery.missing[topic]:,} of {plural(all_, 'message')}" for topic, all_ in counts),
     )
 
 
@@ -277,8 +277,8 @@ def verify(
         differences += [f"{planned.name}: {difference}" for difference in recomputed.differences]
         if not recomputed.differences:
             show(
-                f"{planned.name}: {counted(recomputed.decisions, 'decision')} recomputed with "
-                f"{counted(recomputed.maps, 'map')}, all match"
+                f"{planned.name}: {plural(recomputed.decisions, 'decision')} recomputed with "
+                f"{plural(recomputed.maps, 'map')}, all match"
             )
     warn(*dict.fromkeys(faults))
     for difference in differences:

@@ -13,7 +13,7 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.output import align_rows
 from spatial_replay.cli.terminal import progress, show_result, warn
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.text import counted, json_fields, json_number, listed, printable, without_numbers
+from spatial_replay.text import json_fields, json_number, listing, plural, printable, without_numbers
 
 if TYPE_CHECKING:
     from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, EpisodeReading, Feature
@@ -83,7 +83,7 @@ def _episode_lines(
 ) -> Iterator[str]:
     episode = data_set.episode(number)
     length = f" in {_seconds(columns):.3f} s" if data_set.fps else ""
-    frames = counted(len(columns.times_ns), "frame")
+    frames = plural(len(columns.times_ns), "frame")
     yield f"{data_set.name}#{number}: {data_set.kind} episode, {frames}{length}"
     if episode.task:
         yield f"task     {printable(episode.task)}"
@@ -134,7 +134,7 @@ def _read_labels(data_set: DataSet) -> list[bool | None]:
                 labels.append(None)
             advance(1)
     for reason, *numbers in numbers_by_error.values():
-        warn(f"{reason} ({counted(len(numbers), 'episode')}: {listed(numbers, _MOST_NAMED)})")
+        warn(f"{reason} ({plural(len(numbers), 'episode')}: {listing(numbers, _MOST_NAMED)})")
     return labels
 
 
@@ -189,11 +189,11 @@ def _lines(
     from spatial_replay.mapping.suggest_features import mappable_features, places_text, why_poseless
 
     frames = [episode.frames for episode in data_set.episodes]
-    total = counted(sum(map(int, filter(None, frames))), "frame") if None not in frames else ""
+    total = plural(sum(map(int, filter(None, frames))), "frame") if None not in frames else ""
     rate = f"at {data_set.fps:g} Hz" if data_set.fps else ""
     facts = [
         data_set.kind,
-        counted(len(data_set.episodes), "episode"),
+        plural(len(data_set.episodes), "episode"),
         " ".join(filter(None, (total, rate))),
         f"robot {data_set.robot}" if data_set.robot else "",
     ]
@@ -233,7 +233,7 @@ def _labels_text(data_set: DataSet, labels: Sequence[bool | None]) -> str:
     about = "; it is about the state after each frame's action" if data_set.label.is_about_next else ""
     first = "the first " if len(labels) < len(data_set.episodes) else ""
     unlabelled = f" ({labels.count(None):,} without a label)" if None in labels else ""
-    count = f"true in {labels.count(True):,} of {first}{counted(len(labels), 'episode')}{unlabelled}"
+    count = f"true in {labels.count(True):,} of {first}{plural(len(labels), 'episode')}{unlabelled}"
     return f"{data_set.label.field}: {count}{about}"
 
 
@@ -246,7 +246,7 @@ def _label_text(data_set: DataSet, columns: EpisodeColumns) -> str:
     if columns.success is None or columns.success.ndim == 0 or not columns.label:
         return f"{field}: {str(columns.label).lower()}"
     first = int(columns.success.argmax())
-    return f"{field}: true in {counted(int(columns.success.sum()), 'frame')}, first in frame {first}"
+    return f"{field}: true in {plural(int(columns.success.sum()), 'frame')}, first in frame {first}"
 
 
 def _ranges(feature: Feature, columns: EpisodeColumns) -> Iterator[dict[str, Any]]:

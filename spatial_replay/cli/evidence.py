@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from spatial_replay.text import counted, counted_from, escaped, listed, number_text, time_text, with_unit
+from spatial_replay.text import counted_from, escape_text, listing, number_text, plural, time_text, with_unit
 
 if TYPE_CHECKING:
     from spatial_replay.sources.overview import Overview
@@ -22,10 +22,10 @@ def evidence_lines(overview: Overview) -> Iterator[str]:
     first_ns, unit = overview.start_ns or 0, overview.axes.units.get("", "")
     contradictions = {facts.topic: list(_contradictions(overview, facts.topic)) for facts in overview.facts}
     for facts in sorted(overview.facts, key=lambda facts: not contradictions[facts.topic]):
-        yield escaped(f"{facts.topic}: {_arrivals(facts, first_ns)}")
+        yield escape_text(f"{facts.topic}: {_arrivals(facts, first_ns)}")
         for label, text in (*contradictions[facts.topic], *_rows(facts, unit, first_ns)):
             if text:
-                yield escaped(f"  {label:<12}{text}")
+                yield escape_text(f"  {label:<12}{text}")
 
 
 def _contradictions(overview: Overview, topic: str) -> Iterator[tuple[str, str]]:
@@ -41,7 +41,7 @@ def _contradictions(overview: Overview, topic: str) -> Iterator[tuple[str, str]]
 
 
 def _arrivals(facts: TopicFacts, first_ns: int) -> str:
-    messages, period = counted(facts.messages, "message"), facts.period_s
+    messages, period = plural(facts.messages, "message"), facts.period_s
     if facts.first_ns is None or facts.last_ns is None or period is None:
         return messages
     span = f"from {time_text(facts.first_ns, first_ns)} to {time_text(facts.last_ns, first_ns)}"
@@ -55,16 +55,16 @@ def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, st
     """Yield a label and a text for each kind of facts; the text is "" where there are none."""
     if facts.lateness_s is not None:
         yield "lateness", f"{_range(facts.lateness_s, 's')} after the stamps"
-    yield "publishers", counted(facts.publishers, "channel") if facts.publishers > 1 else ""
-    yield "frames", listed([frame or "''" for frame in facts.frames])
-    yield "signals", listed(facts.signals)
+    yield "publishers", plural(facts.publishers, "channel") if facts.publishers > 1 else ""
+    yield "frames", listing([frame or "''" for frame in facts.frames])
+    yield "signals", listing(facts.signals)
     if not facts.objects:
         return
-    count = counted(len(facts.names), "name")
+    count = plural(len(facts.names), "name")
     pattern = f"`{facts.name}`, " if facts.name else ""
-    yield "names", f"{pattern}{count}, up to {facts.most_at_once} at once: {listed(facts.names)}"
-    changes = f"; {counted(facts.class_changes, 'change')} of class" if facts.class_changes else ""
-    yield "classes", listed([name or "none" for name in facts.classes]) + changes
+    yield "names", f"{pattern}{count}, up to {facts.most_at_once} at once: {listing(facts.names)}"
+    changes = f"; {plural(facts.class_changes, 'change')} of class" if facts.class_changes else ""
+    yield "classes", listing([name or "none" for name in facts.classes]) + changes
     if facts.size is not None and facts.shorter_side is not None:
         yield "sizes", f"longer side {_range(facts.size, unit)}; shorter {_range(facts.shorter_side, unit)}"
     spans = zip(_AXES, facts.low, facts.high, strict=False)

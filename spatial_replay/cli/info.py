@@ -20,7 +20,7 @@ from spatial_replay.cli.terminal import printing_to, progress, show, show_file, 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.verdict import counts_text
-from spatial_replay.text import counted, counted_from, json_fields, json_value, requirement_text
+from spatial_replay.text import counted_from, json_fields, json_value, plural, requirement_text
 from spatial_replay.trace.doubts import json_doubt
 
 if TYPE_CHECKING:
@@ -472,9 +472,9 @@ def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int
 def _lines(
     overview: Overview, survey: Survey | None, damaged: bool, about: Mapping[str, NamedSpec]
 ) -> Iterator[str]:
-    counts = counted(overview.samples, "sample")
+    counts = plural(overview.samples, "sample")
     if survey is not None and not overview.samples:
-        counts = counted(survey.messages, "message")
+        counts = plural(survey.messages, "message")
     yield f"{overview.name}: {overview.kind}, {counts}{', damaged' if damaged else ''}"
     start_ns, end_ns = overview.start_ns, overview.end_ns
     if survey is not None and start_ns is None:
@@ -493,7 +493,7 @@ def _lines(
             (
                 tracked.name,
                 ", ".join(tracked.classes),
-                counted(tracked.samples, "sample"),
+                plural(tracked.samples, "sample"),
                 f"{tracked.unreadable:,} unknown" if tracked.unreadable else "",
             )
             for tracked in overview.objects
@@ -513,7 +513,7 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
     if survey.topics:
         yield "topics"
         yield from align_rows(
-            (topic.topic.name, topic.topic.type, topic.topic.encoding, counted(topic.messages, "message"))
+            (topic.topic.name, topic.topic.type, topic.topic.encoding, plural(topic.messages, "message"))
             for topic in survey.topics
         )
     objects = [(f"{topic.topic.name}:", topic.entry) for topic in survey.topics if topic.entry]
@@ -547,8 +547,8 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
         yield from align_rows(
             (
                 *names,
-                counted(sum(counts), "message"),
-                counted(len(counts), "publisher") if len(counts) > 1 else "",
+                plural(sum(counts), "message"),
+                plural(len(counts), "publisher") if len(counts) > 1 else "",
             )
             for names, counts in _topics(container).items()
         )
@@ -562,7 +562,7 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     if container.attachments:
         yield "attachments"
         yield from align_rows(
-            (attachment.name, attachment.media_type, counted(attachment.size, "byte"))
+            (attachment.name, attachment.media_type, plural(attachment.size, "byte"))
             for attachment in container.attachments
         )
 

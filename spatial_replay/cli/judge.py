@@ -33,7 +33,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.verdict import Semantics
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.stages import Stages
@@ -268,6 +268,6 @@ def _exit_code(judgement: Judgement, at_least: float | None) -> ExitCode:
     is_enough = judgement.reaches(at_least)
     if is_enough is None:
         pending = judgement.agreement.undecided + judgement.agreement.unstored
-        warn(f"--at-least {at_least:g} depends on {counted(pending, 'undecided or unstored episode')}")
+        warn(f"--at-least {at_least:g} depends on {plural(pending, 'undecided or unstored episode')}")
         return ExitCode.UNKNOWN
     return ExitCode.SATISFIED if is_enough else ExitCode.VIOLATED

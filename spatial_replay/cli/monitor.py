@@ -29,7 +29,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.output import change_line, ending_lines
 from spatial_replay.cli.terminal import Line, StatusLine, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, time_text
+from spatial_replay.text import plural, time_text
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
@@ -249,7 +249,7 @@ def monitor(
         asyncio.run(run.follow())
     run.show_remarks()
     for clip in (clip for recorder in recorders for clip in recorder.clips):
-        lost = f"; {counted(clip.dropped, 'sample')} of its time dropped" if clip.dropped else ""
+        lost = f"; {plural(clip.dropped, 'sample')} of its time dropped" if clip.dropped else ""
         show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}{lost}")
     _show_losses(writers, session.status.dropped)
     if output is not None:
@@ -273,8 +273,8 @@ def _refuse_endless(files: Sequence[Specification]) -> None:
 def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
     """Say what logs, clips and viewers lack besides the samples that were not evaluated."""
     for writer in writers:
-        lost = [counted(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
-        lost += [counted(writer.messages_dropped, "message")] if writer.messages_dropped else []
+        lost = [plural(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
+        lost += [plural(writer.messages_dropped, "message")] if writer.messages_dropped else []
         if lost:
             show(f"{writer.name} fell behind and lacks {' and '.join(lost)}")
 
@@ -443,7 +443,7 @@ class _Run:
         if status.waits_for:
             return f"waiting for {', '.join(status.waits_for)}"
         if status.time_ns is None:
-            return f"connected, no sample yet ({counted(status.messages, 'message')})"
+            return f"connected, no sample yet ({plural(status.messages, 'message')})"
         parts = [time_text(status.time_ns, self.first_ns), f"{rate:.0f} samples/s"]
         parts.append(f"delay {status.delay_s * 1e3:.1f} ms")
         parts.append(f"dropped {status.dropped}")
@@ -491,9 +491,9 @@ class _Run:
         span = "no time" if status.time_ns is None else time_text(status.time_ns, self.first_ns)
         lost = ""
         if status.dropped or status.messages_dropped:
-            lost = f"; dropped {counted(status.dropped, 'sample')} and"
-            lost += f" {counted(status.messages_dropped, 'message')}: verdicts are over the others"
-        show(f"{counted(status.samples, 'sample')} over {span}{lost}")
+            lost = f"; dropped {plural(status.dropped, 'sample')} and"
+            lost += f" {plural(status.messages_dropped, 'message')}: verdicts are over the others"
+        show(f"{plural(status.samples, 'sample')} over {span}{lost}")
         show(*ending_lines(endings))
 
     def _print(self, line: Line) -> None:

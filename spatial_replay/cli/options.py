@@ -18,7 +18,7 @@ from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, is_address, local_copy, local_files, log_file
 from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, checked_kinds
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
@@ -591,7 +591,7 @@ def warn_of_input(result: Replayed | Recorded) -> None:
     warn(*result.faults, *result.remarks)
     show_diagnostics(replace(name, severity="warning") for name in result.missing)
     if result.unreadable:
-        count = counted(result.unreadable, "observation")
+        count = plural(result.unreadable, "observation")
         is_single = result.unreadable == 1
         if result.remarks:
             warn(f"{count} {'is' if is_single else 'are'} unknown: see above, or not finite")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from spatial_replay.cli.terminal import Coloured, Line, show, show_json
 from spatial_replay.monitor.verdict import counts_text
-from spatial_replay.text import counted, counted_from, escaped, requirement_text, time_text, with_unit
+from spatial_replay.text import counted_from, escape_text, plural, requirement_text, time_text, with_unit
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.monitor import Ending
@@ -41,10 +41,10 @@ def change_line(change: VerdictChange, first_ns: int) -> Line:
 
 def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
     """Yield a line for the result of each spec when a run ends."""
-    width = max((len(escaped(ending.spec.name)) for ending in endings), default=0)
+    width = max((len(escape_text(ending.spec.name)) for ending in endings), default=0)
     for ending in endings:
         verdict = Coloured(f"{ending.verdict:<9}", _CHANGE_COLOURS[str(ending.verdict)])
-        yield f"  {escaped(ending.spec.name):<{width}}  ", verdict, f"  {_ending_numbers(ending)}"
+        yield f"  {escape_text(ending.spec.name):<{width}}  ", verdict, f"  {_ending_numbers(ending)}"
         if ending.reason:
             yield f"  {'':<{width}}  {ending.reason}"
 
@@ -66,11 +66,11 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     verdicts = [result.verdict for result in replayed.results]
     counts = f": {counts_text(verdicts)}" if len(verdicts) > MANY else ""
     damaged += f"; {replayed.dropped.text}" if replayed.dropped.count else ""
-    show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
+    show(f"{replayed.log}: {plural(replayed.samples, 'sample')} over {span}{damaged}{counts}")
     results, others = worst_of(replayed.results)
     # escaped here, so that what is printed is as wide as what is measured
     titles = [
-        escaped(f"{result.title} [{result.spec.id}]" if result.spec.id else result.title)
+        escape_text(f"{result.title} [{result.spec.id}]" if result.spec.id else result.title)
         for result in results
     ]
     width = max(map(len, titles), default=0)
@@ -193,7 +193,7 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     if not len(failing):
         return f"{over} never violated; robustness at the end {at_end}"
     first = time_text(int(times_ns[failing[0]]), first_ns)
-    count = f"{len(failing):,} of {counted(len(values), 'sample')}"
+    count = f"{len(failing):,} of {plural(len(values), 'sample')}"
     return f"{over} violated at {count}, first at {first}; robustness at the end {at_end}"
 
 
@@ -204,7 +204,7 @@ def _number_text(number: float, unit: str = "") -> str:
 def align_rows(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
     """Yield rows as lines with aligned columns."""
     # escaped here, so that what is printed is as wide as what is measured
-    cells = [tuple(map(escaped, row)) for row in rows]
+    cells = [tuple(map(escape_text, row)) for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
         yield "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -33,7 +33,7 @@ from spatial_replay.cli.terminal import progress, show, show_json, terminal_widt
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.mapping.yaml_document import schema_of
-from spatial_replay.text import counted, counted_from
+from spatial_replay.text import counted_from, plural
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
@@ -279,8 +279,8 @@ def _plan(
             **simulation,
         )
     show(
-        f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
-        f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
+        f"wrote {output}: {plural(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
+        f"{plural(planned.steps, 'motion')}, {plural(planned.pruned, 'edge')} given up"
     )
     for note in filter(None, (planned.bounds, planned.yaws)):
         show(note)

@@ -31,7 +31,7 @@ from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import check_names
-from spatial_replay.text import counted, listed, nearest_hint
+from spatial_replay.text import listing, nearest_hint, plural
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ def video(
             durability=durability,
         )
     warn(*seen.remarks, *seen.faults)
-    show(f"wrote {output}: {counted(seen.samples, 'sample')} over {seen.seconds:.3f} s")
+    show(f"wrote {output}: {plural(seen.samples, 'sample')} over {seen.seconds:.3f} s")
     for name, fit in seen.fits:
         if fit is not None:
             number, off = fit.worst
@@ -436,8 +436,8 @@ def record(
             **simulation,
         )
     show(
-        f"wrote {output}: {counted(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
-        f"{counted(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
+        f"wrote {output}: {plural(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
+        f"{plural(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
     )
     show(f"the robot: {recorded.outcome}")
     show_film(simulation["cameras"])
@@ -493,7 +493,7 @@ def tracks(
     warn_of_input(recorded)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9
     show(
-        f"wrote {output}: {counted(recorded.samples, 'sample')} over {seconds:.3f} s of "
-        f"{counted(len(recorded.objects), 'object')}: {listed(recorded.objects)}"
+        f"wrote {output}: {plural(recorded.samples, 'sample')} over {seconds:.3f} s of "
+        f"{plural(len(recorded.objects), 'object')}: {listing(recorded.objects)}"
     )
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED

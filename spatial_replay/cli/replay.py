@@ -64,7 +64,7 @@ from spatial_replay.errors import (
 )
 from spatial_replay.logs.remote import local_copy
 from spatial_replay.monitor.verdict import counts_text
-from spatial_replay.text import counted, requirement_text, time_text
+from spatial_replay.text import plural, requirement_text, time_text
 from spatial_replay.trace.trace import duration_ns_from_text, time_point_from_text
 
 if TYPE_CHECKING:
@@ -553,7 +553,7 @@ def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> in
                 open_source(log), output, quantity=quantity, inputs=request.inputs, advance=advance
             )
     warn(*lost)
-    show(f"wrote {output}: {counted(rows, 'row')}, {counted(columns, 'node')}")
+    show(f"wrote {output}: {plural(rows, 'row')}, {plural(columns, 'node')}")
     return ExitCode.DAMAGED if faults or lost else ExitCode.SATISFIED
 
 

@@ -14,7 +14,7 @@ from spatial_replay.cli.options import LogPath, output_option
 from spatial_replay.cli.terminal import progress, show, show_file, warn
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.logs.remote import LogFile, local_files
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 if TYPE_CHECKING:
     from spatial_replay.perception.opencv import Frame
@@ -98,7 +98,7 @@ def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, outpu
     if output.suffix.lower() != ".pdf":
         raise UsageError(f"-o {output.name}: sheets are written as PDF; give a name that ends in .pdf")
     pages = TagSheet(family, ids, size, paper).write(output)
-    show(f"wrote {output}: {counted(len(ids), 'tag')} of {size * 1e3:g} mm on {counted(pages, 'page')}")
+    show(f"wrote {output}: {plural(len(ids), 'tag')} of {size * 1e3:g} mm on {plural(pages, 'page')}")
     return ExitCode.SATISFIED
 
 
@@ -170,7 +170,7 @@ def calibrate(
     fx, fy, *_ = result.calibration.deviations
     rms = result.calibration.rms
     show(
-        f"{counted(result.views, 'view')}, corners within {rms:.2f} pixels; focal lengths to"
+        f"{plural(result.views, 'view')}, corners within {rms:.2f} pixels; focal lengths to"
         f" {2 * fx:.1f} and {2 * fy:.1f} pixels",
         err=output is None,
     )

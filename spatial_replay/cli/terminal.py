@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import click
 
-from spatial_replay.text import escaped, without_repetition
+from spatial_replay.text import escape_text, without_repetition
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,7 +62,7 @@ def show(*lines: Line, err: bool = False) -> None:
     """
     for line in lines:
         pieces = (line,) if isinstance(line, (str, Coloured)) else line
-        whole = "".join(escaped(piece.text if isinstance(piece, Coloured) else piece) for piece in pieces)
+        whole = "".join(escape_text(piece.text if isinstance(piece, Coloured) else piece) for piece in pieces)
         first, *rest = [whole]
         if (sys.stderr if err else sys.stdout).isatty():
             first, *rest = _fit_lines(whole)
@@ -74,7 +74,7 @@ def _style(pieces: Iterable[str | Coloured], most: int) -> str:
     """Return the first characters of a line, in colours."""
     styled = ""
     for piece in pieces:
-        text = escaped(piece.text if isinstance(piece, Coloured) else piece)[:most]
+        text = escape_text(piece.text if isinstance(piece, Coloured) else piece)[:most]
         most -= len(text)
         colour = _HUES[piece.colour] if isinstance(piece, Coloured) else None
         styled += text if colour is None else click.style(text, fg=colour, bold=True)
@@ -91,7 +91,7 @@ class StatusLine:
         """Replace the line."""
         if sys.stderr.isatty():
             width = shutil.get_terminal_size().columns - 1
-            click.echo(f"\r\x1b[K{escaped(text)[:width]}", nl=False, err=True)
+            click.echo(f"\r\x1b[K{escape_text(text)[:width]}", nl=False, err=True)
             self._is_shown = True
 
     def clear(self) -> None:
@@ -161,7 +161,7 @@ def show_result(document: Callable[[], Any], lines: Callable[[], Iterable[Line]]
 def show_file(text: str) -> None:
     """Print the text of a file: as it is to a file or a pipe, escaped to a terminal."""
     if sys.stdout.isatty():
-        text = "\n".join(escaped(line, "\t") for line in text.splitlines()) + "\n"
+        text = "\n".join(escape_text(line, "\t") for line in text.splitlines()) + "\n"
     click.echo(text, nl=not text.endswith("\n"))
 
 

@@ -31,7 +31,7 @@ from spatial_replay.cli.terminal import (
 )
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, is_address, local_copy
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 if TYPE_CHECKING:
     from spatial_replay.logs.read_options import Reading
@@ -186,8 +186,8 @@ def _warn_of_doubts(runs: Sequence[LabelledRun]) -> None:
 
 def _lines(tuning: Tuning) -> Iterator[str]:
     count = {is_good: sum(run.is_good == is_good for run in tuning.runs) for is_good in (True, False)}
-    runs = counted(count[True], "good run") + (
-        f" and {counted(count[False], 'bad run')}" if count[False] else ""
+    runs = plural(count[True], "good run") + (
+        f" and {plural(count[False], 'bad run')}" if count[False] else ""
     )
     if tuning.conflict is not None:
         names = ", ".join(constant.name for constant in tuning.constants)
@@ -215,7 +215,7 @@ def _lines(tuning: Tuning) -> Iterator[str]:
         kind = "good" if run.is_good else "bad "
         yield f"  {run.name:<{width}}  {kind}  {run.verdict:<9}  robustness {run.robustness + 0.0:.6g}"
     if len(closest) > _MOST_LISTED:
-        yield f"  … and {counted(len(closest) - _MOST_LISTED, 'more run')}"
+        yield f"  … and {plural(len(closest) - _MOST_LISTED, 'more run')}"
 
 
 def _row(constant: TunedConstant) -> tuple[str, str, str, str]:

@@ -33,12 +33,12 @@ from spatial_replay.text import (
     TEXTS,
     Instant,
     Sentence,
-    counted,
     counted_from,
     json_fields,
     json_value,
-    listed,
+    listing,
     names_from_unit,
+    plural,
     with_unit,
 )
 from spatial_replay.trace.trace import Trace
@@ -367,8 +367,8 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     names = sorted(set(a.names) & set(b.names))
     if not names and (a.names or b.names):
         raise UsageError(
-            f"the runs have no object in common: A has {listed(a.names) or 'none'}; "
-            f"B has {listed(b.names) or 'none'}. "
+            f"the runs have no object in common: A has {listing(a.names) or 'none'}; "
+            f"B has {listing(b.names) or 'none'}. "
             "Map the same things to the same names"
         )
     require_same_units(a, b)
@@ -473,7 +473,7 @@ def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
         parts += [f", farthest by {farthest} at ", Instant(diff.greatest_ns, start_ns)]
     for which, count in (("A", diff.samples_only_in_a), ("B", diff.samples_only_in_b)):
         if count:
-            parts.append(f"; only {which} has it in {counted(count, 'sample')}")
+            parts.append(f"; only {which} has it in {plural(count, 'sample')}")
     return Sentence(*parts)
 
 
@@ -769,17 +769,17 @@ class LogDiff(Printed, Displayed):
         """Yield the diff as text, as the command `diff` prints it."""
         yield f"A {self.a} | B {self.b}"
         if self.is_empty:
-            yield f"  the same {counted(self.samples[0], 'sample')}"
+            yield f"  the same {plural(self.samples[0], 'sample')}"
             return
         paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
-        counts = " | ".join(counted(count, "sample") for count in self.samples)
+        counts = " | ".join(plural(count, "sample") for count in self.samples)
         yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
         yield from (f"  {sentence}" for sentence in self.movements[:_MOST_LISTED])
         if len(self.objects) > _MOST_LISTED:
-            yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
+            yield f"  and {plural(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
         yield from (f"  {sentence}" for sentence in self.signal_changes[:_MOST_LISTED])
         if len(self.signals) > _MOST_LISTED:
-            yield f"  and {counted(len(self.signals) - _MOST_LISTED, 'other signal')} with other values"
+            yield f"  and {plural(len(self.signals) - _MOST_LISTED, 'other signal')} with other values"
         for which, names in (("A", self.only_a), ("B", self.only_b)):
             if names:
                 yield f"  only in {which}: {', '.join(names[:_MOST_LISTED])}"

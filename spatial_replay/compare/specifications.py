@@ -38,11 +38,11 @@ from spatial_replay.spec.resolve import MAX_SIZE
 from spatial_replay.text import (
     Instant,
     Sentence,
-    counted,
     counted_from,
     interval_text,
     json_fields,
     json_value,
+    plural,
     with_unit,
 )
 from spatial_replay.trace.trace import Trace
@@ -246,7 +246,7 @@ class SpecDiff(Displayed):
             yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
         for edit, alone in zip(self.cause, self.alone, strict=True):
             more = max(len(edit.old_nodes), len(edit.new_nodes)) - 1
-            elsewhere = f" (and {counted(more, 'more node')})" if more else ""
+            elsewhere = f" (and {plural(more, 'more node')})" if more else ""
             yield Sentence(f"because: {edit}, in `{edit.spec}`{elsewhere}")
             yield from self._lines_of(edit, shown)
             if alone is not None:
@@ -263,7 +263,7 @@ class SpecDiff(Displayed):
             if edit.kind != "renamed":
                 yield from self._lines_of(edit, shown)
         if len(others) > _MOST_LISTED:
-            yield Sentence(f"and {counted(len(others) - _MOST_LISTED, 'other edit')}")
+            yield Sentence(f"and {plural(len(others) - _MOST_LISTED, 'other edit')}")
 
     def _together(self) -> str:
         """Say how the edits of a cause bring it about, if there are several."""
@@ -383,7 +383,7 @@ class SpecificationDiff(Printed, Displayed):
 
     def lines(self) -> Iterator[str]:
         """Yield the diff as text, as the command `diff` prints it."""
-        yield f"{self.log}: {counted(self.samples, 'sample')}; {self.old.filename} → {self.new.filename}"
+        yield f"{self.log}: {plural(self.samples, 'sample')}; {self.old.filename} → {self.new.filename}"
         same = 0
         printed_changes: set[DeclarationChange] = set()
         for spec in self.specs:
@@ -398,7 +398,7 @@ class SpecificationDiff(Printed, Displayed):
             for name in names:
                 yield f"  {name}: only in {where.filename}"
         if same:
-            yield f"  {counted(same, 'other spec') if same < len(self.specs) else 'all'} the same"
+            yield f"  {plural(same, 'other spec') if same < len(self.specs) else 'all'} the same"
 
     @property
     def document(self) -> dict[str, Any]:

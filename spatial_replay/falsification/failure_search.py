@@ -46,7 +46,7 @@ from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.walks import declared_unit
-from spatial_replay.text import counted, json_fields, json_number, json_value, named_arguments, with_unit
+from spatial_replay.text import json_fields, json_number, json_value, named_arguments, plural, with_unit
 from spatial_replay.trace.trace import Sample
 from spatial_replay.version import __version__
 
@@ -226,7 +226,7 @@ class Falsification(Printed):
             yield "  the search ended with it: what fails without any variation needs no search"
         unknown = sum(run.verdict == "unknown" for run in self.runs)
         doubt = f", {unknown:,} unknown" if unknown else ""
-        runs = counted(len(self.runs), "run")
+        runs = plural(len(self.runs), "run")
         if self.failures:
             yield f"{runs} of {self.name}: {len(self.failures):,} violated{doubt}; the worst first:"
             for failure in self.failures[:_MOST_FAILURES]:
@@ -248,9 +248,9 @@ class Falsification(Printed):
             yield "covered, with the runs in each tenth of a range:"
             yield from _table(self.coverage)
         if self.impossible:
-            yield f"  {counted(self.impossible, 'case')} left out, in which objects would lie in each other"
+            yield f"  {plural(self.impossible, 'case')} left out, in which objects would lie in each other"
         if self.simulations:
-            yield f"{counted(self.simulations, 'more run')} made the failures smaller"
+            yield f"{plural(self.simulations, 'more run')} made the failures smaller"
         worst = min(self.failures, key=lambda failure: failure.smaller.robustness, default=None)
         if worst is not None and worst.command is not None:
             less = " with less" if worst.is_smaller else ""

@@ -36,7 +36,7 @@ from spatial_replay.logs.remote import is_address
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.sources.open_log import LOG_ENDINGS
 from spatial_replay.spec.format import format_formula
-from spatial_replay.text import json_value, listed, nearest_hint, printable, with_unit
+from spatial_replay.text import json_value, listing, nearest_hint, printable, with_unit
 
 if TYPE_CHECKING:
     import pandas
@@ -486,10 +486,10 @@ def _judging_spec(case: PreparedCase, result: str | None, first: int) -> _Spec:
         return matches[0]
     if matches:
         raise UsageError(
-            f"--result {result}: {listed([spec.file for spec in matches])} have it; give one --spec"
+            f"--result {result}: {listing([spec.file for spec in matches])} have it; give one --spec"
         )
     names = [spec.name for spec in specs]
-    hint = nearest_hint(result, names) or f"results are {listed(names)}"
+    hint = nearest_hint(result, names) or f"results are {listing(names)}"
     if any(result == spec.name for file in files[first:] for spec in file.specs):
         hint = f"other specs use it, so it has no result; add `spec judged = {result}`"
     raise UsageError(f"--result {result}: no result has this name; {hint}")

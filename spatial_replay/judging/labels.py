@@ -15,7 +15,7 @@ from spatial_replay.logs.formats.datasets import DATA_SET_ENDINGS, data_set_addr
 from spatial_replay.logs.formats.episodes import AS_STORED, DataSet, EpisodeReading
 from spatial_replay.logs.remote import is_address
 from spatial_replay.sources.open_log import LOG_ENDINGS
-from spatial_replay.text import counted, first_lines, listed, nearest_hint
+from spatial_replay.text import first_lines, listing, nearest_hint, plural
 
 LABEL_FILES: Final = ("labels.json", "labels.csv")
 """Names of label files that are found next to logs."""
@@ -174,7 +174,7 @@ def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 def _success(entry: Mapping[str, Any]) -> bool | None:
     if "success" not in entry:
-        raise UsageError(f"it has no 'success'; it has {listed([str(key) for key in entry]) or 'nothing'}")
+        raise UsageError(f"it has no 'success'; it has {listing([str(key) for key in entry]) or 'nothing'}")
     word = str(entry["success"]).strip().lower()
     if word not in _TRUTHS:
         raise UsageError(f"success is {word!r:.60}; write true or false")
@@ -192,7 +192,7 @@ def _entry_path(
     # next to the label file first: other folders may have logs of that name
     paths = paths_by_name.get(_stem(str(file.parent / name))) or paths_by_name.get(_stem(name)) or []
     if len(paths) > 1:
-        raise UsageError(f"{name!r:.100} names {counted(len(paths), 'log')}; write more of the path")
+        raise UsageError(f"{name!r:.100} names {plural(len(paths), 'log')}; write more of the path")
     if paths:
         neighbour, path = file.parent / name, Path(paths[0])
         is_like = neighbour.name == path.name and neighbour.is_file() and path.is_file()

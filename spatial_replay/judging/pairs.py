@@ -18,7 +18,7 @@ from spatial_replay.judging.judgement import Comparison, JudgedEpisode, Judgemen
 from spatial_replay.judging.statistics import (
     EVIDENCE,
 )
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 SAME_START: Final = 0.001
 """Distance of first places that counts as none, in units of length."""
@@ -116,10 +116,10 @@ def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Yield how many pairs there are, which side is better, and how sure that is."""
     pairs, won, lost = len(comparison.pairs), comparison.won, comparison.lost
-    parts = [f"{counted(pairs, 'pair')} with the same start"]
+    parts = [f"{plural(pairs, 'pair')} with the same start"]
     parts += [f"{comparison.elsewhere:,} with another start"] if comparison.elsewhere else []
     parts += [f"{comparison.undecided:,} undecided"] if comparison.undecided else []
-    parts += [f"{counted(comparison.alone, 'episode')} without a partner"] if comparison.alone else []
+    parts += [f"{plural(comparison.alone, 'episode')} without a partner"] if comparison.alone else []
     yield f"against {comparison.old.name}: {', '.join(parts)}"
     if not pairs:
         return

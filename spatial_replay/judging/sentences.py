@@ -8,7 +8,7 @@ from typing import Final
 
 from spatial_replay.judging.judgement import JudgedEpisode, Judgement, Kind
 from spatial_replay.judging.statistics import Rate
-from spatial_replay.text import counted, first_lines, listed
+from spatial_replay.text import first_lines, listing, plural
 
 _TITLES: Final[dict[Kind, str]] = {
     "only_theirs": "only the label counts",
@@ -23,7 +23,7 @@ _MOST_IN_LINE: Final = 5
 
 def summary_lines(judgement: Judgement) -> Iterator[str]:
     """Yield what was judged, the rates of verdicts and labels, and how many agree."""
-    count = counted(len(judgement.rows), "episode")
+    count = plural(len(judgement.rows), "episode")
     yield f"{judgement.name}: {count} judged by `{judgement.result}`, `{judgement.formula}`"
     agreement = judgement.agreement
     rates = [*_rates("ours", judgement)]
@@ -78,7 +78,7 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
             for row in rows:
                 # what keeps an episode from being read often keeps all
                 lines[_reason(row), "" if kind == "undecided" else row.episode].append(row.episode)
-            names = [listed(episodes, _MOST_IN_LINE) for episodes in lines.values()]
+            names = [listing(episodes, _MOST_IN_LINE) for episodes in lines.values()]
             width = max(map(len, names[:_MOST]))
             pairs = [f"  {name:<{width}}  {line}" for name, (line, _) in zip(names, lines, strict=True)]
             yield from first_lines(pairs, _MOST)
@@ -87,11 +87,11 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
 def failure_lines(judgement: Judgement) -> Iterator[str]:
     """Yield how many episodes failed by which failure, and the first of them."""
     failed = sum(map(len, judgement.failures.values()))
-    yield f"first failures of the {counted(failed, 'episode')} that fail `{judgement.result}`"
+    yield f"first failures of the {plural(failed, 'episode')} that fail `{judgement.result}`"
     names = {name: name or "another failure" for name in judgement.failures}
     width = max(map(len, names.values()), default=0)
     for name, rows in judgement.failures.items():
-        episodes = listed([row.episode for row in rows], _MOST_IN_LINE)
+        episodes = listing([row.episode for row in rows], _MOST_IN_LINE)
         yield f"  {names[name]:<{width}}  {len(rows):>{len(str(failed))},}  {episodes}"
 
 

@@ -52,7 +52,7 @@ from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
-from spatial_replay.text import counted, counted_from
+from spatial_replay.text import counted_from, plural
 from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
@@ -680,7 +680,7 @@ class LiveSession:
         self._last_s = dict.fromkeys(self._assembler.topics, now_s)
         self._notes.append(
             f"connected to {self._address}{f' ({self._server})' if self._server else ''}:"
-            f" {counted(len(self._planned), 'topic')}"
+            f" {plural(len(self._planned), 'topic')}"
         )
         if (sampled := self._sampled_by_default()) is not None:
             self._notes.append(

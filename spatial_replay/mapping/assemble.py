@@ -36,7 +36,7 @@ from spatial_replay.mapping.reading_plan import PlannedTopic, ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart
+from spatial_replay.text import Instant, Sentence, nearest_hint, plural, times_apart
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
@@ -272,7 +272,7 @@ class _Assembling:
         if number > len(channels):
             raise UsageError(
                 f"{self._plan.mapping.name}: topics.{planned.name}.publisher: there is no publisher {number};"
-                f" the topic has {counted(len(channels), 'channel')}"
+                f" the topic has {plural(len(channels), 'channel')}"
             )
         of_publisher: Integers = places[arrived.channel[places] == channels[number - 1]]
         return of_publisher
@@ -697,7 +697,7 @@ class _Silences:
         if end_ns is not None:
             start = () if start_ns == self._unread_ns else ("from ", Instant(start_ns, 0), " ")
             until = "until " if start_ns == self._unread_ns else "to "
-            between = f" and in {counted(more, 'more pause')}" if more else ""
+            between = f" and in {plural(more, 'more pause')}" if more else ""
             then = f"; those between{between} are at {others}"
             yield Sentence(f"{subject}pauses ", *start, until, Instant(end_ns, 0), then)
         if is_open and self._last_pause_ns == self._unread_ns:

@@ -18,7 +18,7 @@ import numpy as np
 from spatial_replay.mapping.binding import BY_PLACE
 from spatial_replay.mapping.evidence import FAR_LEAP, Moment, TopicEvidence
 from spatial_replay.mapping.mapping_file import UNITS_NS, LogMapping
-from spatial_replay.text import Instant, Sentence, counted, number_text
+from spatial_replay.text import Instant, Sentence, number_text, plural
 from spatial_replay.trace.doubts import MANY_TURNS, SHORTEST_PERIOD_NS, Doubt
 
 Log: TypeAlias = Mapping[str, TopicEvidence]
@@ -68,7 +68,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
         is_accepted = assumption.name in mapping.accept
         uncontradicted.pop(assumption.name, None)
         for topics in _group_topics(clauses):
-            others = f" (and so in {counted(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
+            others = f" (and so in {plural(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
             if len({clauses[topic] for topic in topics}) == 1:
                 others = ""
             subjects = topics[:1] if others else topics[:_MOST_NAMED]
@@ -231,7 +231,7 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     other_order = "xyzw" if layout.order == "wxyz" else "wxyz"
     return (
-        f"{upright:,} of {counted(count, 'object')} stand upright if the order of the four numbers is"
+        f"{upright:,} of {plural(count, 'object')} stand upright if the order of the four numbers is"
         f" {layout.order}, and {other_upright:,} if it is {other_order}"
     )
 
@@ -439,7 +439,7 @@ def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
     zeros, count = evidence.zero_covariances, evidence.covariances
     if not zeros or zeros < count / 2:
         return None
-    return f"{zeros:,} of {counted(count, 'covariance')} are zeros, which means unknown, and count as exact"
+    return f"{zeros:,} of {plural(count, 'covariance')} are zeros, which means unknown, and count as exact"
 
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
@@ -472,7 +472,7 @@ def _there_and_back(moment: Moment, returns: int, chances: int, like: str) -> Se
     return Sentence(
         f"{moment.name} leaps by {number_text(moment.amount)} at ",
         Instant(moment.time_ns, 0),
-        f" and back, and so in {returns:,} of {counted(chances, 'report')}, as {like}",
+        f" and back, and so in {returns:,} of {plural(chances, 'report')}, as {like}",
     )
 
 
@@ -481,7 +481,7 @@ def _complete_list(evidence: TopicEvidence, log: Log) -> str | None:
     if layout is None or not layout.complete:
         return None
     if evidence.reader.extractor is not None and evidence.reader.extractor.differences:
-        count = counted(evidence.reader.extractor.differences, "message")
+        count = plural(evidence.reader.extractor.differences, "message")
         return f"{count} have `is_diff`: lists of changes, and objects that they leave out are still there"
     usual = int(gaps[:-1].argmax())
     if usual < 2 or gaps[usual] < max(2 * _FEW, _REGULAR * gaps.sum()):
@@ -533,7 +533,7 @@ def _extent(evidence: TopicEvidence, log: Log) -> str | None:
     layout = evidence.planned.layout
     if layout is None or not evidence.pointlike or not (layout.sizes or layout.solids or layout.shape):
         return None
-    outlines = counted(evidence.objects, "outline")
+    outlines = plural(evidence.objects, "outline")
     return f"{evidence.pointlike:,} of {outlines} have no extent: a size or scale is 0"
 
 
@@ -596,7 +596,7 @@ def _cornerless(evidence: TopicEvidence, log: Log) -> str | None:
     is_bounds = extractor.layout.is_bounds
     count = "other than two corners" if is_bounds else "fewer than three corners"
     hint = "" if is_bounds else "; `bounds` reads two opposite corners of a box"
-    outlines = counted(extractor.cornerless, "outline")
+    outlines = plural(extractor.cornerless, "outline")
     return f"{outlines} with {count}: objects are unknown there{hint}"
 
 
@@ -604,7 +604,7 @@ def _unset(evidence: TopicEvidence, log: Log) -> str | None:
     extractor = evidence.reader.extractor
     if extractor is None or not extractor.unset:
         return None
-    counts = (f"{counted(count, 'object')} did not set {path}" for path, count in extractor.unset.items())
+    counts = (f"{plural(count, 'object')} did not set {path}" for path, count in extractor.unset.items())
     return f"{', '.join(counts)}, so it is unknown there"
 
 
@@ -613,7 +613,7 @@ def _zero_quaternions(evidence: TopicEvidence, log: Log) -> str | None:
     if extractor is None or not 0 < extractor.unturned < extractor.turned:
         return None
     return (
-        f"{extractor.unturned:,} of {counted(extractor.turned, 'pose')} have a quaternion of zeros, as"
+        f"{extractor.unturned:,} of {plural(extractor.turned, 'pose')} have a quaternion of zeros, as"
         " trackers send for what they have lost; they count as poses without a turn"
     )
 
@@ -630,7 +630,7 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
     if jump is None or motions.speed.count < _FEW_LEAPS or not evidence.size.greatest > 0:
         return None
     if motions.zeros >= _FEW:
-        times = counted(motions.zeros, "time")
+        times = plural(motions.zeros, "time")
         return f"its objects leap to (0, 0) {times}, as where that stands for not available"
     far = FAR_LEAP * evidence.size.greatest
     if comeback is not None and comeback.amount > max(far, _FARTHER * usual * motions.comeback_s):

@@ -33,7 +33,7 @@ from spatial_replay.mapping.feature_reader import (
 from spatial_replay.mapping.mapping_file import LogMapping
 from spatial_replay.mapping.tracker import ObservationRows, rows_from_detections
 from spatial_replay.mapping.transforms import matrices_from_quaternions
-from spatial_replay.text import Instant, Sentence, encodable, listed
+from spatial_replay.text import Instant, Sentence, encodable, listing
 from spatial_replay.trace.trace import Trace, class_order, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -140,7 +140,7 @@ class EpisodeSource(Source):
         shapes = {} if self.mapped_by is None else self.mapped_by.shapes
         names = [body.name for body in columns.bodies if body.shapes is None and body.name not in shapes]
         if names:
-            subject = f"{listed(names)} {'is a point' if len(names) == 1 else 'are points'}"
+            subject = f"{listing(names)} {'is a point' if len(names) == 1 else 'are points'}"
             yield (
                 f"{subject} without a shape in the data; give it by `shapes: {{{names[0]}: …}}`, or"
                 " the meshes of a model by `assets:`"
@@ -205,7 +205,7 @@ class EpisodeSource(Source):
         if not names and not signals:
             names_of_features = [feature.name for feature in self.data_set.features if feature.width]
             remedy = (
-                f"name its `features`: {listed(names_of_features)}"
+                f"name its `features`: {listing(names_of_features)}"
                 if names_of_features
                 else "it has no numbers"
             )

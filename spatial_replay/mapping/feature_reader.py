@@ -29,7 +29,7 @@ from spatial_replay.mapping.detections import (
 from spatial_replay.mapping.mapping_file import LogMapping, Measure, ShapeMapping, SignalMapping, TopicMapping
 from spatial_replay.mapping.message_types import MessageLayout, layout_of_topic
 from spatial_replay.mapping.topic_reader import with_single_precision
-from spatial_replay.text import counted, listed, nearest_hint, number_text
+from spatial_replay.text import listing, nearest_hint, number_text, plural
 
 _SLICE: Final = re.compile(r"(.*)\[(?:(-?\d{1,9})|(-?\d{1,9})?:(-?\d{1,9})?)\]", re.DOTALL)
 _NAME_ENDS: Final = re.compile(r"[./]")
@@ -93,7 +93,7 @@ class BoundObject:
         frame = int(is_off.argmax())
         widest = int(np.fmax.reduce(np.abs(quaternions[is_off]), axis=0).argmax())
         least, greatest = np.fmin.reduce(quaternions[:, widest]), np.fmax.reduce(quaternions[:, widest])
-        names = listed([place.name for place in self.quaternion])
+        names = listing([place.name for place in self.quaternion])
         raise UsageError(
             f"{mapping_name}: {self.key}.orientation: {names} have the length"
             f" {number_text(float(length[frame]))} in frame {frame} of {episode}, so they are no quaternion"
@@ -158,7 +158,7 @@ def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
         try:
             if feature is None:
                 names = [feature.name for feature in data_set.features]
-                hint = nearest_hint(entry.topic, names) or f"its features are {listed(names)}"
+                hint = nearest_hint(entry.topic, names) or f"its features are {listing(names)}"
                 raise UsageError(f"{key}: {data_set.name} has no such feature; {hint}")
             places = _Places(data_set, feature, key)
             for signal in entry.signals:
@@ -343,7 +343,7 @@ class _Places:
         if len(places) not in counts:
             needed = f"{' or '.join(map(str, counts))} {'is' if counts == (1,) else 'are'} needed"
             raise UsageError(
-                f"{self.key}.{key}: {listed(list(parts))} has {counted(len(places), 'number')}, and {needed};"
+                f"{self.key}.{key}: {listing(list(parts))} has {plural(len(places), 'number')}, and {needed};"
                 f" write {self._example(counts[-1])}"
             )
         return places
@@ -380,7 +380,7 @@ class _Places:
         index = int(numbered[2])
         if not -source.width <= index < source.width:
             raise UsageError(
-                f"{self.key}.{key}: {source.name} has {counted(source.width, 'number')}, so there is no"
+                f"{self.key}.{key}: {source.name} has {plural(source.width, 'number')}, so there is no"
                 f" {text}; write [0] to [{source.width - 1}]"
             )
         yield _place(source, index % source.width)
@@ -391,7 +391,7 @@ class _Places:
         if hint := nearest_hint(text, names):
             return hint
         if places:
-            return f"its places are {listed(list(places))}"
+            return f"its places are {listing(list(places))}"
         return f"its {width} numbers have no names; write [0] to [{width - 1}]"
 
 

@@ -27,7 +27,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 from spatial_replay.errors import UsageError
-from spatial_replay.text import listed, nearest_hint
+from spatial_replay.text import listing, nearest_hint
 
 Style: TypeAlias = Literal["attributes", "keys"]
 
@@ -387,7 +387,7 @@ def _field_at(path: FieldPath, value: object, name: str) -> object:
         raise FieldError(
             f"{path.text}: {type_name(value)} has no field {name!r}"
             + (f"; {hint}" if hint else "")
-            + (f"; its fields are {listed(names, 20)}" if names else "")
+            + (f"; its fields are {listing(names, 20)}" if names else "")
         )
     return get_field(value, name)
 

@@ -31,7 +31,7 @@ from spatial_replay.mapping.message_types import (
     short_type,
 )
 from spatial_replay.mapping.transforms import HISTORY_NS
-from spatial_replay.text import counted, nearest_hint
+from spatial_replay.text import nearest_hint, plural
 from spatial_replay.trace.trace import LONG_PAUSE
 
 _LONGEST_SILENCE_NS: Final = 10 * 10**9
@@ -288,7 +288,7 @@ def _slow_sampling(
     count = None if sampled is None else by_name[sampled].count
     if count is None or most.count is None or most.count < _MANY_TIMES * max(count, 1):
         return ()
-    messages = counted(count, "message")
+    messages = plural(count, "message")
     return (
         f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
         f" `sample: {{topic: {most.name}}}` takes one at each of these",

@@ -61,7 +61,7 @@ from spatial_replay.mapping.trial import (
     yaml_text,
 )
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 from spatial_replay.trace.trace import FOREVER
 
 EXAMPLES = 20
@@ -237,7 +237,7 @@ def suggest_mapping(
     if unused_that_fit:
         lines += ["", "  # not used:", *dict(unused_that_fit).values()]
     if len(unused_that_fit) < len(unused):
-        lines.append(f"  # … and {counted(len(unused) - len(unused_that_fit), 'topic')} more")
+        lines.append(f"  # … and {plural(len(unused) - len(unused_that_fit), 'topic')} more")
     return "\n".join(lines) + "\n"
 
 
@@ -760,7 +760,7 @@ def _unused_line(suggestion: TopicSuggestion, axes: _Axes) -> str:
 
 def _description(topic: Topic) -> str:
     kind = _comment(topic.type) or "type unknown"
-    return kind if topic.count is None else f"{kind}, {counted(topic.count, 'message')}"
+    return kind if topic.count is None else f"{kind}, {plural(topic.count, 'message')}"
 
 
 def _comment(text: str) -> str:

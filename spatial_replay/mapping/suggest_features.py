@@ -15,7 +15,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.formats.episodes import AS_STORED, Body, DataSet, Feature, quaternion_order
 from spatial_replay.mapping.trial import yaml_text
-from spatial_replay.text import counted, listed, printable
+from spatial_replay.text import listing, plural, printable
 
 _NO_OBJECTS: Final = re.compile(
     r"(.*[./])?(actions?\b.*|rewards?|timestamps?|time|truncat\w*|terminat\w*|is_success|success|done)"
@@ -102,8 +102,8 @@ def why_poseless(data_set: DataSet) -> str:
     pictures = [feature.name for feature in data_set.features if "image" in feature.name]
     content = "; ".join(
         [
-            *([f"the joints of the robot ({listed(names)})"] if names else []),
-            *([f"pictures ({listed(pictures)})"] if pictures else []),
+            *([f"the joints of the robot ({listing(names)})"] if names else []),
+            *([f"pictures ({listing(pictures)})"] if pictures else []),
         ]
     )
     return (
@@ -149,7 +149,7 @@ def suggest_feature_mapping(data_set: DataSet) -> str:
 
 def places_text(feature: Feature) -> str:
     """Return the names of a feature's places, or how many numbers it has."""
-    return " ".join(feature.places) or f"{counted(feature.width, 'number')} without names"
+    return " ".join(feature.places) or f"{plural(feature.width, 'number')} without names"
 
 
 def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) -> list[Suggestion]:

@@ -27,7 +27,7 @@ from spatial_replay.mapping.message_types import name_pattern, possible_classes
 from spatial_replay.mapping.reading_plan import PlannedTopic, ReadingPlan
 from spatial_replay.mapping.topic_reader import ReportFault, TopicReader, unit_of_stamp
 from spatial_replay.mapping.transforms import FrameTree, Transforms
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, plural
 from spatial_replay.trace.observations import Observations, check_observations
 from spatial_replay.trace.spans import TopicSpan
 from spatial_replay.trace.trace import ABSENT, LONG_PAUSE, Pauses, Trace, class_order, renumber_rows
@@ -895,7 +895,7 @@ class Remarks:
             most = max(count for _, count, _ in stale)
             first_ns = min(first for _, _, first in stale)
             yield Sentence(
-                f"{topic}: {names}{more} {are} unknown in up to {counted(most, 'sample')}, the first at ",
+                f"{topic}: {names}{more} {are} unknown in up to {plural(most, 'sample')}, the first at ",
                 Instant(first_ns, 0),
                 f": {reason}",
             )

@@ -29,7 +29,7 @@ from spatial_replay.mapping.field_paths import (
     leads_somewhere,
     tuple_getter,
 )
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, plural
 from spatial_replay.trace.trace import LATEST_NS
 
 _LEAST_NORM = 1e-6
@@ -562,7 +562,7 @@ class FrameTree:
         if self._steps:
             name, (count, old, new) = min(self._steps.items(), key=lambda step: step[1][2].clock_ns)
             others = len(self._steps) - 1
-            of = f"{name!r} and {counted(others, 'other frame')}" if others else repr(name)
+            of = f"{name!r} and {plural(others, 'other frame')}" if others else repr(name)
             rule = (
                 "they are sorted by stamp, as if of two senders; if a clock was set back, cut the log there"
             )

@@ -16,7 +16,7 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.spec.checks import group_classes, object_names, signal_names
 from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import ANY_CLASS, Specification
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, plural
 from spatial_replay.trace.spans import TopicSpan
 from spatial_replay.trace.trace import FOREVER, Trace, within
 
@@ -232,7 +232,7 @@ class RunEnds:
 
     def _remark(self, which: str, left_out: Integers, reason: Iterable[str | Instant]) -> None:
         first, last = (Instant(int(at), 0) for at in left_out[[0, -1]])
-        count = counted(len(left_out), "sample")
+        count = plural(len(left_out), "sample")
         verb = "is" if len(left_out) == 1 else "are"
         times = ("at ", first) if len(left_out) == 1 else ("from ", first, " to ", last)
         sentence = Sentence(f"{count} at the {which} {verb} left out, ", *times, ": ", *reason)

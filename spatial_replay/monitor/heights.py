@@ -15,7 +15,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.plausibility import bound_nodes, over_bindings
 from spatial_replay.spec.formula import Atom, Outline, Quantified, SignedDistance, Specification
 from spatial_replay.spec.walks import iter_expressions, looks_back, terms_of
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, plural
 from spatial_replay.trace.trace import Trace
 
 _MOST_SAMPLES: Final = 64
@@ -83,7 +83,7 @@ class HeightComparisons:
         for comparison in (comparison for _, comparisons in self._comparisons for comparison in comparisons):
             if comparison.count:
                 holds, not_so = ("holds", "does not") if comparison.holds else ("fails", "holds")
-                share = f"in {comparison.count:,} of {counted(comparison.compared, 'sample')} looked at"
+                share = f"in {comparison.count:,} of {plural(comparison.compared, 'sample')} looked at"
                 yield Sentence(
                     f"`{comparison.atom.text}` {holds} at ",
                     Instant(comparison.first_ns, 0),

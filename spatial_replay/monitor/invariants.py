@@ -28,7 +28,7 @@ from spatial_replay.monitor.witness.path import (
 )
 from spatial_replay.monitor.witness.witness import atom_of_path, find_missed_response
 from spatial_replay.spec.formula import Temporal, operands_of, operator_of
-from spatial_replay.text import Instant, Sentence, counted, number_text
+from spatial_replay.text import Instant, Sentence, number_text, plural
 
 LISTED: Final = 5
 """Intervals that an explanation lists."""
@@ -234,7 +234,7 @@ def invariant_sentences(
         if interval.samples > 1:
             yield Sentence("It is violated ", *_span(interval, first_ns), ".")
         return
-    often = counted(len(intervals), "interval")
+    often = plural(len(intervals), "interval")
     if invariant.condition is not None:
         entries_text = f"{missed:,} of {entries:,} entries of `{invariant.condition}`"
         often = entries_text if missed == len(intervals) else f"{often}, in {entries_text}"

@@ -51,7 +51,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit, iter_expressions
-from spatial_replay.text import Instant, Sentence, counted, named_arguments, time_text, times_apart, with_unit
+from spatial_replay.text import Instant, Sentence, named_arguments, plural, time_text, times_apart, with_unit
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.trace import (
     FOREVER,
@@ -500,7 +500,7 @@ class _AwaitedNames:
 
     def _diagnose_missing_names(self) -> tuple[Diagnostic, ...]:
         limit = self._after or 0
-        during = time_text(limit) if self._is_time else counted(limit, "sample")
+        during = time_text(limit) if self._is_time else plural(limit, "sample")
         objects, signals, classes = self._known
         diagnostics = check_names(
             self._specification,

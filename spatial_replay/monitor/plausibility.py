@@ -37,7 +37,7 @@ from spatial_replay.spec.formula import (
     operands_of,
 )
 from spatial_replay.spec.walks import base_of, iter_atoms, iter_bound, iter_expressions, terms_of
-from spatial_replay.text import counted, time_text
+from spatial_replay.text import plural, time_text
 from spatial_replay.trace.trace import Pauses, Trace
 
 _LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
@@ -107,11 +107,11 @@ class ThresholdRange:
         parts = [f"goes from {self.least:.4g} to {self.greatest:.4g}"] if is_number else []
         unknown = self.samples - self.known - self.empty
         for count, words in ((unknown, "is unknown"), (self.empty, self._words_of_empty)):
-            share = f"{count:,} of {counted(self.samples, 'sample')}"
+            share = f"{count:,} of {plural(self.samples, 'sample')}"
             parts += [f"{words} in {'every sample' if count == self.samples else share}"] if count else []
         if not self.known:
             return f"{self.text}: {', '.join(parts)}"
-        samples = counted(self.known, "sample")
+        samples = plural(self.known, "sample")
         if self.holds != "sometimes":
             parts.append(f"{self.holds} holds{' in the others' if unknown or self.empty else ''}")
         elif self.bound:
@@ -305,7 +305,7 @@ def plausibility_warnings(
         if count < log.samples:
             at = time_text(first_ns, zero_ns)
             message = (
-                f"{part.shown} is missing in {count:,} of {counted(log.samples, 'sample')}, first at {at}"
+                f"{part.shown} is missing in {count:,} of {plural(log.samples, 'sample')}, first at {at}"
             )
             hint = "atoms about it are unknown there, and so may be a verdict"
             warnings[part.shown] = source.diagnostic("warning", span, message, hint)
@@ -409,7 +409,7 @@ def _doubts_of_window(text: str, bound: Bound, log: LogNumbers) -> Iterator[tupl
         return
     in_time = bound.unit != "samples"
     length = log.times_ns[1] - log.times_ns[0] if in_time else log.samples - 1
-    length_text = f"{log.seconds:.3f} s" if in_time else counted(log.samples, "sample")
+    length_text = f"{log.seconds:.3f} s" if in_time else plural(log.samples, "sample")
     if bound.lower > length:
         yield f"no sample of this log lies in the window {text}", f"the log has {length_text}"
     elif bound.upper is not None and bound.upper > length:

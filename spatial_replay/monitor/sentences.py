@@ -20,11 +20,11 @@ from spatial_replay.spec.walks import declared_unit, iter_parts, per_second
 from spatial_replay.text import (
     Instant,
     Sentence,
-    counted,
     interval_text,
     is_text_number,
     names_from_unit,
     number_text,
+    plural,
     requirement_text,
     shortened_formula,
     with_unit,
@@ -692,7 +692,7 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
         return Sentence("The samples pause from ", *place, f"{elsewhere}: {reason}.")
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")
-    count_text = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"
+    count_text = f"{gap.name} is missing in {gap.missing:,} of {plural(gap.samples, 'sample')}"
     if gap.window is not None:
         parts: list[str | Instant] = []
         options = []

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.text import counted, printable
+from spatial_replay.text import plural, printable
 from spatial_replay.trace.trace import Trace
 
 _LEAST_REPORTS: Final = 20
@@ -87,7 +87,7 @@ class Stillness:
             count = objects[still[0]].count
             if count >= _LEAST_REPORTS and all(reports.mostly_changes for reports in others):
                 kind = f"of the class {printable(class_name)!r}" if class_name else "without a class"
-                never = f"never changes by a bit in {counted(count + 1, 'report')}"
+                never = f"never changes by a bit in {plural(count + 1, 'report')}"
                 others_move = f"while all other objects {kind} move"
                 yield f"{printable(still[0])} {never}, {others_move}: is it still tracked?"
 

@@ -58,8 +58,8 @@ from spatial_replay.spec.walks import (
 from spatial_replay.text import (
     Instant,
     Sentence,
-    counted,
     nearest_hint,
+    plural,
     printable,
     shortened_formula,
     time_text,
@@ -739,7 +739,7 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
         length = bound.upper - bound.lower + (not is_time)
         seen_length = max(length - missing_length, 0)
         left_text, whole_text = (
-            time_text(n) if is_time else counted(n, "sample") for n in (missing_length, length)
+            time_text(n) if is_time else plural(n, "sample") for n in (missing_length, length)
         )
         seen_text = time_text(seen_length) if is_time else f"{seen_length:,}"
         reach_text = f"its window ends {left_text} after the log"

@@ -32,7 +32,7 @@ from spatial_replay.notebook.figures import INK, draw_curve, draw_disc, new_pane
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.spec.format import iter_branches, label_of, title_of
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operands_of
-from spatial_replay.text import counted, interval_text, time_text
+from spatial_replay.text import interval_text, plural, time_text
 from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def specification_html(specification: Specification) -> Html:
     """Return the declarations of a specification, and the trees of its results."""
     title = element("b", specification.filename)
     results = specification.results
-    about = quiet(f" {counted(len(results), 'result')}, profile {specification.profile}")
+    about = quiet(f" {plural(len(results), 'result')}, profile {specification.profile}")
     kinds = ("constants", "regions", "groups")
     names = {kind: ", ".join(getattr(specification, kind)) for kind in kinds}
     declared = [
@@ -84,7 +84,7 @@ def tree_cell(stem: str, node: Formula) -> Html:
 
 def _left_out(results: Sequence[NamedSpec], shown: int) -> Html:
     nodes = _size(results)
-    return quiet(f"… and {counted(nodes - shown, 'node')} more") if shown < nodes else Html("")
+    return quiet(f"… and {plural(nodes - shown, 'node')} more") if shown < nodes else Html("")
 
 
 class _Place(NamedTuple):
@@ -117,7 +117,7 @@ def draw_specification(specification: Specification, ax: Axes | None = None) -> 
             ax.plot([x, bend, bend, place.x], [y, y, place.y, place.y], color=NEUTRAL, linewidth=1, zorder=1)
         _draw_node(ax, place)
     nodes = _size(specification.results)
-    more = f", the first {len(places)} of {counted(nodes, 'node')}" if len(places) < nodes else ""
+    more = f", the first {len(places)} of {plural(nodes, 'node')}" if len(places) < nodes else ""
     ax.set_title(plain(specification.filename + more), loc="left", fontsize=10)
     return ax
 
@@ -268,7 +268,7 @@ def _trace_title(trace: Trace) -> str:
     if not len(trace):
         return "no samples"
     span = time_text(int(trace.times_ns[-1]), int(trace.times_ns[0]))
-    return f"{counted(len(trace), 'sample')} over {span}"
+    return f"{plural(len(trace), 'sample')} over {span}"
 
 
 def _rings(trace: Trace, rows: Integers) -> tuple[Floats, ...]:
@@ -352,7 +352,7 @@ def evaluation_html(evaluation: Evaluation) -> Html:
     title = element("div", name, " ", verdict_mark(evaluation.verdict))
     worst = _worst_of(evaluation.results, _MOST_RESULTS)
     left_out = len(evaluation.results) - len(worst)
-    more = quiet(f"… and {counted(left_out, 'result')} more, none of them worse") if left_out else Html("")
+    more = quiet(f"… and {plural(left_out, 'result')} more, none of them worse") if left_out else Html("")
     return element("div", title, _results_table(worst), more, *_trees(worst))
 
 
@@ -389,7 +389,7 @@ def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
         rows = list(islice(_tree_rows(result), left))
         left -= len(rows)
         left_out = len(result.final) - len(rows)
-        more = quiet(f"… and {counted(left_out, 'node')} more") if left_out else Html("")
+        more = quiet(f"… and {plural(left_out, 'node')} more") if left_out else Html("")
         nodes = table(["verdict", "robustness", "node"], rows)
         yield details(f"tree of {result.title}, each node at the first sample", nodes, more)
 
@@ -438,7 +438,7 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
     for panel in panels:
         panel.label_outer()
     if len(worst) < len(evaluation.results):
-        left_out = counted(len(evaluation.results) - len(worst), "result")
+        left_out = plural(len(evaluation.results) - len(worst), "result")
         panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\nand {left_out} more, none worse")
     return panels
 
@@ -446,7 +446,7 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
 def _draw_results(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axes, ...]:
     """Draw each result in its axes."""
     if len(results) != len(panels):
-        count = counted(len(results), "result")
+        count = plural(len(results), "result")
         raise UsageError(f"ax has {len(panels)} axes for {count}; give one for each, or draw one result")
     for result, panel in zip(results, panels, strict=True):
         draw_result(result, panel)

@@ -26,7 +26,7 @@ from spatial_replay.planning.decision_log import decision_lines, decision_messag
 from spatial_replay.planning.decisions import Candidate, Consideration, Step
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap
 from spatial_replay.planning.read import LoggedStep
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 from spatial_replay.trace.trace import Sample
 from spatial_replay.tuning.tuned import Surface, Tuning
 
@@ -74,7 +74,7 @@ def tuning_html(tuning: Tuning) -> Html:
         ),
         table(["constant", "value", "as written", "every value that fits"], rows),
         table(["run", "is", "verdict", "robustness"], runs),
-        quiet(f"… and {counted(left_out, 'run')} more") if left_out else Html(""),
+        quiet(f"… and {plural(left_out, 'run')} more") if left_out else Html(""),
     )
 
 
@@ -181,7 +181,7 @@ def _axis_label(surface: Surface, axis: int) -> str:
 def _name_runs(surface: Surface, ax: Axes) -> None:
     good = sum(is_good for _, is_good in surface.runs)
     bad = len(surface.runs) - good
-    runs = counted(good, "good run") + (f", {counted(bad, 'bad run')}" if bad else "")
+    runs = plural(good, "good run") + (f", {plural(bad, 'bad run')}" if bad else "")
     ax.set_title(plain(f"{runs}: margin over {' and '.join(surface.names)}"), loc="left", fontsize=10)
 
 
@@ -304,7 +304,7 @@ def map_html(gradient: GradientMap) -> Html:
     """Return the size of a map, its best robustness, and how many cells are blocked for each reason."""
     grid = gradient.grid
     size = f"{grid.columns} x {grid.rows} cells of {grid.cell_size:g}"
-    turned = f", {counted(len(gradient.turns), 'orientation')}" if len(gradient.turns) > 1 else ""
+    turned = f", {plural(len(gradient.turns), 'orientation')}" if len(gradient.turns) > 1 else ""
     best = gradient.best()
     words = "no free cell" if best == -math.inf else f"robustness {best:.4g} at the best free cell"
     counts = np.bincount(gradient.blocked.ravel(), minlength=len(REASONS)).tolist()

@@ -20,7 +20,7 @@ from spatial_replay.errors import LogError, OutputError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.opencv import Calibration, Camera, Frame, TagDetector, calibrate, tag_cells
 from spatial_replay.perception.tags_file import MountedTag
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 # ------------------------------------------------------------------------------------------------ calibration
 
@@ -96,8 +96,8 @@ def calibrate_camera(
         raise LogError(f"{name} has no frame that can be read")
     if len(views) < _LEAST_VIEWS:
         raise UsageError(
-            f"{name}: {counted(len(views), 'frame')} of different views with {_LEAST_TAGS} or more of the"
-            f" tags ({counted(seen, 'frame')} with so many in all); {_LEAST_VIEWS} are needed: tilt it,"
+            f"{name}: {plural(len(views), 'frame')} of different views with {_LEAST_TAGS} or more of the"
+            f" tags ({plural(seen, 'frame')} with so many in all); {_LEAST_VIEWS} are needed: tilt it,"
             " or move the camera around the table, near and far"
         )
     found_calibration = calibrate(points, pixels, size)

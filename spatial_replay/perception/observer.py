@@ -23,7 +23,7 @@ from spatial_replay.perception.plane import (
     plane_from_references,
 )
 from spatial_replay.perception.tags_file import LEAST_REFERENCES, MountedTag, TaggedObject, TagsFile
-from spatial_replay.text import counted, listed
+from spatial_replay.text import listing, plural
 from spatial_replay.trace.trace import Sample
 
 _STEP: Final = 1e-3
@@ -518,7 +518,7 @@ class CameraView:
 
     def remarks(self) -> list[str]:
         """Return what is worth knowing: that the camera saw nothing, not the plane, or has moved."""
-        frames, lines = counted(self.frames, "frame"), []
+        frames, lines = plural(self.frames, "frame"), []
         of_it = f" of {self.name}" if self.name else ""
         if self.frames and not self.seen:
             lines.append(
@@ -531,7 +531,7 @@ class CameraView:
             lines.append(f"the plane{of_it} is not known: {self._why_no_plane()}")
         for number, count in sorted(self.twice.items()):
             lines.append(
-                f"tag {number} is in {counted(count, 'frame')}{of_it} more than once, and left out there"
+                f"tag {number} is in {plural(count, 'frame')}{of_it} more than once, and left out there"
             )
         if self._parallax:
             above = max((tag.z for _, tag in self.tags.by_id.values() if tag.id in self.seen), key=abs)
@@ -550,13 +550,13 @@ class CameraView:
             )
         if self.moved:
             who = self.name or "the camera"
-            lines.append(f"{who} has moved {counted(self.moved, 'time')}: places are uncertain while it does")
+            lines.append(f"{who} has moved {plural(self.moved, 'time')}: places are uncertain while it does")
         return lines
 
 
 def tags_text(numbers: list[str]) -> str:
     """Return tags as a sentence lists them, the first of many."""
-    return f"tag{'s' if len(numbers) > 1 else ''} {listed(numbers, _MOST_NAMED)}"
+    return f"tag{'s' if len(numbers) > 1 else ''} {listing(numbers, _MOST_NAMED)}"
 
 
 # ---------------------------------------------------------------------------------------------------- samples
@@ -638,7 +638,7 @@ class TagObserver:
         """
         if len(frames) != len(self._cameras) or all(frame is None for frame in frames):
             raise UsageError(
-                f"{counted(len(self._cameras), 'camera')}: give a frame or None of each, not only None"
+                f"{plural(len(self._cameras), 'camera')}: give a frame or None of each, not only None"
             )
         time_ns = next(frame.time_ns for frame in frames if frame is not None)
         if self.frames and time_ns <= self._last_ns:
@@ -754,19 +754,19 @@ class TagObserver:
         lines: list[str] = []
         unmapped = [number for number in sorted(seen) if number not in self.tags.ids]
         if unmapped:
-            tag_texts = [f"{number} (in {counted(seen[number], 'frame')})" for number in unmapped]
+            tag_texts = [f"{number} (in {plural(seen[number], 'frame')})" for number in unmapped]
             lines.append(f"{self.tags.name} has no {tags_text(tag_texts)}")
         missing = [tagged for tagged in self.tags.objects if not any(tag.id in seen for tag in tagged.tags)]
-        frames = counted(sum(camera.frames for camera in self._cameras), "frame")
+        frames = plural(sum(camera.frames for camera in self._cameras), "frame")
         lines += [
             f"{tagged.name} was never seen: no {tags_text([str(tag.id) for tag in tagged.tags])} in {frames}"
             for tagged in missing[:_MOST_NAMED]
         ]
         lines += of_cameras
         for object_name, (text, count) in sorted(self._doubts.items()):
-            lines.append(f"{object_name} is unknown in {counted(count, 'frame')}: {text}")
+            lines.append(f"{object_name} is unknown in {plural(count, 'frame')}: {text}")
         for object_name, (most, count) in sorted(self._apart.items()):
-            where = f"in {counted(count, 'frame')}, by up to {most:.3g} {self.tags.unit}"
+            where = f"in {plural(count, 'frame')}, by up to {most:.3g} {self.tags.unit}"
             lines.append(
                 f"{object_name}: its tags contradict each other {where}; check their places on it, and of"
                 " cameras the pose and the --offset"

@@ -25,7 +25,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError, importing
 from spatial_replay.perception.opencv import LARGEST_PICTURE, Frame, Image
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 # --------------------------------------------------------------------------------------------------- decoding
 
@@ -237,7 +237,7 @@ class Untrue:
         if self._places > 1:
             where = f"in {self._places} places, the first {where}"
         return [
-            f"{name}: frames are missing or damaged {where}; {counted(self.frames, 'frame')}, up to the next"
+            f"{name}: frames are missing or damaged {where}; {plural(self.frames, 'frame')}, up to the next"
             " key frame, left out"
         ]
 

@@ -57,7 +57,7 @@ from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, ma
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
 from spatial_replay.planning.targets import room_cost
-from spatial_replay.text import counted, json_number, time_text
+from spatial_replay.text import json_number, plural, time_text
 from spatial_replay.trace.trace import Sample
 
 # ------------------------------------------------------------------------------------------------------- maps
@@ -530,9 +530,9 @@ def plan_lines(name: str, decisions: Sequence[PlanDecision]) -> Iterator[str]:
     motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
     is_cut = last.HasField("target") and not last.HasField("outcome")
     yield (
-        f"{name}: {counted(len(decisions), 'decision')} for {last.specification!r}, "
-        f"{counted(motions, 'motion')}{' and one cut short' if is_cut else ''}, "
-        f"{counted(len(last.pruned), 'edge')} given up"
+        f"{name}: {plural(len(decisions), 'decision')} for {last.specification!r}, "
+        f"{plural(motions, 'motion')}{' and one cut short' if is_cut else ''}, "
+        f"{plural(len(last.pruned), 'edge')} given up"
     )
     for decision in before:
         yield from decision_lines(decision)
@@ -592,7 +592,7 @@ def effort_text(decision: PlanDecision) -> str:
     search, edge = decision.search, decision.considered[-1] if decision.considered else None
     attempt = f"attempt {edge.failed + 1}" if edge is not None and decision.HasField("target") else ""
     counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
-    searched = [f"{search.maps:.4g} maps", *(counted(*count) for count in counts if count[0])]
+    searched = [f"{search.maps:.4g} maps", *(plural(*count) for count in counts if count[0])]
     return ", ".join([*filter(None, [attempt]), *searched])
 
 
@@ -696,9 +696,9 @@ def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
     """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
     for conjunct in limiting_conjuncts(candidate)[:MOST_LISTED]:
         at_target = f", {conjunct.at_target:.4g} at the target" if conjunct.HasField("at_target") else ""
-        yield "limited by", f"{conjunct.text} in {counted(conjunct.limits, 'cell')}{at_target}"
+        yield "limited by", f"{conjunct.text} in {plural(conjunct.limits, 'cell')}{at_target}"
     for cause in candidate.causes[:MOST_LISTED]:
-        yield "blocked by", f"{cause_text(cause)} in {counted(cause.cells, 'cell')}"
+        yield "blocked by", f"{cause_text(cause)} in {plural(cause.cells, 'cell')}"
     if candidate.HasField("room"):
         yield "room", room_sentence(candidate)
 

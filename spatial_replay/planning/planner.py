@@ -57,7 +57,7 @@ from spatial_replay.planning.movers import (
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Group, Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
-from spatial_replay.text import counted, named_arguments, times_apart
+from spatial_replay.text import named_arguments, plural, times_apart
 from spatial_replay.trace.trace import Sample, require_sample
 
 _LONGEST_WANTED: Final = 60
@@ -485,7 +485,7 @@ class Planner:
         return with_choice(replace(consideration, pruned=None), candidates, self.settings)
 
     def _waiting_step(self, considered: list[Consideration], ahead: tuple[int, ...]) -> Step:
-        reason = f"wait for {counted(len(ahead), 'sample')}: time alone leads on, to state {ahead[-1]}"
+        reason = f"wait for {plural(len(ahead), 'sample')}: time alone leads on, to state {ahead[-1]}"
         return replace(self._decision("wait", considered, reason), ahead=ahead)
 
     def _running_step(self, considered: list[Consideration]) -> Step:

@@ -55,7 +55,7 @@ from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted, cut, json_fields, time_text
+from spatial_replay.text import cut, json_fields, plural, time_text
 from spatial_replay.trace.trace import Sample, window_of
 
 PLANNER_TOPICS: Final = (PLAN_DECISION, GRADIENT_MAP, PLAN_PATH)
@@ -550,7 +550,7 @@ def _missing(rerun: Rerun) -> Iterator[str]:
 
 def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> Iterator[str]:
     if len(recorded) != len(recomputed):
-        yield f"{counted(len(recorded), 'message')} on {topic}, {len(recomputed)} recomputed"
+        yield f"{plural(len(recorded), 'message')} on {topic}, {len(recomputed)} recomputed"
     for old, new in zip(recorded, recomputed, strict=False):
         if old != new:
             yield f"{topic} differs{_differing_fields(old, new) if topic == PLAN_DECISION else ''}"
@@ -645,14 +645,14 @@ class Replanned(Printed):
             width: of the two columns of maps, in characters.
         """
         changes = ", ".join(self.changes) or "nothing changed"
-        yield f"{self.name}: {counted(self.decisions, 'decision')}, redone with {changes}"
+        yield f"{self.name}: {plural(self.decisions, 'decision')}, redone with {changes}"
         if self.same:
             yield f"{_first(self.same, self.decisions)} the same, byte for byte, with all maps"
         if self.alike > self.same:
             number = self.alike - self.same
             also = "then " if self.same else ""
             verb = "does" if number == 1 else "do"
-            yield f"{also}{counted(number, 'decision')} {verb} the same, with other maps or reasons"
+            yield f"{also}{plural(number, 'decision')} {verb} the same, with other maps or reasons"
         if self.redone is None:
             return
         at = time_text(self.redone.sample.time_ns)
@@ -691,7 +691,7 @@ class Replanned(Printed):
 def _first(count: int, of: int) -> str:
     if count == of:
         return "all decisions are" if of > 1 else "the decision is"
-    return f"the first {counted(count, 'decision')} are" if count > 1 else "the first decision is"
+    return f"the first {plural(count, 'decision')} are" if count > 1 else "the first decision is"
 
 
 def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:

@@ -31,7 +31,7 @@ from spatial_replay.recording.log import (
     warm_up,
 )
 from spatial_replay.spec.formula import Specification, iter_nodes
-from spatial_replay.text import counted, named_arguments, nearest_hint
+from spatial_replay.text import named_arguments, nearest_hint, plural
 from spatial_replay.trace.trace import Sample, Trace
 from spatial_replay.trace.units import Axes
 
@@ -554,9 +554,9 @@ class ClipLog(RecorderLog):
         end = RunEnd(is_interrupted, missed["sample"], missed["message"])
         outcome = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
         self.written = (*self.written, outcome)
-        more = counted(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
+        more = plural(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
         lost = "".join(
-            f"; {counted(count, kind)} of it {'was' if count == 1 else 'were'} dropped"
+            f"; {plural(count, kind)} of it {'was' if count == 1 else 'were'} dropped"
             for kind, count in missed.items()
             if count
         )

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError, Message
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
-from spatial_replay.text import listed
+from spatial_replay.text import listing
 
 if TYPE_CHECKING:
     pass
@@ -188,7 +188,7 @@ def _check_descriptors(topic: str, text: bytes, name: str) -> None:
     ]
     if name not in type_names:
         raise UsageError(
-            f"{topic}: the schema has no message {name!r}; it has {listed(type_names) or 'no message'}"
+            f"{topic}: the schema has no message {name!r}; it has {listing(type_names) or 'no message'}"
         )
 
 

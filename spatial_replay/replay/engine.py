@@ -66,7 +66,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications, parse_specification
-from spatial_replay.text import Instant, Sentence, counted, counted_from
+from spatial_replay.text import Instant, Sentence, counted_from, plural
 from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 from spatial_replay.version import __version__
@@ -98,7 +98,7 @@ class Dropped:
     @property
     def text(self) -> str:
         """The losses in words; "" if there are none."""
-        return f"the recorder dropped {self.count:,} of {counted(self.of, 'sample')}" if self.count else ""
+        return f"the recorder dropped {self.count:,} of {plural(self.of, 'sample')}" if self.count else ""
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
-from spatial_replay.text import counted_from, interval_text, listed
+from spatial_replay.text import counted_from, interval_text, listing
 from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import Trace, within
 
@@ -507,7 +507,7 @@ class Evaluated:
             for name, constant in self.edited.constants.items()
             if constant != written_constants[name]
         ]
-        return text + (f" ({listed(changed, _MOST_NAMED)})" if changed else "")
+        return text + (f" ({listing(changed, _MOST_NAMED)})" if changed else "")
 
     @cached_property
     def layout(self) -> Attachment:

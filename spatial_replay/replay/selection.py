@@ -37,7 +37,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
-from spatial_replay.text import Sentence, listed, time_text
+from spatial_replay.text import Sentence, listing, time_text
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, TimePoint, Trace, within
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
     for pattern in patterns:
         if not any(is_kept(topic, (pattern,), ()) for topic in topics):
             raise UsageError(
-                f"no topic of {source.name} fits {pattern!r}; it has {listed(topics)}; "
+                f"no topic of {source.name} fits {pattern!r}; it has {listing(topics)}; "
                 "'all' keeps everything, 'mapped' the topics that make the samples"
             )
 

@@ -23,7 +23,7 @@ from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_dat
 from spatial_replay.report.panels import final_text, json_text, sentence_parts
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import declared_unit, units_of, units_text
-from spatial_replay.text import CALENDAR_NS, Instant, Sentence, counted, printable, time_text
+from spatial_replay.text import CALENDAR_NS, Instant, Sentence, plural, printable, time_text
 from spatial_replay.version import __version__
 
 HEADER: Final = '<header class="top">'
@@ -105,7 +105,7 @@ def _about(report: RunReport) -> Iterator[str]:
         yield f"{datetime.fromtimestamp(replayed.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     start, end = (time_text(time_ns, replayed.first_ns) for time_ns in (replayed.start_ns, replayed.end_ns))
     yield f"{start} to {end}" if replayed.start_ns != replayed.first_ns else end
-    yield counted(replayed.samples, "sample")
+    yield plural(replayed.samples, "sample")
     yield f"semantics {replayed.semantics}"
     yield f"spatial-replay {__version__}"
 
@@ -120,7 +120,7 @@ def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
         yield _notice("alert", "The log contradicts how it was read; verdicts may be wrong:", doubts)
     if replayed.unreadable:
         verb = "holds" if replayed.unreadable == 1 else "hold"
-        what = f"{counted(replayed.unreadable, 'observation')} {verb} no finite number: unknown there."
+        what = f"{plural(replayed.unreadable, 'observation')} {verb} no finite number: unknown there."
         yield _notice("note", what, replayed.remarks)
     elif replayed.remarks:
         yield _notice("note", "The log says of its samples:", replayed.remarks)

@@ -30,7 +30,7 @@ from spatial_replay.spec.formula import (
     Specification,
 )
 from spatial_replay.spec.load import require_specification
-from spatial_replay.text import counted, named_arguments, number_text
+from spatial_replay.text import named_arguments, number_text, plural
 
 Relation: TypeAlias = Literal["same", "stricter", "weaker", "different", "unknown"]
 
@@ -100,7 +100,7 @@ class Distinction(Printed):
 def _run_lines(accepting: str, rejecting: str, example: Example | None) -> Iterator[str]:
     if example is None:
         return
-    length = counted(len(example.sentences), "sample")
+    length = plural(len(example.sentences), "sample")
     note = f", in words only: {example.note}" if example.note else ""
     yield ""
     yield f"accepted by {accepting}, rejected by {rejecting}: {length}{note}"

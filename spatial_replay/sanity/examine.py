@@ -41,7 +41,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, signals_in, terms_of
-from spatial_replay.text import counted, json_fields, named_arguments, number_text, shortened_formula
+from spatial_replay.text import json_fields, named_arguments, number_text, plural, shortened_formula
 
 MAX_PAIRS: Final = 300
 """How many pairs of specs are compared at most."""
@@ -139,7 +139,7 @@ class Examination(Printed):
             yield ""
         yield from self.notes
         if self.findings:
-            yield f"{counted(len(self.findings), 'finding')} in {counted(len(self.specs), 'result')}"
+            yield f"{plural(len(self.findings), 'finding')} in {plural(len(self.specs), 'result')}"
         else:
             whole = not any(spec.reason or spec.undecided for spec in self.specs)
             yield "nothing found" if whole else "nothing found in what could be decided"
@@ -175,7 +175,7 @@ def _remarks(spec: SpecExamination) -> Iterator[str]:
 
 
 def _example(example: Example, file: Path | None) -> Iterator[str]:
-    length = counted(len(example.sentences), "sample")
+    length = plural(len(example.sentences), "sample")
     if example.robustness is None:
         yield f"{example.verdict} by {length}, in words only: {example.note}"
     else:

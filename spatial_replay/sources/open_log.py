@@ -43,7 +43,7 @@ from spatial_replay.logs.remote import (
 )
 from spatial_replay.logs.source import IterTraces, Source, TrackSource
 from spatial_replay.logs.topics import MAGIC
-from spatial_replay.text import counted, counted_from, printable
+from spatial_replay.text import counted_from, plural, printable
 from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
@@ -194,7 +194,7 @@ def _refuse_data_set(path: Path) -> None:
     if data_set is not None and data_set.episodes:
         first = printable(f"{path}#{data_set.episodes[0].number}")
         raise UsageError(
-            f"{path} is a {data_set.kind} data set of {counted(len(data_set.episodes), 'episode')}; give one,"
+            f"{path} is a {data_set.kind} data set of {plural(len(data_set.episodes), 'episode')}; give one,"
             f" such as {first}, or all of them to `batch` or `judge`"
         )
 

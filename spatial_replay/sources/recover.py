@@ -24,7 +24,7 @@ from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.logs.topics import ENDING, METADATA, RECOVERY
 from spatial_replay.sources.open_log import format_of, is_bag_folder, readable_file
-from spatial_replay.text import Instant, Sentence, counted, counted_from
+from spatial_replay.text import Instant, Sentence, counted_from, plural
 from spatial_replay.trace.trace import FOREVER
 
 _MOST_GAPS = 1_000
@@ -90,7 +90,7 @@ class Recovery:
         samples = sum(gap.last - gap.first + 1 for gap in self.samples)
         messages = sum(self.missing.values())
         if messages and samples:
-            return f"{_missing(messages, 'message')}, {counted(samples, 'sample')} among them"
+            return f"{_missing(messages, 'message')}, {plural(samples, 'sample')} among them"
         if messages or samples:
             return _missing(messages or samples, "message" if messages else "sample")
         return "how much is missing is not known"
@@ -222,7 +222,7 @@ def _open_log(file: LogFile) -> tuple[MessageReader, FaultList]:
 
 
 def _missing(count: int, noun: str) -> str:
-    return f"{counted(count, noun)} {'is' if count == 1 else 'are'} missing"
+    return f"{plural(count, noun)} {'is' if count == 1 else 'are'} missing"
 
 
 def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:

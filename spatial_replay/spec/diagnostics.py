@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from spatial_replay.errors import SpecificationError
-from spatial_replay.text import escaped
+from spatial_replay.text import escape_text
 from spatial_replay.text import nearest_hint as nearest_hint
 
 MAX_FAULTS = 100
@@ -54,9 +54,9 @@ class Diagnostic:
         printable_piece = "".join(character if character.isprintable() else " " for character in piece)
         offset = self.column - 1 - first
         caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
-        place = f"{escaped(self.filename)}:{self.line}:{self.column}"
-        head = f"{place}: {self.severity}: {escaped(self.message)}"
-        tail = f"\n  {escaped(self.hint)}" if self.hint else ""
+        place = f"{escape_text(self.filename)}:{self.line}:{self.column}"
+        head = f"{place}: {self.severity}: {escape_text(self.message)}"
+        tail = f"\n  {escape_text(self.hint)}" if self.hint else ""
         return f"{head}\n  {printable_piece}\n  {caret}{tail}"
 
 

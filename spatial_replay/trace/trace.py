@@ -26,10 +26,10 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.text import (
     Instant,
     Sentence,
-    counted,
     is_encodable,
     named_arguments,
     names_from_unit,
+    plural,
     text_number,
     times_apart,
 )
@@ -899,7 +899,7 @@ class Pauses:
             comma = ", " if parts else ""
             parts += [f"{comma}for {length_ns / 1e9:.3f} s from ", Instant(start_ns, 0), " on"]
         more = len(pauses) - _MOST_LISTED
-        others = f", and {counted(more, 'more time')}" if more > 0 else ""
+        others = f", and {plural(more, 'more time')}" if more > 0 else ""
         usual = f", where one usually comes every {self.usual_ns / 1e9:.3g} s"
         unknown = "`max_gap` makes what lies there unknown"
         if max_gap_ns is not None and pauses[0][1] > max_gap_ns:

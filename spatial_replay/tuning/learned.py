@@ -19,7 +19,7 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import ANY_CLASS, NamedSpec, Specification
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
 from spatial_replay.spec.tokens import quoted
-from spatial_replay.text import counted, json_value, number_text, printable
+from spatial_replay.text import json_value, number_text, plural, printable
 from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.fit import (
     ALWAYS,
@@ -443,18 +443,18 @@ class Learned(Printed):
         return bool(self.specs) and not self.missed
 
     def __repr__(self) -> str:
-        return f"<Learned from {counted(len(self.runs), 'run')}: {counted(len(self.specs), 'spec')}>"
+        return f"<Learned from {plural(len(self.runs), 'run')}: {plural(len(self.specs), 'spec')}>"
 
     def lines(self) -> Iterator[str]:
         """Yield the specs with the evidence for each, as the command `learn` prints them."""
         bad = sum(not is_good for _, is_good in self.runs)
         good = len(self.runs) - bad
-        runs = counted(good, "good run") + (f" and {counted(bad, 'bad run')}" if bad else "")
+        runs = plural(good, "good run") + (f" and {plural(bad, 'bad run')}" if bad else "")
         if self.specs:
-            yield f"learned {counted(len(self.specs), 'spec')} from {runs}:"
+            yield f"learned {plural(len(self.specs), 'spec')} from {runs}:"
         else:
             what = "distinguishes any bad run" if bad else "is worth a line"
-            yield f"nothing that holds in all of {counted(good, 'good run')} {what}"
+            yield f"nothing that holds in all of {plural(good, 'good run')} {what}"
         width = max((len(line.title) for line in self.specs), default=0)
         for line in self.specs:
             violating = (
@@ -468,7 +468,7 @@ class Learned(Printed):
         for name in self.missed[:_MOST_MISSED] if self.specs else ():
             yield f"{name} violates none of these lines"
         if self.specs and len(self.missed) > _MOST_MISSED:
-            yield f"… nor do {counted(len(self.missed) - _MOST_MISSED, 'more bad run')}"
+            yield f"… nor do {plural(len(self.missed) - _MOST_MISSED, 'more bad run')}"
         for omission in self.left_out:
             yield f"not compared: {omission}"
 
@@ -562,7 +562,7 @@ def _check(runs: Sequence[LabelledRun]) -> None:
     require_comparable(runs, "learn from")
     for run in runs:
         if len(run.trace) < _FEWEST_SAMPLES:
-            have = counted(len(run.trace), "sample")
+            have = plural(len(run.trace), "sample")
             raise UsageError(f"{run.name} is too short to learn from: it has {have}; leave it out")
     for first in good:
         for second in runs:
@@ -586,9 +586,9 @@ def _missing(good: Sequence[LabelledRun]) -> Iterator[str]:
     counts = Counter(name for run in good for name in run.trace.names)
     some = [name for name in sorted(counts) if len(good) / 2 <= counts[name] < len(good)]
     for name in some[:_MOST_NAMED]:
-        yield f"{name}, which is missing in {len(good) - counts[name]} of {counted(len(good), 'good run')}"
+        yield f"{name}, which is missing in {len(good) - counts[name]} of {plural(len(good), 'good run')}"
     if len(some) > _MOST_NAMED:
-        yield f"{counted(len(some) - _MOST_NAMED, 'more object')} that some good runs lack"
+        yield f"{plural(len(some) - _MOST_NAMED, 'more object')} that some good runs lack"
 
 
 def _nothing_in_common(good: Sequence[LabelledRun]) -> str:
@@ -664,10 +664,10 @@ class _Writer:
         lines = [*map(_comment, head), f"use {self.profile}"]
         for spec, line in zip(written.specification.specs, evidence, strict=True):
             lowest = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
-            lines += ["", _comment(f"Holds in {good} of {counted(good, 'good run')}, {lowest}.")]
+            lines += ["", _comment(f"Holds in {good} of {plural(good, 'good run')}, {lowest}.")]
             if bad:
                 violating = (
-                    f"{len(line.violated_by)} of {counted(bad, 'bad run')}{_names_text(line.violated_by)}"
+                    f"{len(line.violated_by)} of {plural(bad, 'bad run')}{_names_text(line.violated_by)}"
                 )
                 lines.append(_comment(f"Violated by {violating}."))
             title = quoted(f"{spec.id}: {spec.title}")
@@ -734,11 +734,11 @@ def _head(
     checked: Sequence[CheckedRun],
     left_out: Sequence[str],
 ) -> Iterator[str]:
-    runs = counted(len(good), "good run") + (f" and {counted(len(bad), 'bad run')}" if bad else "")
+    runs = plural(len(good), "good run") + (f" and {plural(len(bad), 'bad run')}" if bad else "")
     yield f"Learned from {runs}."
     if missed:
         verb = "violates" if len(missed) == 1 else "violate"
-        yield f"{counted(len(missed), 'bad run')} {verb} none of these lines{_names_text(missed)}."
+        yield f"{plural(len(missed), 'bad run')} {verb} none of these lines{_names_text(missed)}."
     if checked:
         yield checked_text(checked)
     else:

@@ -28,7 +28,7 @@ from spatial_replay.spec.formula import (
     Variable,
 )
 from spatial_replay.spec.relations import PROFILES
-from spatial_replay.text import TEXTS, counted
+from spatial_replay.text import TEXTS, plural
 from spatial_replay.trace.trace import ABSENT, Trace
 
 MOST_OBJECTS: Final = 60
@@ -100,7 +100,7 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
     left_out = []
     if len(names) > MOST_OBJECTS:
         left_out.append(
-            f"{counted(len(names) - MOST_OBJECTS, 'object')} beyond the first {MOST_OBJECTS} by name"
+            f"{plural(len(names) - MOST_OBJECTS, 'object')} beyond the first {MOST_OBJECTS} by name"
         )
         names = names[:MOST_OBJECTS]
     samples = sum(map(len, traces))
@@ -114,14 +114,14 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
     measured_pairs = [*class_pairs[:most], *pairs[: max(0, most - len(class_pairs))]]
     if missing := len(class_pairs) + len(pairs) - len(measured_pairs):
         left_out.append(
-            f"{counted(missing, 'pair')} of objects that come less near than {len(measured_pairs):,} others"
+            f"{plural(missing, 'pair')} of objects that come less near than {len(measured_pairs):,} others"
         )
     signals = sorted(set(traces[0].signals).intersection(*(trace.signals for trace in traces[1:])))
     signals = [
         signal for signal in signals if not any((trace.signals[signal] <= TEXTS).any() for trace in traces)
     ]
     if len(signals) > MOST_SIGNALS:
-        left_out.append(f"{counted(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}")
+        left_out.append(f"{plural(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}")
     taken_names = common | {name for trace in traces for name in trace.names}
     quantities = [quantity for a, b in measured_pairs for quantity in _quantities(a, b, profile, taken_names)]
     for name in signals[:MOST_SIGNALS]:

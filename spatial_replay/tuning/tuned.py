@@ -25,7 +25,7 @@ from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import constant_writer
-from spatial_replay.text import counted, json_fields, json_number, json_value
+from spatial_replay.text import json_fields, json_number, json_value, plural
 from spatial_replay.trace.units import require_same_units
 from spatial_replay.tuning.margins import (
     Direction,
@@ -771,7 +771,7 @@ class Tuning(Displayed):
         if self.conflict is not None:
             return f"<Tuning: {self.conflict.message}>"
         values = ", ".join(f"{name} = {value}" for name, value in self.values.items())
-        return f"<Tuning of {counted(len(self.runs), 'run')}: {values}; margin {self.margin:.6g}>"
+        return f"<Tuning of {plural(len(self.runs), 'run')}: {values}; margin {self.margin:.6g}>"
 
     def surface(self, *names: str, points: int = 25) -> Surface:
         """Compute the margins over one or two constants; without names over the first two.
@@ -1004,7 +1004,7 @@ def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
             for run in runs[:_MOST_NAMED]
         ]
         if len(runs) > _MOST_NAMED:
-            parts.append(f"and {counted(len(runs) - _MOST_NAMED, 'other run')} likewise")
+            parts.append(f"and {plural(len(runs) - _MOST_NAMED, 'other run')} likewise")
     names = tuple(margins.runs[run].name for run in (*alone, *others))
     return Conflict(names, "; ".join(parts), found.is_proven, names[: len(alone)])
 

@@ -16,7 +16,7 @@ import numpy as np
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.text import counted, listed, nearest_hint
+from spatial_replay.text import listing, nearest_hint, plural
 from spatial_replay.trace.trace import LATEST_NS
 
 
@@ -202,7 +202,7 @@ class DataSet:
             if name in arrays and len(arrays[name]) in (count, count - 1):
                 values[name] = _with_last(arrays[name], count)
             elif name in arrays:
-                rows = counted(len(arrays[name]), "row")
+                rows = plural(len(arrays[name]), "row")
                 remarks.append(f"{name} has {rows} for {count} states; it is not read")
         return replace(columns, features=values, success=success, remarks=tuple(remarks))
 
@@ -258,7 +258,7 @@ class DataSet:
         value = self.whole_label(run, label)
         if value is None and run.reading.label is not None and self.feature(label) is None:
             names = [feature.name for feature in self.features]
-            hint = nearest_hint(label, names) or f"it has {listed(names)}"
+            hint = nearest_hint(label, names) or f"it has {listing(names)}"
             raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
         return None if value is None else np.array(value)
 
@@ -296,7 +296,7 @@ class DataSet:
         if not self.episodes:
             return "it has no episodes"
         first, last = self.episodes[0].number, self.episodes[-1].number
-        return f"it has {counted(len(self.episodes), 'episode')}, {self.name}#{first} to {self.name}#{last}"
+        return f"it has {plural(len(self.episodes), 'episode')}, {self.name}#{first} to {self.name}#{last}"
 
     def feature(self, name: str) -> Feature | None:
         """Return the feature of a name."""
@@ -338,7 +338,7 @@ def _success_of_states(labels: Floats, count: int, place: str) -> Booleans:
     if len(labels) == count - 1:
         return np.concatenate([[False], is_success])
     if len(labels) != count:
-        raise LogError(f"{place} has {counted(len(labels), 'row')} for {counted(count, 'state')}")
+        raise LogError(f"{place} has {plural(len(labels), 'row')} for {plural(count, 'state')}")
     return is_success
 
 

@@ -31,7 +31,7 @@ from spatial_replay.logs.formats.episodes import (
 from spatial_replay.logs.formats.mujoco import model_from_file, model_from_xml
 from spatial_replay.logs.formats.steps import D4rl
 from spatial_replay.logs.formats.tables import read_json
-from spatial_replay.text import listed
+from spatial_replay.text import listing
 
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _NUMBERED: Final = re.compile(r"[a-z]+_([0-9]{1,9})")
@@ -55,7 +55,7 @@ def open_hdf5(path: Path) -> DataSet | None:
             if layout.is_layout(file):
                 return layout(path, file)
         raise UsageError(
-            f"{path.name} is an HDF5 file with {listed(file.names) or 'nothing in it'}, no layout that is"
+            f"{path.name} is an HDF5 file with {listing(file.names) or 'nothing in it'}, no layout that is"
             " read: ManiSkill (traj_0), Isaac Lab, robosuite, robomimic or LIBERO (data/demo_0), D4RL"
             " (terminals)"
         )
@@ -226,7 +226,7 @@ class _ManiSkill(_Demonstrations):
             yield f"{about.name} is missing or has no episodes: seeds are not known, and the rate is 20 Hz"
         elif keys != self._rows.keys():
             differing = sorted(keys ^ self._rows.keys(), key=natural_key)
-            yield f"{about.name} and {self.name} differ in their episodes: {listed(differing)}"
+            yield f"{about.name} and {self.name} differ in their episodes: {listing(differing)}"
         if not self.names_bodies:
             yield "env_states has no actors by name; name objects by `features:`"
 

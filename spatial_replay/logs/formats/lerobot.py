@@ -30,7 +30,7 @@ from spatial_replay.logs.formats.episodes import (
     integer_or_none,
 )
 from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
-from spatial_replay.text import counted, listed
+from spatial_replay.text import listing, plural
 
 _SUCCESS: Final = "next.success"
 _TIME_ERROR_S: Final = 1e-3
@@ -87,12 +87,12 @@ class _LeRobot(DataSet):
         lost = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
         if lost and not is_third_party:
             remarks.append(
-                f"meta names files that are not in data/: {listed(lost, 3)}; rows are found by episode_index"
+                f"meta names files that are not in data/: {listing(lost, 3)}; rows are found by episode_index"
             )
         total = info.get("total_episodes")
         if isinstance(total, int) and total != len(self.episodes):
             remarks.append(
-                f"meta/info.json says {counted(total, 'episode')}, and meta has {len(self.episodes)}"
+                f"meta/info.json says {plural(total, 'episode')}, and meta has {len(self.episodes)}"
             )
         if info.get("chunks_size") == 1 and _lacks_files(path):
             remarks.append(
@@ -238,7 +238,7 @@ def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str
             by_number.setdefault(row["episode_index"], row)
     if len(by_number) < len(rows):
         remarks.append(
-            f"meta lists {counted(len(rows) - len(by_number), 'episode')} twice or without a number"
+            f"meta lists {plural(len(rows) - len(by_number), 'episode')} twice or without a number"
         )
     episodes, file_of = [], {}
     for number, row in sorted(by_number.items()):
@@ -303,7 +303,7 @@ def _remarks(
 ) -> Iterator[str]:
     """Yield remarks on the rows of an episode whose values are odd, although all are read."""
     if expected is not None and expected != len(frames):
-        yield f"meta says {counted(expected, 'frame')}, and data has {len(frames)}"
+        yield f"meta says {plural(expected, 'frame')}, and data has {len(frames)}"
     steps = np.diff(frames)
     odd = np.flatnonzero(steps != 1)
     if len(frames) and frames[0] != 0:

@@ -29,7 +29,7 @@ from spatial_replay.logs.formats.episodes import (
 )
 from spatial_replay.logs.formats.hdf5 import InGroups
 from spatial_replay.logs.formats.tables import arrow, numbers_from_column, read_head, read_json
-from spatial_replay.text import counted, listed
+from spatial_replay.text import listing, plural
 
 _LABELS: Final = ("infos/success", "infos/is_success")
 _OF_STEPS: Final = ("actions", "rewards", "terminations", "truncations")
@@ -75,9 +75,9 @@ class _Minari(DataSet):
     def _remarks(self, about: Mapping[str, Any]) -> Iterator[str]:
         total, combined = about.get("total_episodes"), about.get("combined_datasets")
         if isinstance(total, int) and total != len(self.episodes):
-            yield f"metadata.json says {counted(total, 'episode')}, and the data have {len(self.episodes)}"
+            yield f"metadata.json says {plural(total, 'episode')}, and the data have {len(self.episodes)}"
         if isinstance(combined, list):
-            names = listed(list(dict.fromkeys(map(str, combined))))
+            names = listing(list(dict.fromkeys(map(str, combined))))
             yield f"it combines {names}: episodes that were filtered out of these are in it again"
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
@@ -118,7 +118,7 @@ def _second_run(arrays: Mapping[str, Floats], steps: int, count: int) -> str:
         if len(ends):
             return f"its {name} end a run at step {ends[0]} of {steps}: {SECOND_RUN}"
     if count != steps + 1:
-        return f"it has {counted(count, 'state')} for {counted(steps, 'step')}: {SECOND_RUN}"
+        return f"it has {plural(count, 'state')} for {plural(steps, 'step')}: {SECOND_RUN}"
     return ""
 
 

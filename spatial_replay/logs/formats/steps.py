@@ -25,7 +25,7 @@ from spatial_replay.logs.formats.episodes import (
     Run,
 )
 from spatial_replay.logs.formats.mujoco import model_from_file
-from spatial_replay.text import counted
+from spatial_replay.text import plural
 
 
 class _Steps(DataSet):
@@ -42,7 +42,7 @@ class _Steps(DataSet):
         ends = np.flatnonzero(is_end)
         if len(is_end) and (len(ends) == 0 or ends[-1] != len(is_end) - 1):
             last = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)
-            self.remarks += (f"its last episode, of {counted(last, 'step')}, {missing}",)
+            self.remarks += (f"its last episode, of {plural(last, 'step')}, {missing}",)
             ends = np.append(ends, len(is_end) - 1)
         self._bounds = [0, *(ends + 1).tolist()]
         steps = enumerate(np.diff(self._bounds).tolist())

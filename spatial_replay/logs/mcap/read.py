@@ -63,7 +63,7 @@ from spatial_replay.logs.topics import (
     is_kept,
     remarks_on_copies,
 )
-from spatial_replay.text import Instant, Sentence, counted, listed
+from spatial_replay.text import Instant, Sentence, listing, plural
 from spatial_replay.trace.doubts import doubts_from_metadata
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
@@ -460,7 +460,7 @@ class McapSource(FileSource):
         topics = sorted({channel.topic for channel in walk.channels.values()})
         if not topics:
             return LogError(f"{self.name} holds no message" + (f": {fault}" if fault else ""))
-        what = f"no topic {OBJECTS!r} in {self.name}; it has {listed([*map(repr, topics)])}"
+        what = f"no topic {OBJECTS!r} in {self.name}; it has {listing([*map(repr, topics)])}"
         if fault:
             return LogError(f"{what}: {fault}")
         if METADATA in dict(self.metadata()):
@@ -481,7 +481,7 @@ def directory_remarks(
 ) -> tuple[str, ...]:
     """Return what to say about a log with skipped records, or one recovered from a damaged one."""
     skipped = (
-        (f"{name}: {counted(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
+        (f"{name}: {plural(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
         if directory.skipped
         else ()
     )
