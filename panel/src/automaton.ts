@@ -6,8 +6,8 @@ import {
 import { createElement, type ReactElement } from "react";
 
 import { TimedList } from "./event-list";
-import { type AutomatonMessage, type AutomatonStateMessage, type EventMessage, type ResultMessage, type SpecificationMessage } from "./messages";
-import { EVENTS, Results } from "./results";
+import { type AutomatonMessage, type AutomatonStateMessage, type EventMessage, type RecentEventsMessage, type ResultMessage, type SpecificationMessage } from "./messages";
+import { EVENTS, RECENT_EVENTS, Results } from "./results";
 import { Series } from "./series";
 import { chooser, type Cursor, type View, type Viewer } from "./viewer";
 
@@ -24,6 +24,7 @@ interface Taken {
 
 export class AutomatonView implements View {
   readonly topics = [EVENTS, AUTOMATON];
+  readonly currentTopics = [RECENT_EVENTS];
   readonly body = element("div", { class: "panel-body" });
   private readonly results: Results;
   private readonly drawing = element("div", { class: "drawing" });
@@ -62,6 +63,7 @@ export class AutomatonView implements View {
 
   take(topic: string, time: number, message: unknown): void {
     if (topic === EVENTS) this.results.takeEvent(time, message as EventMessage);
+    else if (topic === RECENT_EVENTS) this.results.takeRecent(time, message as RecentEventsMessage);
     else this.run?.take(time, message as AutomatonStateMessage);
   }
 

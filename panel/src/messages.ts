@@ -90,6 +90,12 @@ export interface EventMessage {
   readonly metadata: readonly { readonly key: string; readonly value: string }[];
 }
 
+export interface RecentEventsMessage {
+  readonly events: readonly { readonly event: string }[];
+  /** Absent in logs of earlier versions. */
+  readonly facts?: readonly EventMessage[];
+}
+
 export interface TargetMessage {
   readonly object: string;
   readonly x?: number;

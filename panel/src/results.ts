@@ -3,11 +3,13 @@
 import { printable, type DrawnEvent, type Status } from "report-drawing";
 
 import {
-  nanoseconds, titleOf, type EventMessage, type ResultMessage, type SpecificationMessage,
+  nanoseconds, titleOf, type EventMessage, type RecentEventsMessage, type ResultMessage, type SpecificationMessage,
 } from "./messages";
 import type { Viewer } from "./viewer";
 
 export const EVENTS = "/spatial/events";
+/** The newest events, for panels that join a run late. */
+export const RECENT_EVENTS = "/spatial/recent_events";
 
 /** A change, with the time at which it is confirmed: before that, no one knows of it. */
 export interface Event extends DrawnEvent {
@@ -101,6 +103,13 @@ export class Results {
       if (isSame(this.events[before]!)) return;
     }
     this.events.splice(place, 0, event);
+  }
+
+  takeRecent(time: number, { events, facts = [] }: RecentEventsMessage): void {
+    facts.forEach((event, place) => {
+      const message = { key: "message", value: events[place]!.event };
+      this.takeEvent(time, { ...event, metadata: [...event.metadata, message] });
+    });
   }
 
   /** Returns the newest event of a result that is known at a time. */

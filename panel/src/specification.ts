@@ -5,8 +5,8 @@ import { createElement, type ReactElement } from "react";
 
 import { NodeChart } from "./curve";
 import { EventList } from "./event-list";
-import type { EventMessage, RobustnessMessage, SpecificationMessage } from "./messages";
-import { EVENTS, Results } from "./results";
+import type { EventMessage, RecentEventsMessage, RobustnessMessage, SpecificationMessage } from "./messages";
+import { EVENTS, RECENT_EVENTS, Results } from "./results";
 import { Tree } from "./tree";
 import { chooser, type Cursor, type View, type Viewer } from "./viewer";
 
@@ -14,6 +14,7 @@ const ROBUSTNESS = "/spatial/robustness";
 
 export class SpecificationView implements View {
   readonly topics = [EVENTS, ROBUSTNESS];
+  readonly currentTopics = [RECENT_EVENTS];
   readonly body = element("div", { class: "panel-body" });
   private readonly results: Results;
   private readonly place = element("div", { class: "tree" });
@@ -48,6 +49,7 @@ export class SpecificationView implements View {
 
   take(topic: string, time: number, message: unknown): void {
     if (topic === EVENTS) this.results.takeEvent(time, message as EventMessage);
+    else if (topic === RECENT_EVENTS) this.results.takeRecent(time, message as RecentEventsMessage);
     else this.tree?.take(time, message as RobustnessMessage);
   }
 

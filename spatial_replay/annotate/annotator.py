@@ -30,7 +30,13 @@ from spatial_replay.annotate.violations import EvaluatedResult, ShadeTracker, vi
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvent, RecentEvents, Robustness, StandingUpdate
+from spatial_replay.logs.schemas.Robustness_pb2 import (
+    EventFacts,
+    RecentEvent,
+    RecentEvents,
+    Robustness,
+    StandingUpdate,
+)
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.topics import (
     AUTOMATON,
@@ -167,7 +173,7 @@ class Annotator:
         self.standing.zero_ns = self._scene.zero_ns
         self._show = show
         self._written = dict.fromkeys(DERIVED, 0)
-        self._newest = deque[RecentEvent](maxlen=_MOST_RECENT)
+        self._newest = deque[tuple[RecentEvent, EventFacts]](maxlen=_MOST_RECENT)
 
     @property
     def scene(self) -> SceneState:
@@ -235,18 +241,26 @@ class Annotator:
         """Return the event of what happens to a run beside its samples."""
         return self._events([encoded_occurrence(time_ns, what, sentence)])
 
-    def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
-        """Take in the next samples and return only their events."""
+    def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock], most_changes: int = 0) -> list[Messages]:
+        """Take in the next samples and return only their events, and how results stood at the last changes.
+
+        Args:
+            most_changes: the number of these changes, at most; see `StandingEncoder.encode_changes`.
+        """
         if not len(trace):
             return []
         self._find_zero(trace)
         for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
                 run.pass_over(block)
-        self.standing.pass_over(blocks)
         self._scene = self._encoder.pass_over(trace, self._scene)
         self._remember(trace, blocks)
-        return self._events(self._changes(trace, blocks))
+        messages = self._events(self._changes(trace, blocks))
+        if not most_changes or not self._trees:
+            self.standing.pass_over(blocks)
+            return messages
+        changes = self.standing.encode_changes(blocks, self._over, most_changes)
+        return [*messages, self._messages(_STANDING, *changes)]
 
     def draw(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
         """Show the scene at the next sample, however short ago the one before was; nothing else is made."""
@@ -332,8 +346,9 @@ class Annotator:
         zero_ns = events[0].time_ns if self._scene.zero_ns is None else self._scene.zero_ns
         for event in events:
             seconds = round((event.time_ns - zero_ns) / 1e9, 3)
-            self._newest.appendleft(RecentEvent(at=seconds, event=event.log.message))
-        return RecentEvents(events=self._newest).SerializeToString(deterministic=True)
+            self._newest.appendleft((RecentEvent(at=seconds, event=event.log.message), event.facts))
+        rows, facts = zip(*self._newest, strict=True)
+        return RecentEvents(events=rows, facts=facts).SerializeToString(deterministic=True)
 
     def _scene_messages(
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False

@@ -25,6 +25,7 @@ from spatial_replay.annotate.deciding_leaf import (
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.compiled import kernel
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.schemas.Robustness_pb2 import EventFacts
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import amount_text, how_text, uncertain_text
@@ -313,6 +314,20 @@ class EncodedEvent(NamedTuple):
     time_ns: int
     event: bytes
     log: Log
+
+    @property
+    def facts(self) -> EventFacts:
+        """Its facts, as far as a list of events needs them."""
+        event = Event.FromString(self.event)
+        facts = EventFacts(start_time=event.start_time, end_time=event.end_time)
+        for entry in event.metadata:
+            if entry.key in _LISTED:
+                facts.metadata.add(key=entry.key, value=entry.value)
+        return facts
+
+
+_LISTED: Final = frozenset({"specification", "object", "node", "verdict", "sign", "witness_node", "vacuous"})
+"""The facts of an event that a list of events needs."""
 
 
 def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:

@@ -67,8 +67,14 @@ class _Entry(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Shared parts of messages with the same texts and lengths: the worst result, the states of automata in
-    words, the violated results with their deciding atoms, and whether the log is finished."""
+    """Shared parts of messages with the same texts and lengths.
+
+    Attributes:
+        worst: the place of the worst result.
+        words: states of automata.
+        violated: the violated results with their deciding atoms.
+        final: whether the log is finished.
+    """
 
     worst: int
     words: tuple[str, ...]
@@ -143,20 +149,55 @@ class StandingEncoder:
             blocks: of each tree; an object's result may have fewer samples.
             over: of each tree, what decided it, if that has happened in these samples or before.
         """
-        samples = spaced(times_ns, self._written_ns)
-        shown_ns = times_ns[samples]
+        shown_ns = times_ns[spaced(times_ns, self._written_ns)]
+        if len(shown_ns):
+            self._written_ns = int(shown_ns[-1])
+        return shown_ns, self._encode_at(shown_ns, blocks, over)
+
+    def encode_changes(
+        self, blocks: Sequence[SeriesBlock], over: Sequence[str], most: int
+    ) -> tuple[Integers, Sequence[bytes]]:
+        """Take in the next samples; return times and contents of a message for each of the last changes.
+
+        A change is the first sample, or one in which an entry stands otherwise than in the sample before.
+
+        Args:
+            over: as for `encode`.
+            most: the number of changes, at most.
+        """
+        changes_ns = [np.empty(0, np.int64)]
+        for index, block in enumerate(blocks):
+            nodes = [entry.node for entry in self._entries if entry.tree == index]
+            codes = standing_codes(block.series[nodes])
+            is_change = np.ones(len(block.times_ns), np.bool_)
+            is_change[1:] = (codes[:, 1:] != codes[:, :-1]).any(axis=0)
+            changes_ns.append(block.times_ns[is_change])
+        shown_ns = np.unique(np.concatenate(changes_ns))[-most:]
+        return shown_ns, self._encode_at(shown_ns, blocks, over)
+
+    def _encode_at(
+        self, shown_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
+    ) -> Sequence[bytes]:
+        """Take in the next samples; return the messages of the times that are shown."""
         series, words, since, least = [], [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
-            series.append(np.concatenate([self._last[index], block.series], axis=2)[:, :, at])
+            series.append(self._numbers(index, block, at))
             words.append(self._described(index, block, at))
             since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
             least.append(np.append(self._least_ns[index], self._became_least(index, block))[at])
         self.pass_over(blocks)
-        if not len(samples):
-            return shown_ns, []
-        self._written_ns = int(shown_ns[-1])
-        return shown_ns, self._messages(shown_ns, series, words, np.array([since, least]), over)
+        if not len(shown_ns):
+            return []
+        return self._messages(shown_ns, series, words, np.array([since, least]), over)
+
+    def _numbers(self, index: int, block: SeriesBlock, at: Integers) -> Floats:
+        """Return the numbers (N, 4, S) of a result `at` samples into a block; those before it at 0."""
+        if not len(block.times_ns):
+            return np.repeat(self._last[index], len(at), axis=2)
+        numbers = block.series[:, :, np.maximum(at - 1, 0)]
+        numbers[:, :, at == 0] = self._last[index]
+        return numbers
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
         """Take in the next samples without a message."""
@@ -257,6 +298,7 @@ class StandingEncoder:
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
             columns = [column[members] for column in (times_ns[:, None], *numbers)]
+            stamps = np.divmod(times_ns[members, None], 10**9)
             for place, _ in layout.violated:
                 if place not in of_violated:
                     seconds = (np.minimum(instants_ns[:, place], times_ns) - (self.zero_ns or 0)) / 1e9
@@ -264,6 +306,7 @@ class StandingEncoder:
                     of_violated[place] = since, round_numbers(_finite(-series[place][0, 3, :, None])), at
                 columns += [column[members] for column in of_violated[place]]
             own_marks = np.concatenate([mark[members] for mark in marks], axis=1)
+            columns += [numbers.astype(np.float64) for numbers in stamps]
             encoded.append((members, self._template(layout).encode(words_of(columns), own_marks)))
         return join_in_order(encoded)
 
@@ -279,6 +322,7 @@ class StandingEncoder:
             message.violated.add(name=name, since=1.0, by=1.0, unit=unit, over=over, at=1.0)
         if not violated:
             message.violated.add(name="nothing is violated")
+        message.header.stamp.sec = message.header.stamp.nsec = 1.0
         return WireTemplate.of(message)
 
 

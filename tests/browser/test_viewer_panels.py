@@ -179,19 +179,23 @@ def test_a_live_source_is_followed_and_may_jump_back(open_panel: Open, results: 
         expect(now).to_have_text(number_text(results[0].series[0, 1, sample]))
 
 
-def test_a_panel_that_joins_late_has_the_time_of_the_log_and_all_events(open_panel: Open) -> None:
+@pytest.mark.parametrize("topic", ["/spatial/events", "/spatial/recent_events"])
+def test_a_panel_that_joins_late_has_the_time_of_the_log_and_all_events(open_panel: Open, topic: str) -> None:
+    """Either all events come again, as after a seek, or the last message with the newest ones, as in a run."""
     page = open_panel("table", "specification", "live")
     count = page.evaluate(
-        """() => {
+        """(topic) => {
             const late = {sec: 4, nsec: 0};
             const of = (topic) => MESSAGES
                 .filter((each) => each.topic === topic && compare(each.receiveTime, late) <= 0)
                 .map((each) => ({...each, receiveTime: late}));
-            const events = of("/spatial/events"), numbers = of("/spatial/robustness").slice(-3);
+            const events = of(topic).slice(topic === "/spatial/events" ? 0 : -1);
+            const numbers = of("/spatial/robustness").slice(-3);
             viewer.render({startTime: late, currentTime: late, currentFrame: [...events, ...numbers]});
             viewer.render({currentFrame: of("/spatial/specification")});
-            return events.length;
-        }"""
+            return of("/spatial/events").length;
+        }""",
+        topic,
     )
     assert count > 1
     expect(page.locator(".panel-head")).to_contain_text("at 4.000 s")

@@ -34,7 +34,16 @@ def extension_files() -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-TOPICS = ("specification", "robustness", "automaton", "events", "decision", "gradient_map", "behaviour_tree")
+TOPICS = (
+    "specification",
+    "robustness",
+    "automaton",
+    "events",
+    "recent_events",
+    "decision",
+    "gradient_map",
+    "behaviour_tree",
+)
 
 
 def write_viewer_page(log: Path, page: Path, *, topics: Sequence[str] = TOPICS) -> None:

@@ -22,29 +22,38 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fspatial_replay/Robustness.proto\x12\x0espatial_replay\"\x93\x01\n\nRobustness\x12\x14\n\x07time_ns\x18\x01 \x01(\x06H\x00\x88\x01\x01\x12\x15\n\rspecification\x18\x02 \x01(\t\x12\x0e\n\x06object\x18\x03 \x01(\t\x12-\n\x05nodes\x18\x04 \x03(\x0b\x32\x1e.spatial_replay.NodeRobustness\x12\r\n\x05\x66inal\x18\x05 \x01(\x08\x42\n\n\x08_time_ns\"\xdc\x01\n\x0eNodeRobustness\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\x12\n\x05value\x18\x03 \x01(\x01H\x01\x88\x01\x01\x12\x10\n\x03now\x18\x04 \x01(\x01H\x02\x88\x01\x01\x12\x12\n\x05lower\x18\x05 \x01(\x01H\x03\x88\x01\x01\x12\x12\n\x05upper\x18\x06 \x01(\x01H\x04\x88\x01\x01\x12*\n\x08standing\x18\x08 \x01(\x0e\x32\x18.spatial_replay.StandingB\x05\n\x03_idB\x08\n\x06_valueB\x06\n\x04_nowB\x08\n\x06_lowerB\x08\n\x06_upperJ\x04\x08\x07\x10\x08\"\xba\x01\n\x0eStandingUpdate\x12\x14\n\x07time_ns\x18\x01 \x01(\x06H\x00\x88\x01\x01\x12/\n\x07results\x18\x02 \x03(\x0b\x32\x1e.spatial_replay.ResultStanding\x12\r\n\x05worst\x18\x03 \x01(\t\x12\r\n\x05\x66inal\x18\x05 \x01(\x08\x12+\n\x08violated\x18\x06 \x03(\x0b\x32\x19.spatial_replay.ViolationB\n\n\x08_time_nsJ\x04\x08\x04\x10\x05J\x04\x08\x07\x10\x08\"\x83\x01\n\tViolation\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\x05since\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x0f\n\x02\x62y\x18\x03 \x01(\x01H\x01\x88\x01\x01\x12\x0c\n\x04unit\x18\x04 \x01(\t\x12\x0c\n\x04over\x18\x05 \x01(\t\x12\x0f\n\x02\x61t\x18\x06 \x01(\x01H\x02\x88\x01\x01\x42\x08\n\x06_sinceB\x05\n\x03_byB\x05\n\x03_at\";\n\x0cRecentEvents\x12+\n\x06\x65vents\x18\x01 \x03(\x0b\x32\x1b.spatial_replay.RecentEvent\"(\n\x0bRecentEvent\x12\n\n\x02\x61t\x18\x01 \x01(\x01\x12\r\n\x05\x65vent\x18\x02 \x01(\t\"\x93\x01\n\x0eResultStanding\x12\x0c\n\x04name\x18\x01 \x01(\t\x12*\n\x08standing\x18\x02 \x01(\x0e\x32\x18.spatial_replay.Standing\x12\x17\n\nrobustness\x18\x03 \x01(\x01H\x00\x88\x01\x01\x12\x0c\n\x04unit\x18\x04 \x01(\t\x12\x11\n\tautomaton\x18\x05 \x01(\tB\r\n\x0b_robustness*m\n\x08Standing\x12\x18\n\x14STANDING_UNSPECIFIED\x10\x00\x12\r\n\tSATISFIED\x10\x1c\x12\x10\n\x0cHOLDS_SO_FAR\x10 \x12\x0b\n\x07PENDING\x10!\x12\x0c\n\x08VIOLATED\x10\x1d\x12\x0b\n\x07UNKNOWN\x10/b\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fspatial_replay/Robustness.proto\x12\x0espatial_replay\x1a\x1fgoogle/protobuf/timestamp.proto\"\x93\x01\n\nRobustness\x12\x14\n\x07time_ns\x18\x01 \x01(\x06H\x00\x88\x01\x01\x12\x15\n\rspecification\x18\x02 \x01(\t\x12\x0e\n\x06object\x18\x03 \x01(\t\x12-\n\x05nodes\x18\x04 \x03(\x0b\x32\x1e.spatial_replay.NodeRobustness\x12\r\n\x05\x66inal\x18\x05 \x01(\x08\x42\n\n\x08_time_ns\"\xdc\x01\n\x0eNodeRobustness\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\x12\n\x05value\x18\x03 \x01(\x01H\x01\x88\x01\x01\x12\x10\n\x03now\x18\x04 \x01(\x01H\x02\x88\x01\x01\x12\x12\n\x05lower\x18\x05 \x01(\x01H\x03\x88\x01\x01\x12\x12\n\x05upper\x18\x06 \x01(\x01H\x04\x88\x01\x01\x12*\n\x08standing\x18\x08 \x01(\x0e\x32\x18.spatial_replay.StandingB\x05\n\x03_idB\x08\n\x06_valueB\x06\n\x04_nowB\x08\n\x06_lowerB\x08\n\x06_upperJ\x04\x08\x07\x10\x08\"\xe2\x01\n\x0eStandingUpdate\x12\x14\n\x07time_ns\x18\x01 \x01(\x06H\x00\x88\x01\x01\x12/\n\x07results\x18\x02 \x03(\x0b\x32\x1e.spatial_replay.ResultStanding\x12\r\n\x05worst\x18\x03 \x01(\t\x12\r\n\x05\x66inal\x18\x05 \x01(\x08\x12+\n\x08violated\x18\x06 \x03(\x0b\x32\x19.spatial_replay.Violation\x12&\n\x06header\x18\x08 \x01(\x0b\x32\x16.spatial_replay.HeaderB\n\n\x08_time_nsJ\x04\x08\x04\x10\x05J\x04\x08\x07\x10\x08\"\x83\x01\n\tViolation\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\x05since\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x0f\n\x02\x62y\x18\x03 \x01(\x01H\x01\x88\x01\x01\x12\x0c\n\x04unit\x18\x04 \x01(\t\x12\x0c\n\x04over\x18\x05 \x01(\t\x12\x0f\n\x02\x61t\x18\x06 \x01(\x01H\x02\x88\x01\x01\x42\x08\n\x06_sinceB\x05\n\x03_byB\x05\n\x03_at\".\n\x06Header\x12$\n\x05stamp\x18\x01 \x01(\x0b\x32\x15.spatial_replay.Stamp\"=\n\x05Stamp\x12\x10\n\x03sec\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x11\n\x04nsec\x18\x02 \x01(\x01H\x01\x88\x01\x01\x42\x06\n\x04_secB\x07\n\x05_nsec\"f\n\x0cRecentEvents\x12+\n\x06\x65vents\x18\x01 \x03(\x0b\x32\x1b.spatial_replay.RecentEvent\x12)\n\x05\x66\x61\x63ts\x18\x02 \x03(\x0b\x32\x1a.spatial_replay.EventFacts\"\x97\x01\n\nEventFacts\x12.\n\nstart_time\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12,\n\x08\x65nd_time\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12+\n\x08metadata\x18\x03 \x03(\x0b\x32\x19.spatial_replay.EventFact\"\'\n\tEventFact\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t\"(\n\x0bRecentEvent\x12\n\n\x02\x61t\x18\x01 \x01(\x01\x12\r\n\x05\x65vent\x18\x02 \x01(\t\"\x93\x01\n\x0eResultStanding\x12\x0c\n\x04name\x18\x01 \x01(\t\x12*\n\x08standing\x18\x02 \x01(\x0e\x32\x18.spatial_replay.Standing\x12\x17\n\nrobustness\x18\x03 \x01(\x01H\x00\x88\x01\x01\x12\x0c\n\x04unit\x18\x04 \x01(\t\x12\x11\n\tautomaton\x18\x05 \x01(\tB\r\n\x0b_robustness*m\n\x08Standing\x12\x18\n\x14STANDING_UNSPECIFIED\x10\x00\x12\r\n\tSATISFIED\x10\x1c\x12\x10\n\x0cHOLDS_SO_FAR\x10 \x12\x0b\n\x07PENDING\x10!\x12\x0c\n\x08VIOLATED\x10\x1d\x12\x0b\n\x07UNKNOWN\x10/b\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'spatial_replay.Robustness_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_STANDING']._serialized_start=1000
-  _globals['_STANDING']._serialized_end=1109
-  _globals['_ROBUSTNESS']._serialized_start=52
-  _globals['_ROBUSTNESS']._serialized_end=199
-  _globals['_NODEROBUSTNESS']._serialized_start=202
-  _globals['_NODEROBUSTNESS']._serialized_end=422
-  _globals['_STANDINGUPDATE']._serialized_start=425
-  _globals['_STANDINGUPDATE']._serialized_end=611
-  _globals['_VIOLATION']._serialized_start=614
-  _globals['_VIOLATION']._serialized_end=745
-  _globals['_RECENTEVENTS']._serialized_start=747
-  _globals['_RECENTEVENTS']._serialized_end=806
-  _globals['_RECENTEVENT']._serialized_start=808
-  _globals['_RECENTEVENT']._serialized_end=848
-  _globals['_RESULTSTANDING']._serialized_start=851
-  _globals['_RESULTSTANDING']._serialized_end=998
+  _globals['_STANDING']._serialized_start=1422
+  _globals['_STANDING']._serialized_end=1531
+  _globals['_ROBUSTNESS']._serialized_start=85
+  _globals['_ROBUSTNESS']._serialized_end=232
+  _globals['_NODEROBUSTNESS']._serialized_start=235
+  _globals['_NODEROBUSTNESS']._serialized_end=455
+  _globals['_STANDINGUPDATE']._serialized_start=458
+  _globals['_STANDINGUPDATE']._serialized_end=684
+  _globals['_VIOLATION']._serialized_start=687
+  _globals['_VIOLATION']._serialized_end=818
+  _globals['_HEADER']._serialized_start=820
+  _globals['_HEADER']._serialized_end=866
+  _globals['_STAMP']._serialized_start=868
+  _globals['_STAMP']._serialized_end=929
+  _globals['_RECENTEVENTS']._serialized_start=931
+  _globals['_RECENTEVENTS']._serialized_end=1033
+  _globals['_EVENTFACTS']._serialized_start=1036
+  _globals['_EVENTFACTS']._serialized_end=1187
+  _globals['_EVENTFACT']._serialized_start=1189
+  _globals['_EVENTFACT']._serialized_end=1228
+  _globals['_RECENTEVENT']._serialized_start=1230
+  _globals['_RECENTEVENT']._serialized_end=1270
+  _globals['_RESULTSTANDING']._serialized_start=1273
+  _globals['_RESULTSTANDING']._serialized_end=1420
 # @@protoc_insertion_point(module_scope)

@@ -9,6 +9,7 @@ import google.protobuf.descriptor
 import google.protobuf.internal.containers
 import google.protobuf.internal.enum_type_wrapper
 import google.protobuf.message
+import google.protobuf.timestamp_pb2
 import sys
 import typing
 
@@ -162,6 +163,7 @@ class StandingUpdate(google.protobuf.message.Message):
     WORST_FIELD_NUMBER: builtins.int
     FINAL_FIELD_NUMBER: builtins.int
     VIOLATED_FIELD_NUMBER: builtins.int
+    HEADER_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time of the sample in nanoseconds; equal to the log time of the message, unless that is final."""
     worst: builtins.str
@@ -178,6 +180,10 @@ class StandingUpdate(google.protobuf.message.Message):
         so: viewers draw no table without rows.
         """
 
+    @property
+    def header(self) -> global___Header:
+        """The time of the sample, for strips of a live source: after a seek, earlier messages come at the new time."""
+
     def __init__(
         self,
         *,
@@ -186,9 +192,10 @@ class StandingUpdate(google.protobuf.message.Message):
         worst: builtins.str = ...,
         final: builtins.bool = ...,
         violated: collections.abc.Iterable[global___Violation] | None = ...,
+        header: global___Header | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "header", b"header", "time_ns", b"time_ns"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "header", b"header", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___StandingUpdate = StandingUpdate
@@ -239,24 +246,119 @@ class Violation(google.protobuf.message.Message):
 global___Violation = Violation
 
 @typing.final
+class Header(google.protobuf.message.Message):
+    """A time as viewers read it in the header of a message."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    STAMP_FIELD_NUMBER: builtins.int
+    @property
+    def stamp(self) -> global___Stamp: ...
+    def __init__(
+        self,
+        *,
+        stamp: global___Stamp | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["stamp", b"stamp"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["stamp", b"stamp"]) -> None: ...
+
+global___Header = Header
+
+@typing.final
+class Stamp(google.protobuf.message.Message):
+    """Seconds since 1970 and nanoseconds, both whole: doubles have one length."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SEC_FIELD_NUMBER: builtins.int
+    NSEC_FIELD_NUMBER: builtins.int
+    sec: builtins.float
+    nsec: builtins.float
+    def __init__(
+        self,
+        *,
+        sec: builtins.float | None = ...,
+        nsec: builtins.float | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_nsec", b"_nsec", "_sec", b"_sec", "nsec", b"nsec", "sec", b"sec"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_nsec", b"_nsec", "_sec", b"_sec", "nsec", b"nsec", "sec", b"sec"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_nsec", b"_nsec"]) -> typing.Literal["nsec"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_sec", b"_sec"]) -> typing.Literal["sec"] | None: ...
+
+global___Stamp = Stamp
+
+@typing.final
 class RecentEvents(google.protobuf.message.Message):
-    """The newest events, so that a viewer that seeks in a file can list them."""
+    """The newest events, so that a viewer that seeks in a file, or joins a run late, can list them."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     EVENTS_FIELD_NUMBER: builtins.int
+    FACTS_FIELD_NUMBER: builtins.int
     @property
     def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___RecentEvent]:
         """The newest first."""
+
+    @property
+    def facts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___EventFacts]:
+        """The facts of the same events, in the same order."""
 
     def __init__(
         self,
         *,
         events: collections.abc.Iterable[global___RecentEvent] | None = ...,
+        facts: collections.abc.Iterable[global___EventFacts] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["events", b"events"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["events", b"events", "facts", b"facts"]) -> None: ...
 
 global___RecentEvents = RecentEvents
+
+@typing.final
+class EventFacts(google.protobuf.message.Message):
+    """Facts of an event on /spatial/events, as far as a list of events needs them."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    START_TIME_FIELD_NUMBER: builtins.int
+    END_TIME_FIELD_NUMBER: builtins.int
+    METADATA_FIELD_NUMBER: builtins.int
+    @property
+    def start_time(self) -> google.protobuf.timestamp_pb2.Timestamp: ...
+    @property
+    def end_time(self) -> google.protobuf.timestamp_pb2.Timestamp: ...
+    @property
+    def metadata(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___EventFact]: ...
+    def __init__(
+        self,
+        *,
+        start_time: google.protobuf.timestamp_pb2.Timestamp | None = ...,
+        end_time: google.protobuf.timestamp_pb2.Timestamp | None = ...,
+        metadata: collections.abc.Iterable[global___EventFact] | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["end_time", b"end_time", "start_time", b"start_time"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["end_time", b"end_time", "metadata", b"metadata", "start_time", b"start_time"]) -> None: ...
+
+global___EventFacts = EventFacts
+
+@typing.final
+class EventFact(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    KEY_FIELD_NUMBER: builtins.int
+    VALUE_FIELD_NUMBER: builtins.int
+    key: builtins.str
+    value: builtins.str
+    def __init__(
+        self,
+        *,
+        key: builtins.str = ...,
+        value: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["key", b"key", "value", b"value"]) -> None: ...
+
+global___EventFact = EventFact
 
 @typing.final
 class RecentEvent(google.protobuf.message.Message):
