@@ -174,8 +174,13 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
     ]
 
 
-def state_strips(trees: Sequence[ReportedTree]) -> Panel:
-    """Return a strip for how each result stands, then for its named specs."""
+def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Panel:
+    """Return a strip for how each result stands, then for its named specs.
+
+    Args:
+        by_stamp: whether the header of a message has its time. After a seek of a live source, earlier
+            messages come at the new time.
+    """
     strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
     more = [(title, _standing_path(title, "standing")) for title, node in _parts(trees) if looks_ahead(node)]
     # Foxglove takes its colours from here, Lichtblick from the numbers
@@ -187,7 +192,7 @@ def state_strips(trees: Sequence[ReportedTree]) -> Panel:
         {
             "enabled": True,
             "label": label,
-            "timestampMethod": "receiveTime",
+            "timestampMethod": "headerStamp" if by_stamp else "receiveTime",
             "value": path,
             "customStates": {"type": "discrete", "states": states},
         }
@@ -387,7 +392,8 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
     unit at a time, the states of results, and a panel of tabs.
     """
     contents = contents.worst_first()
-    return _layout(contents, sample_curves(contents.trees, contents.units, contents.zero), _details(contents))
+    curves = sample_curves(contents.trees, contents.units, contents.zero)
+    return _layout(contents, curves, _details(contents), state_strips(contents.trees))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
@@ -400,7 +406,8 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
         details.insert(0, ("whole log", _titled("RawMessages!summary", "The whole log", summary)))
     title = "Playback and constants of the specification"
     constants = _titled("Parameters!constants", title, {"title": title})
-    return _layout(contents, whole_curves(contents.trees, contents.units), details, below=constants)
+    curves = whole_curves(contents.trees, contents.units)
+    return _layout(contents, curves, details, state_strips(contents.trees, by_stamp=True), below=constants)
 
 
 _PANELS: Final = "spatial-replay.spatial-replay {}!{}"
@@ -465,7 +472,11 @@ def layout_text(layout: Mapping[str, Any]) -> str:
 
 
 def _layout(
-    contents: LayoutContents, curves: Sequence[Panel], details: _Details, below: Panel | None = None
+    contents: LayoutContents,
+    curves: Sequence[Panel],
+    details: _Details,
+    states: Panel,
+    below: Panel | None = None,
 ) -> dict[str, Any]:
     """Return a layout: lights at the top, the scene on the left, curves, states and details on the right.
 
@@ -482,7 +493,6 @@ def _layout(
     right: list[tuple[_Tree, float]] = []
     if curves:
         plots, own = _tabs("Tab!curves", [(_tab_title(each), each) for each in curves])
-        states = state_strips(contents.trees)
         panels += [*own, states]
         # curves have at least 140 pixels on a screen of 1280 × 720
         right += [(plots, 4.5), (states.identifier, 2.0)]

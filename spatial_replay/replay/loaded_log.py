@@ -28,7 +28,7 @@ from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge
 from spatial_replay.logs.source import MemorySource, Source, read_ahead, read_blocks
-from spatial_replay.logs.topics import RECENT_EVENTS
+from spatial_replay.logs.topics import EVENT_LOG, EVENTS, RECENT_EVENTS, STANDING
 from spatial_replay.monitor.ends import Needs
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
@@ -580,6 +580,9 @@ _LOOK_BACK_NS: Final = 2_000_000_000
 _MOST_EVENTS: Final = 500
 """The most earlier events that a seek sends."""
 
+_MOST_CHANGES: Final = 100
+"""The most earlier changes of verdicts that a seek sends."""
+
 
 class Playback:
     """The messages that an annotated log would have, in the order of time.
@@ -593,6 +596,7 @@ class Playback:
         arrow: the title of the result whose violation the scene points at, from the next `seek` on; "" for
             the first one.
         time_ns: the time up to which messages were taken, inclusive.
+        past: how results stood at the last changes before the sample of the last `seek`, by time.
     """
 
     def __init__(self, evaluated: Evaluated) -> None:
@@ -601,6 +605,7 @@ class Playback:
         self._times_ns = evaluated.loaded.inside.times_ns
         self.start_ns, self.end_ns = int(self._times_ns[0]), log_messages.end_ns
         self.time_ns = self.start_ns
+        self.past = Messages()
         self.evaluated = evaluated
         self.arrow = ""
         self._regions = shown_regions(evaluated.edited.files)
@@ -622,7 +627,7 @@ class Playback:
         """Go to a time, and return what a viewer shows there.
 
         The state has the sample at or before it with all its messages, the specification, the latest events,
-        and the last message of each of the log's own topics.
+        and the last message of each of the log's own topics. `past` has how results stood before it.
 
         Raises:
             LogError: the log can no longer be read.
@@ -637,7 +642,9 @@ class Playback:
         scene = replace(self._annotator.scene, written_ns=None, last={}, top=self._start.top)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
-        events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, sample))))
+        before = merge(self._annotator.pass_over(*self.evaluated.part(0, sample), _MOST_CHANGES))
+        self.past = before.of_topics((STANDING,))
+        events = _last(before.of_topics((EVENTS, EVENT_LOG, RECENT_EVENTS)))
         derived = self._annotator.messages(*self.evaluated.part(sample, self._next))
         shown_there = merge([events, *derived, self._seek_own(int(self._times_ns[sample]))])
         return join([shown_there, _last(self._end())])

@@ -746,18 +746,24 @@ class Player:
     def _seek(self, time_ns: int) -> None:
         """Send what is shown at a time, and go on from there.
 
-        Viewers drop what they have when time steps back, or a state says that it jumped: both come first. A
-        viewer that drops messages later than that is sent them once more while it is paused.
+        A viewer that drops messages later than that is sent them once more while it is paused.
         """
-        self._viewers.send_time(time_ns)
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
         self._show(time_ns)
         self._session.continue_from(time_ns)
         self._shows_again = True
 
     def _show(self, time_ns: int) -> None:
+        """Send what is shown at a time, after viewers have dropped what they had.
+
+        They do so when time steps back, or at a state that says that it jumped. Times overtake messages.
+        """
+        self._viewers.send_time(self._playback.start_ns)
+        self._viewers.send_time(time_ns)
+        present = self._playback.seek(time_ns)
+        self._viewers.publish(self._playback.past)
         self._send_curves(time_ns)
-        self._viewers.publish(self._playback.seek(time_ns))
+        self._viewers.publish(present)
         self._viewers.send_time(time_ns)
 
     def _resend(self, topics: Collection[str]) -> None:

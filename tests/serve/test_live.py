@@ -9,6 +9,8 @@ import socket
 import struct
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
+from operator import eq
 from pathlib import Path
 from typing import Any
 
@@ -217,6 +219,51 @@ def test_every_seek_leaves_all_that_is_shown_at_its_time(server: Serving) -> Non
             assert SPECIFICATION in shown
 
     watch(server, looking)
+
+
+def test_a_seek_shows_how_results_stood_before_the_cursor(server: Serving, tmp_path: Path) -> None:
+    """A viewer draws a strip between changes, each at the time in the header of its message."""
+    run_replay(PiecewiseSource(run(COUNT), 7), [specification()], output=tmp_path / "annotated.mcap")
+    results = {
+        time_ns: results_of(data)
+        for topic, time_ns, _, _, data in content_of(tmp_path / "annotated.mcap").messages
+        if topic == STANDING
+    }
+
+    async def looking(own: Viewer) -> None:
+        await own.subscribe([STANDING])
+        for place in (20, 9, 22):
+            seek_ns = place * STEP_NS
+            await own.ask(seek_ns=seek_ns)
+            # viewers drop what they have once the time steps back
+            await own.until(partial(eq, 0))
+            await own.until(is_message_at(seek_ns))
+            again = await own.until(is_message_at(seek_ns))
+            strip = {
+                stamp_ns(message.data): results_of(message.data)
+                for message in again
+                if isinstance(message, Message)
+            }
+            before_ns = range(0, seek_ns, STEP_NS)
+            changes_ns = [at_ns for at_ns in before_ns if results[at_ns] != results.get(at_ns - STEP_NS)]
+            assert len(changes_ns) > 2
+            assert strip == {at_ns: results[at_ns] for at_ns in [*changes_ns, seek_ns]}
+
+    watch(server, looking)
+
+
+def is_message_at(time_ns: int) -> Callable[[Received], bool]:
+    return lambda received: isinstance(received, Message) and received.time_ns == time_ns
+
+
+def stamp_ns(data: bytes) -> int:
+    stamp = StandingUpdate.FromString(data).header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nsec)
+
+
+def results_of(data: bytes) -> list[tuple[str, int]]:
+    """How each result and named spec stands, in one message."""
+    return [(result.name, result.standing) for result in StandingUpdate.FromString(data).results]
 
 
 @pytest.mark.parametrize(
