@@ -181,7 +181,7 @@ def test_a_live_source_is_followed_and_may_jump_back(open_panel: Open, results: 
 
 @pytest.mark.parametrize("topic", ["/spatial/events", "/spatial/recent_events"])
 def test_a_panel_that_joins_late_has_the_time_of_the_log_and_all_events(open_panel: Open, topic: str) -> None:
-    """Either all events come again, as after a seek, or the last message with the newest ones, as in a run."""
+    """After a seek all events come again; in a run the last message with the newest ones does."""
     page = open_panel("table", "specification", "live")
     count = page.evaluate(
         """(topic) => {
