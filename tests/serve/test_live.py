@@ -232,6 +232,7 @@ def test_a_seek_shows_how_results_stood_before_the_cursor(server: Serving, tmp_p
 
     async def looking(own: Viewer) -> None:
         await own.subscribe([STANDING])
+        await own.message(STANDING)
         for place in (20, 9, 22):
             seek_ns = place * STEP_NS
             await own.ask(seek_ns=seek_ns)
