@@ -23,6 +23,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import Evaluation, SpecResult
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.verdict import require_ltlf
+from spatial_replay.planning.decision_log import place_text
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection
 from spatial_replay.spec.checks import with_numbers
@@ -702,8 +703,7 @@ def _map_hashes(decision: PlanDecision | None) -> dict[str, tuple[bytes, ...]]:
 def _decision_text(decision: PlanDecision | None) -> str:
     if decision is None:
         return "none: the run has no such decision"
-    target = decision.target
-    where = f"; {target.object} to ({target.x:.4g}, {target.y:.4g})" if decision.HasField("target") else ""
+    where = f"; {place_text(decision.target)}" if decision.HasField("target") else ""
     return f"{decision.reason}{where}"
 
 

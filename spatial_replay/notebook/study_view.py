@@ -19,11 +19,12 @@ from spatial_replay.geometry.footprint import Footprint, moved_object
 from spatial_replay.html import Html, element, quiet, table, verdict_mark
 from spatial_replay.lazy import page_of
 from spatial_replay.logs.output_file import replacing
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision, PlanEdge, PlanTarget
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import INK, new_panel, new_panels, picture, plain, signed_colours
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE
-from spatial_replay.planning.decision_log import decision_lines, decision_message
-from spatial_replay.planning.decisions import Candidate, Consideration, Step
+from spatial_replay.planning.decision_log import decision_lines, decision_message, target_message
+from spatial_replay.planning.decisions import Step
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap
 from spatial_replay.planning.read import LoggedStep
 from spatial_replay.text import plural
@@ -335,11 +336,12 @@ def draw_map(
         UsageError: matplotlib is not installed.
     """
     ax = new_panel((6.4, 5.2)) if ax is None else ax
-    turn = _best_turn(gradient, target) if turn is None else turn
+    if turn is None:
+        turn = _best_turn(gradient, None if target is None else target.turn)
     image = _draw_cells(gradient, ax, turn, _reach_of([gradient]), margin)
     _draw_objects(ax, sample, gradient.name)
     if target is not None:
-        _draw_target(ax, target, sample)
+        _draw_target(ax, target_message(target), sample)
     ax.figure.colorbar(image, ax=ax, label="robustness of what is to hold")
     ax.set_title(plain(f"where {gradient.name} could go"), loc="left", fontsize=10)
     ax.set_xlabel("x in the unit of the log")
@@ -350,10 +352,10 @@ def draw_map(
     return ax
 
 
-def _best_turn(gradient: GradientMap, target: Target | None) -> int:
+def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
     """Return the index of the target's orientation, or of that of the best free cell."""
-    if target is not None:
-        return int(np.abs(gradient.turns - target.turn).argmin())
+    if target_turn is not None:
+        return int(np.abs(gradient.turns - target_turn).argmin())
     best = np.where(gradient.blocked == FREE, gradient.robustness, -np.inf).max(axis=(1, 2))
     return int(best.argmax())
 
@@ -401,12 +403,13 @@ def _draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
         )  # fmt: skip
 
 
-def _draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
+def _draw_target(ax: Axes, target: PlanTarget, sample: Sample | None) -> None:
     """Draw the target of an object and the path to it."""
-    ax.plot(*zip(*target.waypoints, strict=True), color="white", linewidth=3.5, solid_capstyle="round")
-    ax.plot(*zip(*target.waypoints, strict=True), color=INK, linewidth=1.5, solid_capstyle="round")
+    x, y = target.waypoints[::2], target.waypoints[1::2]
+    ax.plot(x, y, color="white", linewidth=3.5, solid_capstyle="round")
+    ax.plot(x, y, color=INK, linewidth=1.5, solid_capstyle="round")
     ax.plot(target.x, target.y, "o", color="white", markeredgecolor=INK, markersize=6)
-    tracked = None if sample is None else sample.objects.get(target.name)
+    tracked = None if sample is None else sample.objects.get(target.object)
     if tracked is not None:
         moved = moved_object(tracked, target.x, target.y, target.turn)
         _draw_footprint(ax, moved.footprint, 1.5, "--")
@@ -445,28 +448,43 @@ def draw_step(step: Step, sample: Sample | None = None, *, margin: float | None 
     Raises:
         UsageError: matplotlib is not installed.
     """
-    edges = [edge for edge in step.considered if edge.candidates][-_MOST_EDGES:]
+    return _draw_decision(decision_message(step), _maps_of(step), sample, margin)
+
+
+def _maps_of(step: Step) -> list[list[GradientMap]]:
+    """Return the maps of each edge that a step considered."""
+    return [[candidate.map for candidate in edge.candidates] for edge in step.considered]
+
+
+def _draw_decision(
+    decision: PlanDecision, maps: Sequence[Sequence[GradientMap]], sample: Sample | None, margin: float | None
+) -> tuple[Axes, ...]:
+    """Draw the maps of a decision; see `draw_step`."""
+    numbers = [number for number, edge in enumerate(decision.considered) if edge.candidates][-_MOST_EDGES:]
+    edges = [decision.considered[number] for number in numbers]
     if not edges:
         return ()
     columns = min(max(len(edge.candidates) for edge in edges), _MOST_CANDIDATES)
     size = (0.8 + _PANEL * columns, 0.5 + _PANEL * len(edges))
     panels = new_panels(len(edges), columns, size)
     places = [
-        (row * columns + column, edge, candidate)
-        for row, edge in enumerate(edges)
-        for column, candidate in enumerate(edge.candidates[:columns])
+        (row * columns + column, edge, candidate, gradient)
+        for row, (number, edge) in enumerate(zip(numbers, edges, strict=True))
+        for column, (candidate, gradient) in enumerate(
+            zip(edge.candidates[:columns], maps[number][:columns], strict=True)
+        )
     ]
-    maps = [candidate.map for _, _, candidate in places]
+    drawn_maps = [gradient for *_, gradient in places]
     for panel in panels:
         panel.set_axis_off()
-    used_panels = tuple(panels[number] for number, _, _ in places)
-    reach = _reach_of(maps)
+    used_panels = tuple(panels[place] for place, *_ in places)
+    reach = _reach_of(drawn_maps)
     images = [
-        _draw_candidate(panel, edge, candidate, sample, reach, margin)
-        for panel, (_, edge, candidate) in zip(used_panels, places, strict=True)
+        _draw_candidate(panel, edge, candidate, gradient, sample, reach, margin)
+        for panel, (_, edge, candidate, gradient) in zip(used_panels, places, strict=True)
     ]
     used_panels[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
-    keys = _hatch_keys(used_panels[0], maps)
+    keys = _hatch_keys(used_panels[0], drawn_maps)
     if keys:
         used_panels[0].figure.legend(
             handles=keys, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=8.5
@@ -476,34 +494,36 @@ def draw_step(step: Step, sample: Sample | None = None, *, margin: float | None 
 
 def _draw_candidate(
     ax: Axes,
-    edge: Consideration,
-    candidate: Candidate,
+    edge: PlanEdge,
+    candidate: PlanCandidate,
+    gradient: GradientMap,
     sample: Sample | None,
     reach: float,
     margin: float | None,
 ) -> AxesImage:
     """Draw one map, titled with the choice made on it."""
-    gradient = candidate.map
+    target = candidate.target if candidate.HasField("target") else None
     ax.set_axis_on()
-    image = _draw_cells(gradient, ax, _best_turn(gradient, candidate.target), reach, margin)
-    _draw_objects(ax, sample, candidate.name)
-    if candidate.target is not None:
-        _draw_target(ax, candidate.target, sample)
-    question = plain(f"{edge.edge[0]} → {edge.edge[1]}: move {candidate.name}?")
+    turn = _best_turn(gradient, None if target is None else target.turn)
+    image = _draw_cells(gradient, ax, turn, reach, margin)
+    _draw_objects(ax, sample, candidate.object)
+    if target is not None:
+        _draw_target(ax, target, sample)
+    question = plain(f"{edge.source} → {edge.target}: move {candidate.object}?")
     ax.set_title(f"{question}\n{_choice_text(candidate)}", fontsize=9, loc="left")
     ax.tick_params(labelsize=7.5)
     return image
 
 
-def _choice_text(candidate: Candidate) -> str:
+def _choice_text(candidate: PlanCandidate) -> str:
     """Return whether a candidate is chosen, with its robustness, or why it was rejected."""
-    if candidate.target is None:
+    if not candidate.HasField("target"):
         return "\n".join(wrap(plain(f"no: {candidate.rejected}", 90), _LINE))
-    choice = "chosen" if candidate.is_chosen else "possible"
+    choice = "chosen" if candidate.chosen else "possible"
     return f"{choice}: robustness {candidate.target.robustness:.3g}"
 
 
 @plot.register(LoggedStep)
 def draw_logged_step(logged: LoggedStep) -> tuple[Axes, ...]:
     """Draw the maps of a logged step with the objects of its sample; see `draw_step`."""
-    return draw_step(logged.step, logged.sample, margin=logged.message.margin)
+    return _draw_decision(logged.message, _maps_of(logged.step), logged.sample, logged.message.margin)

@@ -419,7 +419,7 @@ def decision_message(step: Step, specification: str = "", first_map: int = 0) ->
         kind=PlanDecision.Kind.Value(f"KIND_{step.kind.upper().replace(' ', '_')}"),
         states=step.states,
         considered=[_edge(consideration, numbers) for consideration in step.considered],
-        target=None if step.target is None else _target(step.target),
+        target=None if step.target is None else target_message(step.target),
         pruned=pruned,
         reason=step.reason,
         lost=None if step.lost is None else PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text),
@@ -436,7 +436,7 @@ def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> Pla
         constraints=_guards(consideration.constraints),
         candidates=[_candidate(candidate, numbers) for candidate in consideration.candidates],
         pruned=str(consideration.pruned or ""),
-        motions=map(_target, consideration.motions),
+        motions=map(target_message, consideration.motions),
         joint=consideration.is_joint,
         failed=consideration.failed,
         order=consideration.order,
@@ -455,7 +455,7 @@ def _candidate(candidate: Candidate, numbers: Mapping[TurnedMap, int]) -> PlanCa
         object=candidate.name,
         best=candidate.map.best(),
         map_sha256=map_digest(candidate.map),
-        target=None if candidate.target is None else _target(candidate.target),
+        target=None if candidate.target is None else target_message(candidate.target),
         rejected=candidate.rejected,
         chosen=candidate.is_chosen,
         maps=[
@@ -465,7 +465,8 @@ def _candidate(candidate: Candidate, numbers: Mapping[TurnedMap, int]) -> PlanCa
     )
 
 
-def _target(target: Target) -> PlanTarget:
+def target_message(target: Target) -> PlanTarget:
+    """Return a target as a message."""
     return PlanTarget(
         object=target.name,
         x=target.x,
@@ -551,8 +552,9 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     if decision.HasField("target"):
         yield f"  {_target_text(decision.target)}{joint_suffix(decision.considered[-1])}"
     said: dict[tuple[str, ...], str] = {}
-    for place, edge in enumerate(decision.considered, 1):
-        yield from _edge_lines(edge, said, is_aim=place == len(decision.considered) and not edge.pruned)
+    aim = aim_of(decision)
+    for edge in decision.considered:
+        yield from _edge_lines(edge, said, is_aim=edge is aim)
     if decision.HasField("lost"):
         why = f": {decision.lost.text}" if decision.lost.text else ""
         yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{why}"
@@ -599,9 +601,7 @@ def effort_text(decision: PlanDecision) -> str:
 def _rival_text(candidate: PlanCandidate) -> str:
     if candidate.rejected:
         return f"{candidate.object}: {candidate.rejected}"
-    return (
-        f"{candidate.object}: {_place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
-    )
+    return f"{candidate.object}: {place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
 
 
 def _outcome_text(decision: PlanDecision) -> str:
@@ -634,7 +634,7 @@ def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: boo
         yield f"    {_candidate_text(candidate)}"
         yield from rows
     if len(edge.motions) > 1:
-        yield f"    planned   {', then '.join(_place_text(motion) for motion in edge.motions)}"
+        yield f"    planned   {', then '.join(place_text(motion) for motion in edge.motions)}"
     if edge.pruned:
         yield f"    given up: {Reason.from_text(edge.pruned).kind}"
 
@@ -668,7 +668,8 @@ def _target_text(target: PlanTarget) -> str:
     )
 
 
-def _place_text(target: PlanTarget) -> str:
+def place_text(target: PlanTarget) -> str:
+    """Return which object goes where."""
     return f"{target.object} to ({target.x:.4g}, {target.y:.4g})"
 
 
@@ -749,12 +750,23 @@ def cause_sentence(cause: PlanCause) -> str:
     return texts.get(cause.kind, "something that has to hold is unknown there")
 
 
+def kind_text(decision: PlanDecision) -> str:
+    """Return the kind of a decision as steps name it: "no path"."""
+    return decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
+
+
+def aim_of(decision: PlanDecision) -> PlanEdge | None:
+    """Return the edge that a decision is for, if any; see `Step.aim`."""
+    last = decision.considered[-1] if decision.considered else None
+    return None if last is None or last.pruned else last
+
+
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
     """Return decisions as values for JSON."""
     rows = [MessageToDict(decision, preserving_proto_field_name=True) for decision in decisions]
     for row, decision in zip(rows, decisions, strict=True):
         _write_numbers(row, decision)
-        row["kind"] = decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
+        row["kind"] = kind_text(decision)
     return rows
 
 

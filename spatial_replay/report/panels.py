@@ -58,10 +58,12 @@ from spatial_replay.perception.image_sources import ImageTopic
 from spatial_replay.perception.opencv import Image, encode_jpeg
 from spatial_replay.planning.decision_log import (
     MOST_LISTED,
+    aim_of,
     best_robustness,
     cause_sentence,
     decision_from_payload,
     joint_suffix,
+    kind_text,
     latest_decisions,
     limiting_conjuncts,
     map_fields,
@@ -872,15 +874,13 @@ def _finite(message: Message, name: str) -> float | None:
 def _decision_value(
     decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
 ) -> dict[str, Any]:
+    aim = aim_of(decision)
     value: dict[str, Any] = {
         **json_fields(decision, "number", "specification", "reason"),
         "time": (decision.time_ns - first_ns) / 1e9,
-        "kind": decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " "),
+        "kind": kind_text(decision),
         "states": list(decision.states),
-        "edges": [
-            _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
-            for edge in decision.considered
-        ],
+        "edges": [_edge_value(edge, edge is aim) for edge in decision.considered],
         "margin": _finite(decision, "margin"),
         "maps": maps,
         "target": _target_value(decision.target) if decision.HasField("target") else None,
