@@ -91,11 +91,11 @@ class MessageColumns(Messages):
 Columns: TypeAlias = Iterator[MessageColumns]
 
 
-def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
-    """Yield the same messages, at most `size` at a time."""
+def in_pieces(columns: Columns) -> Columns:
+    """Yield the same messages, at most `_TOGETHER` at a time."""
     for message_columns in columns:
-        for begin in range(0, len(message_columns), size):
-            yield select(message_columns, slice(begin, begin + size))
+        for begin in range(0, len(message_columns), _TOGETHER):
+            yield select(message_columns, slice(begin, begin + _TOGETHER))
 
 
 def places_in(part: int, within: Integers) -> Integers:

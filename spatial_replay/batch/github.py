@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -37,9 +37,9 @@ _MOST_COMPARED: Final = 10_000
 """Number of worst rows that are searched for failures of different kinds."""
 
 
-def is_github(environment: Mapping[str, str] = os.environ) -> bool:
+def is_github() -> bool:
     """Return whether this process is a step of a GitHub job."""
-    return environment.get("GITHUB_ACTIONS") == "true"
+    return os.environ.get("GITHUB_ACTIONS") == "true"
 
 
 def annotation(
@@ -57,7 +57,7 @@ def annotation(
     return f"::{severity} {properties}::{_data(message)}"
 
 
-def repository_path(file: str | Path, environment: Mapping[str, str] = os.environ) -> str:
+def repository_path(file: str | Path) -> str:
     """Return the path of a file as the tools of its repository know it: relative to the repository.
 
     The repository is the folder of the job on GitHub, else the nearest folder above with a `.git`, else the
@@ -66,7 +66,7 @@ def repository_path(file: str | Path, environment: Mapping[str, str] = os.enviro
     if is_address(file):
         return str(file)
     path, current = Path(file).absolute(), Path.cwd()
-    job = environment.get("GITHUB_WORKSPACE")
+    job = os.environ.get("GITHUB_WORKSPACE")
     above = next((folder for folder in (current, *current.parents) if (folder / ".git").exists()), current)
     for base in (Path(job) if job else above, above):
         for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
@@ -99,13 +99,13 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
         yield annotation("error", repository_path(file), row["line"], message, title=name)
 
 
-def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) -> None:
+def write_summary(table: pa.Table) -> None:
     """Add the totals and the worst rows to the summary of the job, if there is one.
 
     Raises:
         OutputError: it cannot be written.
     """
-    file = environment.get("GITHUB_STEP_SUMMARY")
+    file = os.environ.get("GITHUB_STEP_SUMMARY")
     if not file:
         return
     try:

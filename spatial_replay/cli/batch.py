@@ -429,14 +429,12 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     return tolerance, ResultsFolder.open(outputs.baseline).read_run()
 
 
-def evaluated_batch(
-    cases: Sequence[PreparedCase], folder: str, workers: Workers, fail_on: frozenset[str] = frozenset()
-) -> BatchResult:
+def evaluated_batch(cases: Sequence[PreparedCase], folder: str, workers: Workers) -> BatchResult:
     """Evaluate what is new; an interruption says where the results so far are."""
     from spatial_replay.batch.run import run_batch
 
     with resumable(folder):
-        return run_batch(cases, folder, workers, fail_on=fail_on, progress=progress)
+        return run_batch(cases, folder, workers, progress=progress)
 
 
 def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:

@@ -211,7 +211,6 @@ def checked_document(
     schema: Mapping[str, Any],
     contradictions: Callable[[Document], list[tuple[Place, str]]],
     what: str,
-    largest: int = LARGEST_TEXT,
 ) -> Document:
     """Read a YAML text and check it.
 
@@ -220,12 +219,11 @@ def checked_document(
         schema: JSON Schema, draft 2020-12.
         contradictions: finds what a schema cannot express; it may get any value, valid or not.
         what: what the file is, such as "a mapping".
-        largest: size in bytes.
 
     Raises:
         UsageError: the text is not valid; all errors are listed, with their lines.
     """
-    document = document_from_text(text, what, largest)
+    document = document_from_text(text, what, LARGEST_TEXT)
     by_place = faults_by_place(document, schema, contradictions)
     faults = [f"{name}:{line}: {fault}" for line, fault in numbered_faults(document, by_place)]
     if faults:
