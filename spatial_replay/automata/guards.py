@@ -20,7 +20,7 @@ from spatial_replay.spec.formula import (
     Temporal,
     Truth,
     expand,
-    judged,
+    judged_operator,
     operands_of,
     operator_of,
 )
@@ -233,7 +233,7 @@ def _maximal(formula: Formula) -> Iterator[Formula]:
     if is_spatial(formula):
         yield formula
         return
-    for operand in operands_of(judged(formula) if isinstance(formula, Temporal) else formula):
+    for operand in operands_of(judged_operator(formula) if isinstance(formula, Temporal) else formula):
         yield from _maximal(operand)
 
 

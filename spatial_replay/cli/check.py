@@ -42,7 +42,7 @@ from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
-from spatial_replay.spec.tokens import quoted
+from spatial_replay.spec.tokens import quote_name
 from spatial_replay.spec.walks import nodes_of
 from spatial_replay.text import Sentence, counted_from, json_fields, plural
 from spatial_replay.version import __version__
@@ -354,7 +354,7 @@ class _CutResults:
 
 def _heading(spec: NamedSpec) -> str:
     head = f"spec {spec.name}" if spec.parameter is None else f"spec {spec.name}({spec.parameter})"
-    return head if spec.title is None else f"{head} {quoted(title_text(spec))}"
+    return head if spec.title is None else f"{head} {quote_name(title_text(spec))}"
 
 
 def _lines(specification: Specification, compared: _Compared) -> Iterator[str]:

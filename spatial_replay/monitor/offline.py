@@ -37,7 +37,7 @@ from spatial_replay.spec.formula import (
     Signal,
     Temporal,
     expand,
-    judged,
+    judged_operator,
     operator_of,
 )
 from spatial_replay.spec.walks import nodes_with_operands
@@ -353,7 +353,7 @@ def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boo
         identifier: operand
         for node, operands in tree
         if isinstance(node, Temporal)
-        for identifier, operand in zip(operands, judged(node).operands, strict=True)
+        for identifier, operand in zip(operands, judged_operator(node).operands, strict=True)
         if isinstance(operand, Boolean) and operand.operator in ("given", "with")
     }
 

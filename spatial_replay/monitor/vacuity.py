@@ -39,7 +39,7 @@ from spatial_replay.spec.formula import (
     Temporal,
     TrackedName,
     iter_nodes,
-    judged,
+    judged_operator,
     operands_of,
     operator_of,
 )
@@ -372,7 +372,7 @@ def _scopes(
             operand_scope = scope
             if isinstance(node, Temporal):
                 operand_scope = _below(node, place, scope, windows)
-                judged_operand = judged(node).operands[place]
+                judged_operand = judged_operator(node).operands[place]
                 if operator_of(judged_operand) in ("given", "with"):
                     operand_scope = operand_scope & holding(operands_of(judged_operand)[0])
             elif is_conditional and place and operator_of(node) == "->" and scope.any():
@@ -636,7 +636,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
                 )
             case Boolean() | Temporal():
                 judged_operands = (
-                    judged(formula).operands if isinstance(formula, Temporal) else formula.operands
+                    judged_operator(formula).operands if isinstance(formula, Temporal) else formula.operands
                 )
                 operands = [
                     with_stand_ins(operand, in_antecedent=in_antecedent) for operand in judged_operands

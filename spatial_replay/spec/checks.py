@@ -36,7 +36,7 @@ from spatial_replay.spec.syntax import BrokenStatement, ScaleStatement, SpecStat
 from spatial_replay.spec.tokens import (
     BINARY_TYPES,
     STATEMENT_TYPES,
-    quoted,
+    quote_name,
     span_of,
     title_hint,
     tokenize,
@@ -394,7 +394,7 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
         numbers = {text_number(name): number for name, number in names.items()}
         if part.value not in numbers:
             what = f"no number of {part.signal.name} is called {atom.parameters[-1]}"
-            faults.add(atom.span, what, f"its names are {', '.join(map(quoted, names))}")
+            faults.add(atom.span, what, f"its names are {', '.join(map(quote_name, names))}")
             return atom
         exact = replace(part, value=numbers[part.value])
         return replace(atom, expression=exact if part is atom.expression else -exact)
@@ -420,7 +420,7 @@ def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
     meant = next((label for label in classes if label.casefold() == name.casefold()), None)
     if kind != "object" or meant is None:
         return ""
-    group = f"class {quoted(meant)}"
+    group = f"class {quote_name(meant)}"
     return f"it is a class: write {group} for all of them, or forall one in {group}: ..."
 
 

@@ -48,7 +48,7 @@ from spatial_replay.spec.syntax import (
     NumberSyntax,
     RateSyntax,
 )
-from spatial_replay.spec.tokens import function_hint, quoted, span_of
+from spatial_replay.spec.tokens import function_hint, quote_name, span_of
 from spatial_replay.spec.walks import (
     base_of,
     iter_expressions,
@@ -149,7 +149,7 @@ class ComparisonBuilder:
         return Comparison(relation, minimum(*margins), terms, parameters)
 
     def _of_text(self, signal: Name, sign: str, text: Name, scope: Scope) -> Comparison:
-        return self._of_signal(signal, sign, text_number(text.text), quoted(text.text), scope)
+        return self._of_signal(signal, sign, text_number(text.text), quote_name(text.text), scope)
 
     def _of_signal(
         self, name: Name, sign: str, limit: float, limit_text: float | str, scope: Scope
@@ -349,7 +349,7 @@ class ComparisonBuilder:
             # signals that are compared have similar names
             constants = [key for key in constants if key.casefold() == limit.text.casefold()]
         if nearest := self.resolver.faults.nearest(limit.text, constants):
-            hint = f"{nearest} A signal of that name is written in quotes: {quoted(limit.text)}"
+            hint = f"{nearest} A signal of that name is written in quotes: {quote_name(limit.text)}"
             self.resolver.fault(limit.span, scope, f"unknown constant {limit.text!r}", hint)
 
     def _check_hyphen(self, written: Arithmetic, scope: Scope) -> None:
@@ -365,7 +365,7 @@ class ComparisonBuilder:
                 name = f"{first.text}-{last.text}"
             case _:
                 return
-        hint = f"a name with - is written in quotes: {quoted(name)}; a difference has blanks around its -"
+        hint = f"a name with - is written in quotes: {quote_name(name)}; a difference has blanks around its -"
         self.resolver.fault(sign, scope, "'-' within a name, or without blanks", hint)
 
     def _report_equality(self, written: ComparisonSyntax, scope: Scope) -> None:
@@ -377,7 +377,7 @@ class ComparisonBuilder:
                 definitions = self.resolver.names.definitions
                 constants = [key for key in definitions if isinstance(definitions[key], ConstStatement)]
                 nearest = self.resolver.faults.nearest(name.text, constants)
-                hint = nearest or f"{hint}; a text stands in quotes, {left} == {quoted(name.text)}"
+                hint = nearest or f"{hint}; a text stands in quotes, {left} == {quote_name(name.text)}"
         (token, *_) = [token for token in written.operators if token.value in ("==", "!=")]
         self.resolver.fault(span_of(token), scope, "two measured numbers are hardly ever equal", hint)
 

@@ -132,7 +132,7 @@ def text_of(value: Value) -> str:
 # ------------------------------------------------------------------------------------ from the outside
 
 
-def replaced(
+def replace_constants(
     text: str,
     statements: Mapping[str, ConstStatement],
     values: Mapping[str, Value | None],
@@ -160,7 +160,7 @@ def replaced(
 
 
 def _new_text(name: str, value: object, written: Value | None) -> str:
-    new = value_given(name, value)
+    new = value_from_outside(name, value)
     if written is not None and isinstance(new, Duration) != isinstance(written, Duration):
         was, example = (
             ("a duration", "'2s' or '500ms'") if isinstance(written, Duration) else ("a number", "80")
@@ -170,7 +170,7 @@ def _new_text(name: str, value: object, written: Value | None) -> str:
     return text_of(new)
 
 
-def value_given(name: str, value: object) -> Value:
+def value_from_outside(name: str, value: object) -> Value:
     """Return the value given for a constant from outside.
 
     Raises:

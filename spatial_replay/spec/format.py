@@ -43,7 +43,7 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.tokens import quoted, written_name
+from spatial_replay.spec.tokens import quote_name, written_name
 
 _LARGEST_PLAIN = 1e16
 
@@ -97,7 +97,7 @@ def _format_group(group: Group, relations: frozenset[str]) -> str:
 
 
 def _format_open(group: Group) -> str:
-    return "all" if group.class_name == ANY_CLASS else f"class {quoted(group.class_name or '')}"
+    return "all" if group.class_name == ANY_CLASS else f"class {quote_name(group.class_name or '')}"
 
 
 def format_relation(
@@ -264,7 +264,7 @@ def format_specification(specification: Specification) -> str:
 def _format_spec(spec: NamedSpec, relations: frozenset[str]) -> str:
     parameter = f"({written_name(spec.parameter, relations)})" if spec.parameter is not None else ""
     formula = format_formula(spec.formula, references=True, relations=relations)
-    title = f" {quoted(title_text(spec))}" if spec.title is not None else ""
+    title = f" {quote_name(title_text(spec))}" if spec.title is not None else ""
     return f"spec {written_name(spec.name, relations)}{parameter}{title} = {formula}"
 
 

@@ -505,7 +505,7 @@ BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "sp
 """`spec` has one operand and is that operand: a spec that only repeats another under its own name.
 
 `given` and `with` are in expansions alone: an operand of an operator that leaves samples without a rate out
-(see `judged`). Their first operand is that there is a rate, their last one what was written.
+(see `judged_operands`). Their first operand is that there is a rate, their last one what was written.
 """
 
 
@@ -535,8 +535,8 @@ PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
 class Temporal:
     """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
 
-    Its `expansion` is the formula that defines R, W and WX, and any operator over a rate (see `judged`); None
-    for the others (see `expand`).
+    Its `expansion` is the formula that defines R, W and WX, and any operator over a rate (see
+    `judged_operands`); None for the others (see `expand`).
     """
 
     operator: TemporalOperator
@@ -565,7 +565,7 @@ class Quantified:
 
     Attributes:
         group: an open `Group`, or one `Earlier` (its members are those of then).
-        judged: the body that is evaluated: it leaves members without a rate out (see `judged`).
+        judged: the body that is evaluated: it leaves members without a rate out (see `judged_operands`).
     """
 
     quantifier: Literal["forall", "exists"]
@@ -659,7 +659,7 @@ def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formu
     )
 
 
-def judged(formula: Temporal) -> Temporal:
+def judged_operator(formula: Temporal) -> Temporal:
     """Return a temporal operator with the operands that it reads (see `judged_operands`)."""
     expansion = formula.expansion
     is_judged = isinstance(expansion, Temporal) and expansion.operator == formula.operator

@@ -29,7 +29,7 @@ from spatial_replay.spec.checks import (
     unused_warnings,
 )
 from spatial_replay.spec.comparisons import ComparisonBuilder
-from spatial_replay.spec.constants import replaced
+from spatial_replay.spec.constants import replace_constants
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, Span, nearest_hint
 from spatial_replay.spec.format import format_atom, format_duration, format_number, title_text
 from spatial_replay.spec.formula import (
@@ -95,7 +95,7 @@ from spatial_replay.spec.tokens import (
     SAMPLES,
     function_hint,
     is_reserved,
-    quoted,
+    quote_name,
     span_of,
     tokenize,
 )
@@ -264,7 +264,7 @@ class QuantifierBuilder:
 
     def formula(self, written: QuantifierSyntax, scope: Scope, span: Span) -> Formula:
         """Return the formula of a quantifier; `true` in place of one with faults."""
-        doubled = first_repeated(written.variables)
+        doubled = first_repetition(written.variables)
         if doubled is not None:
             self.resolver.fault(doubled.span, scope, f"the variable {doubled.text!r} is given twice")
         group = self.resolver.term(written.group, scope)
@@ -352,7 +352,7 @@ class QuantifierBuilder:
         return f"{name}_{number}"
 
 
-def first_repeated(names: Sequence[Name]) -> Name | None:
+def first_repetition(names: Sequence[Name]) -> Name | None:
     """Return the first of some names that an earlier one is equal to."""
     texts: set[str] = set()
     for name in names:
@@ -479,7 +479,7 @@ class Elaborator:
 
     def _check_macro(self, definition: DefStatement) -> None:
         """Check the body of a macro that nothing uses, for any arguments."""
-        doubled = first_repeated(definition.parameters)
+        doubled = first_repetition(definition.parameters)
         if doubled is not None:
             self.faults.add(doubled.span, f"the parameter {doubled.text!r} is given twice")
         if definition.name.text not in self.names.used:
@@ -592,7 +592,7 @@ class Elaborator:
                 hint = f"truth values are written {name.text.lower()}"
             elif name.text.lower() in SAMPLES:
                 hint = f"it is written {SAMPLES[name.text.lower()]}"
-            word = name.text if name.text.isidentifier() else quoted(name.text)
+            word = name.text if name.text.isidentifier() else quote_name(name.text)
             hint = hint or (
                 f"a signal needs a comparison, such as {word} >= 1.0 or, for a flag, {word} == 1; "
                 f"an object needs a relation, such as {word} ovlp other"
@@ -660,7 +660,7 @@ class Elaborator:
             local = scope.values.get(written.text)
             if local is not None:
                 return local
-            constant = self.names.traced(written.text, self.names.constant(written.text))
+            constant = self.names.with_constant_name(written.text, self.names.constant(written.text))
             if constant is not None:
                 self.names.used.add(written.text)
                 return constant
@@ -890,7 +890,7 @@ def _constant_writer(
         for name, statement in namespace.definitions.items()
         if isinstance(statement, ConstStatement)
     }
-    return partial(replaced, text, lines, namespace.constants)
+    return partial(replace_constants, text, lines, namespace.constants)
 
 
 def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:
@@ -1012,7 +1012,7 @@ def _with_titles(
             for token in tokens
             if token.type == "TITLE" and span_of(token).start >= spec.span.end
         )
-        words = quoted(f"{title_text(spec)} ({', '.join(overrides)})")
+        words = quote_name(f"{title_text(spec)} ({', '.join(overrides)})")
         text = f"{text[: title.start]}{words}{text[title.end :]}"
     return _parse(SpecificationText(text, changed.filename), {})
 

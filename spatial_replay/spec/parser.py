@@ -59,10 +59,10 @@ from spatial_replay.spec.tokens import (
     BINARY_TYPES,
     KEYWORDS,
     STATEMENT_TYPES,
+    foreign_token_advice,
     is_called,
-    meant,
     meant_statement,
-    quoted,
+    quote_name,
     span_of,
 )
 
@@ -639,7 +639,7 @@ def _report(
     position = next((index for index, candidate in enumerate(tokens) if candidate is token), len(tokens))
     before = tokens[position - 1] if position else None
     span = _place(token, tokens)
-    if position and (advice := meant(tokens, position, accepted)) is not None:
+    if position and (advice := foreign_token_advice(tokens, position, accepted)) is not None:
         faults.add(span, *advice)
         return
     if token.type == "$END":
@@ -658,7 +658,7 @@ def _report(
     elif before is not None and before.type in ("RELATION", "DIST", "CLOSER", "THAN") and token.type in (
         "PREFIX", "NOT", "QUANTIFIER", "TRUTH",
     ):  # fmt: skip
-        hint = f"put it before the relation; an object of that name is written {quoted(token.value)}"
+        hint = f"put it before the relation; an object of that name is written {quote_name(token.value)}"
         faults.add(span, f"{token.value!r} cannot stand inside a relation", hint)
     elif token.type in ("RELATION", "DIST") and is_called(tokens, position):
         hint = f"write it between its objects: {_between_objects(tokens, position)}"
@@ -671,16 +671,16 @@ def _report(
     elif token.type in ("RELATION", "DIST", "CLOSER", "BETWEEN") and before is not None:
         hint = "a relation stands between two objects, without operators inside"
         if before.type in ("PREFIX", "INFIX", "TRUTH", "NOT"):
-            hint = f"if {before.value!r} is an object, write it in quotes: {quoted(before.value)}"
+            hint = f"if {before.value!r} is an object, write it in quotes: {quote_name(before.value)}"
         faults.add(span, f"{token.value!r} needs an object, region or group on its left", hint)
     elif "NAME" in accepted and (token.value in KEYWORDS or token.type == "RELATION"):
-        hint = f"that word is reserved; an object of its name is written in quotes: {quoted(token.value)}"
+        hint = f"that word is reserved; an object of its name is written in quotes: {quote_name(token.value)}"
         faults.add(span, message, hint)
     elif "TITLE" in accepted and token.type == "NAME":
         hint = 'a title is written in quotes: spec NAME "REQ-12: what must hold" = ...'
         faults.add(span, message, hint)
     elif "NAME" in accepted and token.type == "NUMBER":
-        hint = f"a name that begins with a digit is written in quotes: {quoted(token.value)}"
+        hint = f"a name that begins with a digit is written in quotes: {quote_name(token.value)}"
         faults.add(span, message, hint)
     else:
         faults.add(span, message)

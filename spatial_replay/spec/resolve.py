@@ -48,7 +48,7 @@ from spatial_replay.spec.syntax import (
     TermSyntax,
     UseStatement,
 )
-from spatial_replay.spec.tokens import quoted, title_hint
+from spatial_replay.spec.tokens import quote_name, title_hint
 from spatial_replay.spec.walks import LENGTHS, standing
 
 Corner: TypeAlias = tuple[float, float]
@@ -269,7 +269,7 @@ class Namespace:
                 None,
             )
             if needed is None:
-                self.constants[current] = value_of(statement.value, self.named, self.faults.add)
+                self.constants[current] = value_of(statement.value, self.named_value, self.faults.add)
             elif needed.text in pending:
                 message = f"const {needed.text!r} is defined in terms of itself"
                 self.faults.add(needed.span, message, "give it a number")
@@ -291,7 +291,7 @@ class Namespace:
             ends = None
             if statement.range is not None:
                 low, high = (
-                    value_of(end, self.named, self.faults.add)
+                    value_of(end, self.named_value, self.faults.add)
                     for end in (statement.range.lower, statement.range.upper)
                 )
                 ends = None if low is None or high is None else (low, high)
@@ -308,7 +308,7 @@ class Namespace:
                 name.span, "'inf' is not a number here", "it is the upper end of a window: [0, inf]"
             )
         elif name.is_quoted and statement is None:
-            hint = f"an object gets another name by a group: group NAME = {quoted(name.text)}"
+            hint = f"an object gets another name by a group: group NAME = {quote_name(name.text)}"
             self.faults.add(name.span, "a text, where a number or a duration is expected", hint)
         elif statement is None:
             consts = (
@@ -317,8 +317,8 @@ class Namespace:
                 if isinstance(what, ConstStatement)
             )
             hint = self.faults.nearest(name.text, consts) or (
-                f"define it: const {name.text} = 1.0; a text stands in quotes, mode == {quoted(name.text)}; "
-                "a signal is not compared with a signal"
+                f"define it: const {name.text} = 1.0; a text stands in quotes,"
+                f" mode == {quote_name(name.text)}; a signal is not compared with a signal"
             )
             self.faults.add(name.span, f"unknown constant {name.text!r}", hint)
         elif not isinstance(statement, BrokenStatement):
@@ -326,9 +326,9 @@ class Namespace:
 
     def quantity(self, written: Quantity) -> float | Duration:
         """Return the number or duration written, or that of a constant; 0 after a fault."""
-        return value_of(written, self.named, self.faults.add) or 0.0
+        return value_of(written, self.named_value, self.faults.add) or 0.0
 
-    def named(self, name: Name) -> float | Duration | None:
+    def named_value(self, name: Name) -> float | Duration | None:
         """Return the value of the constant of a name; None, and a fault, if it is none."""
         self.used.add(name.text)
         statement = self.definitions.get(name.text)
@@ -337,7 +337,7 @@ class Namespace:
             return None
         return self.constant(name.text)
 
-    def traced(self, name: str, value: float | Duration | None) -> float | Duration | None:
+    def with_constant_name(self, name: str, value: float | Duration | None) -> float | Duration | None:
         """Return the value of a constant with its name, unless more than formulas depends on the constant."""
         if isinstance(value, float) and name not in self.entangled:
             return NamedNumber(value, (name,), is_plain=True)
@@ -556,10 +556,10 @@ class Resolver:
     def quantity(self, written: Quantity, scope: Scope) -> float | Duration:
         """Return the number or duration at a place; 0 after a fault."""
 
-        def named(name: Name) -> float | Duration | None:
+        def named_value(name: Name) -> float | Duration | None:
             value = scope.values.get(name.text)
             if value is None:
-                return self.names.traced(name.text, self.names.named(name))
+                return self.names.with_constant_name(name.text, self.names.named_value(name))
             if isinstance(value, (float, Duration)):
                 return value
             if not isinstance(value, Anything):
@@ -570,7 +570,7 @@ class Resolver:
         def report(span: Span, message: str, hint: str) -> None:
             self.fault(span, scope, message, hint)
 
-        value = value_of(written, named, report)
+        value = value_of(written, named_value, report)
         return 0.0 if value is None else value
 
     def is_number(self, name: Name, scope: Scope) -> bool:

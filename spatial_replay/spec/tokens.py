@@ -307,7 +307,9 @@ def unit_hint(number: str, unit: str, per: str = "") -> str:
     return f"write it without the blank: {number}{unit}" if unit in ("s", "ms") else ""
 
 
-def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> tuple[str, str] | None:
+def foreign_token_advice(
+    tokens: Sequence[Token], position: int, accepted: Collection[str]
+) -> tuple[str, str] | None:
     """Return message and hint for a token that cannot stand where it does, if it is of another language.
 
     Args:
@@ -644,16 +646,16 @@ def written_name(name: str, relations: Iterable[str]) -> str:
     """Return a name as written in a text: in quotes unless it is an identifier that is not reserved."""
     if _IDENTIFIER.match(name) and not is_reserved(name, relations):
         return name
-    return quoted(name)
+    return quote_name(name)
 
 
 def title_hint(name: str) -> str:
     """Return how a specification that needs another name keeps its own as a title."""
     identifier = re.sub(r"\W", "_", name) + "_holds"
-    return f"a title keeps its name: spec {identifier} {quoted(name)} = ..."
+    return f"a title keeps its name: spec {identifier} {quote_name(name)} = ..."
 
 
-def quoted(name: str) -> str:
+def quote_name(name: str) -> str:
     """Return a name in quotes."""
     escaped = name.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
@@ -709,7 +711,7 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
                 is_window = unit == "m" and {"PREFIX", "INFIX"} & {token.type for token in tokens[-4:-1]}
                 meant_unit = "min" if is_window and "LSQB" in {token.type for token in tokens[-3:]} else unit
                 hint = unit_hint(value.removesuffix(unit), meant_unit, per.group(1) if per else "")
-                hint = hint or f"units of time are s and ms; a name is written in quotes: {quoted(value)}"
+                hint = hint or f"units of time are s and ms; a name is written in quotes: {quote_name(value)}"
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
                 # what is behind the sign is the rest of the unit

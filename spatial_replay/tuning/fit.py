@@ -16,7 +16,7 @@ import numpy as np
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.tokens import quoted, written_name
+from spatial_replay.spec.tokens import quote_name, written_name
 from spatial_replay.text import number_text
 from spatial_replay.tuning.quantities import WITH_LIMIT, Observed, Party, Quantity, members_of, variables_of
 
@@ -79,10 +79,10 @@ class LimitedRelation:
         )
         text = self._atom(a, b)
         if parties[0].is_class and parties[0] == parties[1]:
-            return f"forall {a}, {b} in class {quoted(parties[0].name)}: {text}"
+            return f"forall {a}, {b} in class {quote_name(parties[0].name)}: {text}"
         for party, variable in reversed(list(zip(parties, variables, strict=True))):
             if party.is_class:
-                text = f"forall {variable} in class {quoted(party.name)}: {text}"
+                text = f"forall {variable} in class {quote_name(party.name)}: {text}"
         return text
 
     def _atom(self, a: str, b: str) -> str:

@@ -18,7 +18,7 @@ from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import ANY_CLASS, NamedSpec, Specification
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
-from spatial_replay.spec.tokens import quoted
+from spatial_replay.spec.tokens import quote_name
 from spatial_replay.text import json_value, number_text, plural, printable
 from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.fit import (
@@ -653,7 +653,7 @@ class _Writer:
             while name in names or name in self.taken:
                 name, more = f"{base}_{more}", more + 1
             names.add(name)
-            title = quoted(f"LEARNED-{number}: {printable(line.title)}")
+            title = quote_name(f"LEARNED-{number}: {printable(line.title)}")
             texts.append(f"spec {name} {title} = {line.formula(self.taken)}")
         return parse_specification("\n".join([*texts, ""]))
 
@@ -670,7 +670,7 @@ class _Writer:
                     f"{len(line.violated_by)} of {plural(bad, 'bad run')}{_names_text(line.violated_by)}"
                 )
                 lines.append(_comment(f"Violated by {violating}."))
-            title = quoted(f"{spec.id}: {spec.title}")
+            title = quote_name(f"{spec.id}: {spec.title}")
             lines.append(f"spec {spec.name} {title} = {format_formula(spec.formula)}")
         return "\n".join([*lines, ""])
 

@@ -20,7 +20,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.offline import OfflineFormula, new_leaves
 from spatial_replay.monitor.stream import Instance, find_instances
 from spatial_replay.spec import check_names
-from spatial_replay.spec.constants import text_of, value_given
+from spatial_replay.spec.constants import text_of, value_from_outside
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import (
     Atom,
@@ -287,7 +287,7 @@ def _end(value: float, constant: Constant) -> Value:
 
 
 def _decimal(name: str, value: Value, written: Constant) -> Decimal:
-    read = value_given(name, value)
+    read = value_from_outside(name, value)
     if isinstance(read, Duration) != (written.duration_ns is not None):
         kind = "a number" if written.duration_ns is None else "a duration such as 2s"
         raise UsageError(f"{name} cannot be {value!r}: it is {kind} ({text_of_constant(written)} as written)")
