@@ -19,7 +19,7 @@ from spatial_replay.errors import (
     TraceError,
     UsageError,
 )
-from spatial_replay.lazy import loaded_when_used
+from spatial_replay.lazy import lazy_attributes
 from spatial_replay.version import __version__
 
 if TYPE_CHECKING:
@@ -105,4 +105,4 @@ __all__ = [
     "write_report",
 ]
 
-__getattr__, __dir__ = loaded_when_used(globals())
+__getattr__, __dir__ = lazy_attributes(globals())

@@ -552,7 +552,7 @@ def _source(log: Log, reading: Reading) -> Source:
     return MemorySource(log)
 
 
-def _listed(specifications: Specifications | None) -> list[Specification | PathName]:
+def _specification_list(specifications: Specifications | None) -> list[Specification | PathName]:
     if specifications is None:
         return []
     if isinstance(specifications, Specification | str | PathLike):
@@ -570,7 +570,7 @@ def _files(
 ) -> list[Specification]:
     """Return the specifications to evaluate, in the order in which they are given."""
     choices: list[Specification | Path] = []
-    for specification in _listed(specifications):
+    for specification in _specification_list(specifications):
         choice = specification if isinstance(specification, Specification) else local_copy(specification)
         # each path counts once
         if isinstance(choice, Specification) or choice not in choices:
@@ -589,7 +589,7 @@ def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -
     """Return the files that are read."""
     files = [
         specification
-        for specification in _listed(specifications)
+        for specification in _specification_list(specifications)
         if not isinstance(specification, Specification)
     ]
     mapping = reading.get("mapping")

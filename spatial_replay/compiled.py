@@ -105,7 +105,7 @@ class Compiler:
                 import numba
 
                 if self.folder is not None:
-                    remove_damaged(self.folder)
+                    remove_damaged_files(self.folder)
                     # and of what kernels that the cache holds are compiled for later
                     atexit.register(seal, self.folder)
                 self._compiler = numba
@@ -466,12 +466,12 @@ class _Kernel(Generic[_Arguments, _Result]):
             return ready(*arguments, **named)
         elements = _CALL + _elements(arguments)
         if not self._may_interpret(elements):
-            compiled = self.compiled()
+            compiled = self.compiled_form()
             with _process.compiling(self.__wrapped__):
                 result = compiled(*arguments, **named)
             self._ready = compiled
             return result
-        run = cast(Callable[..., _Result], self.interpreted())
+        run = cast(Callable[..., _Result], self.interpreted_form())
         begin = time.thread_time()
         # as in machine code: a quotient by zero or a product out of range is no error and no warning
         with np.errstate(all="ignore"):
@@ -507,21 +507,21 @@ class _Kernel(Generic[_Arguments, _Result]):
         # asked last, since looking for the cache takes its time, too
         return self._spent_s + cost <= _COLD_S and not _process.holds(self.__wrapped__)
 
-    def interpreted(self) -> Callable[_Arguments, _Result]:
+    def interpreted_form(self) -> Callable[_Arguments, _Result]:
         """Return the function as it stands, calling others as they stand."""
         if self._interpreted is None:
-            self._interpreted = _linked(self.__wrapped__, methodcaller("interpreted"))
+            self._interpreted = _link(self.__wrapped__, methodcaller("interpreted_form"))
         return self._interpreted
 
-    def compiled(self) -> Callable[_Arguments, _Result]:
+    def compiled_form(self) -> Callable[_Arguments, _Result]:
         """Return the function as machine code, calling machine code."""
         if self._compiled is None:
-            linked = _linked(self.__wrapped__, methodcaller("compiled"))
+            linked = _link(self.__wrapped__, methodcaller("compiled_form"))
             self._compiled = _process.compile(linked, self.options)
         return self._compiled
 
 
-def _linked(
+def _link(
     function: Callable[_Arguments, _Result], form: Callable[[Any], Any]
 ) -> Callable[_Arguments, _Result]:
     """Return a copy of a function that calls the given form of every kernel that it names."""
@@ -561,7 +561,7 @@ def _view(value: Any) -> object:
     if isinstance(value, tuple):
         # kernels take rows of the arrays in named tuples, and a memoryview of several dimensions has none
         make: Any = type(value)
-        return cast(object, make(*(_view(each) if each.ndim == 1 else each for each in value)))
+        return cast(object, make(*(_view(array) if array.ndim == 1 else array for array in value)))
     return value.data if isinstance(value, np.ndarray) else value
 
 
@@ -593,10 +593,10 @@ def over_cores(
         return
     ends = [count * share // shares for share in range(shares + 1)]
     with ThreadPoolExecutor(shares - 1) as threads:
-        others = [threads.submit(run, begin, end) for begin, end in pairwise(ends[1:])]
+        tasks = [threads.submit(run, begin, end) for begin, end in pairwise(ends[1:])]
         run(0, ends[1])
-        for each in others:
-            each.result()
+        for task in tasks:
+            task.result()
 
 
 _STALE_S: Final = 7 * 24 * 3600.0
@@ -635,7 +635,7 @@ def cache_folder() -> Path | None:
     return None
 
 
-def remove_damaged(folder: Path) -> None:
+def remove_damaged_files(folder: Path) -> None:
     """Remove machine code that is not what was written.
 
     Code newer than its digest may be in the making while other processes run that use the folder. It stays.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 
-def loaded_when_used(package: dict[str, Any]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package (PEP 562).
 
     A name of its `__all__` is loaded as the package's source imports it for type checkers.

@@ -221,10 +221,10 @@ def _add_nodes(
 
 
 def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: Automaton) -> None:
-    from spatial_replay.automata.automaton import abbreviated, meanings
+    from spatial_replay.automata.automaton import abbreviate, meanings
     from spatial_replay.automata.drawing import draw_automaton, guard_of
 
-    drawing, short = draw_automaton(automaton), abbreviated(automaton)
+    drawing, short = draw_automaton(automaton), abbreviate(automaton)
     result.automaton.legend.extend(map(tree.named, meanings(short)))
     result.automaton.summary = drawing.summary
     result.automaton.left_out = drawing.left_out

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from spatial_replay.lazy import loaded_when_used
+from spatial_replay.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import TransitionTable, words_text
@@ -26,4 +26,4 @@ __all__ = [
     "words_text",
 ]
 
-__getattr__, __dir__ = loaded_when_used(globals())
+__getattr__, __dir__ = lazy_attributes(globals())

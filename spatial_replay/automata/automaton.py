@@ -250,7 +250,7 @@ class Automaton(Displayed):
         """
         return guard_words(transition, self.propositions, longest)
 
-    def renamed(self, propositions: Sequence[Proposition]) -> Automaton:
+    def with_propositions(self, propositions: Sequence[Proposition]) -> Automaton:
         """Return the automaton with other names for its propositions."""
         result = replace(self, propositions=tuple(propositions))
         # names change no move: what was worked out is kept
@@ -266,7 +266,7 @@ class Automaton(Displayed):
         Accepting states have a double outline. Those that accept permanently are blue, traps are vermillion.
         If not all transitions can be listed, it has the states nearest to the start.
         """
-        short = abbreviated(self)
+        short = abbreviate(self)
         cut = () if self.is_listable else (_left_out(self),)
         return digraph_text(short, [*meanings(short), *cut])
 
@@ -499,7 +499,7 @@ def state_colour(automaton: Automaton, state: int) -> str:
     return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
 
 
-def abbreviated(automaton: Automaton) -> Automaton:
+def abbreviate(automaton: Automaton) -> Automaton:
     """Return the automaton with short names for long propositions, as fit on arrows."""
     labels = {proposition.label for proposition in automaton.propositions}
     names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
@@ -507,7 +507,7 @@ def abbreviated(automaton: Automaton) -> Automaton:
         proposition if len(proposition.label) <= _LONGEST_LABEL else replace(proposition, name=next(names))
         for proposition in automaton.propositions
     )
-    return automaton.renamed(tuple(short))
+    return automaton.with_propositions(tuple(short))
 
 
 def meanings(automaton: Automaton) -> list[str]:

@@ -22,9 +22,9 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
-from spatial_replay.automata.guards import LEAF, NO, YES, Diagrams, Propositions, copied
+from spatial_replay.automata.guards import LEAF, NO, YES, Diagrams, Propositions, node_copier
 from spatial_replay.automata.ltlf import FALSE, TRUE, Kind, Node, Skeleton, counts_seconds, no_automaton
-from spatial_replay.automata.machine import Machine, least, machine_of, merged
+from spatial_replay.automata.machine import Machine, least, machine_of, merge_equivalent_states
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.spec.diagnostics import SourceText, nearest_hint
 from spatial_replay.spec.format import format_formula
@@ -354,7 +354,7 @@ MAX_DECISIONS = 150_000
 """How many nodes the decision diagrams may have."""
 
 
-def progressed(
+def machine_by_progression(
     skeleton: Skeleton,
     propositions: int,
     number: int | None = None,
@@ -403,7 +403,7 @@ class _Progression:
             return states[node]
 
         result = Diagrams()
-        copy = copied(self._diagrams, result, self._propositions, number)
+        copy = node_copier(self._diagrams, result, self._propositions, number)
         start = copy(self._read(root))
         # the list grows while it is iterated: moves lead to new states
         moves = [copy(self._after(node)) for node in waiting]
@@ -467,7 +467,7 @@ _FEW_STATES, _FEW_DECISIONS = 1_000, 20_000
 """A formula that takes no more is compiled at once, without a look at its operands."""
 
 
-def composed(skeleton: Skeleton, propositions: int) -> Machine:
+def machine_by_composition(skeleton: Skeleton, propositions: int) -> Machine:
     """Return an automaton of a skeleton over so many propositions.
 
     Raises:
@@ -503,20 +503,22 @@ class _Composition:
         return self._progress(number, MAX_STATES, MAX_DECISIONS)
 
     def _progress(self, number: int, states: int, decisions: int) -> Machine:
-        return progressed(self._skeleton, self._propositions, number, states=states, decisions=decisions)
+        return machine_by_progression(
+            self._skeleton, self._propositions, number, states=states, decisions=decisions
+        )
 
     def _join(self, operands: tuple[int, ...], both: bool) -> Machine:
-        machines = [merged(self.machine(operand)) for operand in operands]
+        machines = [merge_equivalent_states(self.machine(operand)) for operand in operands]
         waiting = [(machine.size, number) for number, machine in enumerate(machines)]
         heapify(waiting)
         while len(waiting) > 1:
             first, second = (machines[heappop(waiting)[1]] for _ in range(2))
-            machines.append(merged(joined(first, second, both)))
+            machines.append(merge_equivalent_states(join_machines(first, second, both)))
             heappush(waiting, (machines[-1].size, len(machines) - 1))
         return machines[-1]
 
 
-def joined(first: Machine, second: Machine, both: bool) -> Machine:
+def join_machines(first: Machine, second: Machine, both: bool) -> Machine:
     """Return the automaton of the runs that both machines accept or, if not `both`, that one of them does.
 
     Args:
@@ -789,7 +791,7 @@ def _compose_least(shape: _Shape) -> Machine:
     Raises:
         NoAutomatonError: it would take more states or decisions than are explored.
     """
-    return least(composed(shape.skeleton, shape.propositions))
+    return least(machine_by_composition(shape.skeleton, shape.propositions))
 
 
 def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:

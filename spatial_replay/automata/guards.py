@@ -123,7 +123,7 @@ class Diagrams:
         return number
 
 
-def copied(
+def node_copier(
     source: Diagrams, target: Diagrams, variables: int, leaf: Callable[[int], int]
 ) -> Callable[[int], int]:
     """Return a function that copies nodes from one collection into another, with other leaves.
@@ -208,7 +208,7 @@ class Propositions:
         if shape in (YES, NO):
             # logic alone decides it, but where a relation and its opposite both are 0
             shape = self._shapes.of_text(formula)
-        negated = self._shapes.negated(shape)
+        negated = self._shapes.negate(shape)
         if negated in self._numbers:
             self._literals[id(formula)] = self._numbers[negated], False
             return
@@ -261,7 +261,7 @@ class Shapes:
         """Return a node that only a formula of the same text has."""
         return self._variable(format_formula(formula))
 
-    def negated(self, node: int) -> int:
+    def negate(self, node: int) -> int:
         """Return the node of the negation."""
         try:
             return self._diagrams.complement(node)
@@ -286,9 +286,9 @@ class Shapes:
             case Quantified():
                 # "exists" is not "forall" of the negation
                 body, is_every = self.of(without_variables(formula)), formula.quantifier == "forall"
-                key = len(formula.variables), formula.group, body if is_every else self.negated(body)
+                key = len(formula.variables), formula.group, body if is_every else self.negate(body)
                 every = self._variable(key)
-                return every if is_every else self.negated(every)
+                return every if is_every else self.negate(every)
             case Temporal():
                 raise ValueError(f"{formula.operator} is not an operator about one sample")
 

@@ -46,7 +46,7 @@ def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
     for node in _temporal(formula):
         if node.bound is not None and _counts_seconds(node.bound):
             bound = in_samples(node.bound, rate_hz)
-            sentences[f"`{written(node)}` is `{operator_of(node)}{format_bound(bound)}`"] = None
+            sentences[f"`{operator_text(node)}` is `{operator_of(node)}{format_bound(bound)}`"] = None
     return f"at {rate_hz:g} Hz, {', '.join(sentences)}" if sentences else ""
 
 
@@ -68,13 +68,13 @@ def refuse_operators(formula: Formula, source: SourceText | None, rate_hz: float
             faults.append(obstacle(source, node, message))
         elif node.bound is not None and _counts_seconds(node.bound):
             if rate_hz is None:
-                message = f"`{written(node)}` counts seconds, an automaton counts samples"
+                message = f"`{operator_text(node)}` counts seconds, an automaton counts samples"
                 remedy = (
                     "for an automaton, bound it in samples, or state the samples a second (--hz, rate_hz)"
                 )
                 faults.append(obstacle(source, node, message, remedy))
             elif in_samples(node.bound, rate_hz) is None:
-                message = f"no sample is in the window of `{written(node)}` at {rate_hz:g} Hz"
+                message = f"no sample is in the window of `{operator_text(node)}` at {rate_hz:g} Hz"
                 faults.append(obstacle(source, node, message, "for an automaton, widen it"))
     if faults:
         messages = dict.fromkeys(map(str, faults))
@@ -87,7 +87,7 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
     place = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(place):
         place = _without_names(spec.formula)
-    message = f"`{written(place)}` leaves {spec.name} without an automaton: {reason}"
+    message = f"`{operator_text(place)}` leaves {spec.name} without an automaton: {reason}"
     hint = "for an automaton, write smaller bounds, or split it into several specs"
     return obstacle(source, place, message, hint)
 
@@ -102,7 +102,7 @@ def obstacle(
     return NoAutomatonError(str(source.diagnostic("error", node.span, message, hint)), message)
 
 
-def written(node: Formula) -> str:
+def operator_text(node: Formula) -> str:
     """Return an operator with its bound, as in the canonical text."""
     bound = node.bound if isinstance(node, Temporal) else None
     return operator_of(node) + ("" if bound is None else format_bound(bound))
@@ -316,6 +316,6 @@ class Skeleton:
 
     def _too_large(self) -> NoAutomatonError:
         place = self._unrolled
-        what = "the formula" if place is None else f"`{written(place)}`"
+        what = "the formula" if place is None else f"`{operator_text(place)}`"
         message = f"with {what} unrolled into steps, there are more than {MAX_NODES} subformulas"
         return obstacle(self._source, place, message, "for an automaton, write smaller bounds")

@@ -60,7 +60,7 @@ def _machine(
     return Machine(np.array(moves, np.int64), decisions, np.array(accepting, np.bool_), start)
 
 
-def merged(machine: Machine) -> Machine:
+def merge_equivalent_states(machine: Machine) -> Machine:
     """Return a machine that accepts the same runs, without equivalent states."""
     _, firsts, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
     places, decisions = _relabel(machine, classes)
@@ -75,7 +75,7 @@ def least(machine: Machine) -> Machine:
     their distance from the first one. No run is empty, so that may be any state with the same moves, and one
     that does not accept if there is a choice.
     """
-    machine = merged(machine)
+    machine = merge_equivalent_states(machine)
     reachable = _reachable(machine)
     # compilers differ in states that no run is in
     same = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)

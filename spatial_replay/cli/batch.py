@@ -587,7 +587,7 @@ def results(
         if not len(rows):
             warn(*absent_values(table, where))
         table = rows
-    table = explain_shown(table, range(len(table)) if json_file else worst_places(table, worst))
+    table = explain_table_rows(table, range(len(table)) if json_file else worst_places(table, worst))
     if json_file is not None:
         write_json_lines(table, json_file, ())
     if json_file == "-":
@@ -605,7 +605,7 @@ _MOST_HERE = 64
 """Results that are explained by this process alone."""
 
 
-def explain_shown(table: pa.Table, places: Collection[int]) -> pa.Table:
+def explain_table_rows(table: pa.Table, places: Collection[int]) -> pa.Table:
     """Return the table of a run in which the rows at some places are explained, from their logs."""
     from spatial_replay.batch.explanations import explain_rows
     from spatial_replay.batch.run import workers_of
@@ -625,7 +625,7 @@ def _compare_results(folder: str, other: str, json_file: str | None, tolerance: 
     with naming_option("--tolerance"):
         allowed = Tolerance.parse(tolerance or "0")
     before, now = (ResultsFolder.open(place).read_run() for place in (folder, other))
-    flips = diff_runs(before, now, allowed, (folder, other), explain=explain_shown)
+    flips = diff_runs(before, now, allowed, (folder, other), explain=explain_table_rows)
     if json_file is not None:
         write_json_lines([change.document for change in flips.changes], json_file, ())
     if json_file != "-":

@@ -95,15 +95,15 @@ def diff(
     if len(logs) > 2:
         raise UsageError(f"{len(logs)} logs; give two, or two specifications: --spec OLD --spec NEW")
     request = _for_log(conditions, logs[0])
-    other = _log(logs[1]) if len(logs) > 1 else None
+    second_log = _log(logs[1]) if len(logs) > 1 else None
     if output is not None:
-        refuse_output(output, _inputs(request, other))
-    if other is None and align != "time":
+        refuse_output(output, _inputs(request, second_log))
+    if second_log is None and align != "time":
         raise UsageError("--align applies to two logs; give the second one")
-    if other is None:
+    if second_log is None:
         difference: SpecificationDiff | LogDiff = _of_specifications(request, output, semantics)
     else:
-        difference = _of_logs(request, other, align, output, semantics)
+        difference = _of_logs(request, second_log, align, output, semantics)
     show_result(lambda: difference.document, difference.lines, as_json)
     if output is not None and not as_json:
         show(f"wrote {output}")
@@ -145,7 +145,7 @@ def _over_logs(
     from spatial_replay.batch.rows import parsed_specifications
     from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.suite import Conditions, Suite
-    from spatial_replay.cli.batch import code_of_errors, explain_shown, warn_of_damage, warn_of_names
+    from spatial_replay.cli.batch import code_of_errors, explain_table_rows, warn_of_damage, warn_of_names
 
     others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
     objects = objects_by_parameter(given.choices)
@@ -159,7 +159,7 @@ def _over_logs(
     with TemporaryDirectory() as folder:
         table = run_batch(cases, folder, workers, progress=progress).table
     before, now = (table.filter(pc.equal(table["file"], file.name)) for file in (old, new))
-    flips = diff_runs(before, now, names=(old.name, new.name), explain=explain_shown)
+    flips = diff_runs(before, now, names=(old.name, new.name), explain=explain_table_rows)
     paths = {log.name: log.path for log in cases[0].logs}
     specifications = parsed_specifications((old.text, new.text), conditions)
     causes = list(_causes(flips, paths, given, specifications, semantics))

@@ -417,40 +417,41 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     return tuple(diffs)
 
 
-def _object_diff(a: Trace, one: Integers, b: Trace, other: Integers) -> tuple[Booleans, Floats, Floats]:
+def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tuple[Booleans, Floats, Floats]:
     """Compare observations in pairs.
 
     Returns:
         Which differ, the squared shift of their vertices' mean, and the signed distance of the two
         footprints; NaN for those that do not differ.
     """
-    first, second = a.footprints.select(one), b.footprints.select(other)
+    first, second = a.footprints.select(a_rows), b.footprints.select(b_rows)
     moved = ~_are_equal(first, second)
     columns = [(first.bottom, second.bottom), (first.top, second.top)]
-    columns += [(a.yaw[one], b.yaw[other]), (a.uncertainty[one], b.uncertainty[other])]
+    columns += [(a.yaw[a_rows], b.yaw[b_rows]), (a.uncertainty[a_rows], b.uncertainty[b_rows])]
     for value, beside in columns:
         moved |= (value != beside) & ~(np.isnan(value) & np.isnan(beside))
     # relative to one vertex, so that coordinates far from the origin do not cancel
     corner = first.vertices[first.vertex_start[first.part_start[:-1]]]
     x, y = _mean_vertices(second, corner) - _mean_vertices(first, corner)
-    distance = np.full(len(one), np.nan)
-    operands = [Operand(np.flatnonzero(moved)[:, None] + start) for start in (0, len(one))]
+    distance = np.full(len(a_rows), np.nan)
+    operands = [Operand(np.flatnonzero(moved)[:, None] + start) for start in (0, len(a_rows))]
     both = FootprintBatch.concatenate([first, second])
     distance[moved] = measure(both, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
     return moved, x * x + y * y, distance
 
 
-def _are_equal(one: FootprintBatch, other: FootprintBatch) -> Booleans:
+def _are_equal(first: FootprintBatch, second: FootprintBatch) -> Booleans:
     """Return which rows have the same parts."""
     sizes = [
-        (np.diff(batch.part_start), np.diff(batch.vertex_start[batch.part_start])) for batch in (one, other)
+        (np.diff(batch.part_start), np.diff(batch.vertex_start[batch.part_start]))
+        for batch in (first, second)
     ]
     alike = (sizes[0][0] == sizes[1][0]) & (sizes[0][1] == sizes[1][1])
-    one, other = (batch.select(np.flatnonzero(alike)) for batch in (one, other))
-    parts = (np.diff(one.vertex_start) != np.diff(other.vertex_start)) | (one.radius != other.radius)
-    vertices = (one.vertices != other.vertices).any(axis=1)
-    unequal = count_in_rows(parts, one.part_start)
-    unequal += count_in_rows(vertices, one.vertex_start[one.part_start])
+    first, second = (batch.select(np.flatnonzero(alike)) for batch in (first, second))
+    parts = (np.diff(first.vertex_start) != np.diff(second.vertex_start)) | (first.radius != second.radius)
+    vertices = (first.vertices != second.vertices).any(axis=1)
+    unequal = count_in_rows(parts, first.part_start)
+    unequal += count_in_rows(vertices, first.vertex_start[first.part_start])
     alike[alike] = unequal == 0
     return np.asarray(alike)
 

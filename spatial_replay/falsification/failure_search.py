@@ -607,7 +607,7 @@ def simulate_rounds(
         queue = _Queue(rounds, earlier_runs, advance, logs)
         for task, run in workers.results(partial(_simulate, simulation), queue):
             if isinstance(run, WorkerLost):
-                raise lost(run)
+                raise lost_worker_error(run)
             queue.take(task, run)
         return queue.result
 
@@ -703,7 +703,7 @@ def write_whole(write: Callable[[Path], None], log: Path) -> None:
     unfinished.replace(log)
 
 
-def lost(worker: WorkerLost) -> OutputError:
+def lost_worker_error(worker: WorkerLost) -> OutputError:
     """Return the error about a worker that died."""
     return OutputError(f"a run could not be simulated: {worker}; the same command goes on from there")
 
@@ -909,7 +909,7 @@ class _Search:
         with self._progress("clips", len(failures)) as advance:
             for _, finished in self._workers.results(partial(_finish, self._simulation), failures):
                 if isinstance(finished, WorkerLost):
-                    raise lost(finished)
+                    raise lost_worker_error(finished)
                 advance(1)
         result = Falsification(
             self._simulation.name,

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from spatial_replay.lazy import loaded_when_used
+from spatial_replay.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from spatial_replay.live.session import LiveSession, LiveUpdate, SessionStatus, monitor, open_recorders
 
 __all__ = ["LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"]
 
-__getattr__, __dir__ = loaded_when_used(globals())
+__getattr__, __dir__ = lazy_attributes(globals())

@@ -14,7 +14,7 @@ from spatial_replay.annotate.scene.scene_template import outlines_of, rings_of
 from spatial_replay.annotate.specification import unit_of, unit_words
 from spatial_replay.automata.automaton import (
     Automaton,
-    abbreviated,
+    abbreviate,
     meanings,
     size_words,
     state_colour,
@@ -614,7 +614,7 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
         UsageError: Graphviz or matplotlib is not installed.
         OutputError: Graphviz fails, or takes too long.
     """
-    short = abbreviated(automaton)
+    short = abbreviate(automaton)
     layout = json.loads(layout_text(short))
     width, height = _point(layout["bb"].removeprefix("0,0,"))
     legend = meanings(short)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from spatial_replay.lazy import loaded_when_used
+from spatial_replay.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from spatial_replay.geometry.footprint import moved_object
@@ -57,4 +57,4 @@ __all__ = [
     "redo_decisions",
 ]
 
-__getattr__, __dir__ = loaded_when_used(globals())
+__getattr__, __dir__ = lazy_attributes(globals())

@@ -135,7 +135,7 @@ class Planner:
             else proposition
             for proposition, spec_name in zip(self.automaton.propositions, spec_names, strict=True)
         ]
-        self._words = self.automaton.renamed(named)
+        self._words = self.automaton.with_propositions(named)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
         # the same, where what only groups without members satisfy may still be to do
         self._tested = self._states

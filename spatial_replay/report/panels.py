@@ -36,7 +36,7 @@ from spatial_replay.annotate.scene.scene_frames import (
 )
 from spatial_replay.annotate.scene.scene_template import REGION
 from spatial_replay.annotate.specification import unit_of
-from spatial_replay.automata.automaton import Automaton, abbreviated, meanings
+from spatial_replay.automata.automaton import Automaton, abbreviate, meanings
 from spatial_replay.automata.drawing import draw_automaton
 from spatial_replay.bags.open import is_log, open_messages
 from spatial_replay.errors import LogError, UsageError
@@ -300,7 +300,7 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
         named: writes the object in place of a template's parameter.
     """
     visited = {state for states in path.sets for state in states}
-    drawing, short = draw_automaton(automaton, visited), abbreviated(automaton)
+    drawing, short = draw_automaton(automaton, visited), abbreviate(automaton)
     return {
         **json_fields(drawing, "summary", "left_out"),
         "states": [

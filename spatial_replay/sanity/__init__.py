@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from spatial_replay.lazy import loaded_when_used
+from spatial_replay.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from spatial_replay.sanity.differences import Distinction, distinguish
@@ -12,4 +12,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Distinction", "distinguish", "doctor", "refuse_constant_results", "refuse_unsatisfiable"]
 
-__getattr__, __dir__ = loaded_when_used(globals())
+__getattr__, __dir__ = lazy_attributes(globals())

@@ -461,7 +461,7 @@ class FactDiagrams:
         if shape not in self._opaque_nodes:
             node = self._opaque_nodes[shape] = self._new_opaque(formula)
             # "exists" of something is not "forall" of its negation
-            self._opaque_nodes[self._shapes.negated(shape)] = self.diagrams.complement(node)
+            self._opaque_nodes[self._shapes.negate(shape)] = self.diagrams.complement(node)
         return self._opaque_nodes[shape]
 
     def _new_opaque(self, formula: Formula) -> int:

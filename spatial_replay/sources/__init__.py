@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from spatial_replay.lazy import loaded_when_used
+from spatial_replay.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from spatial_replay.sources.open_log import open_source, read_trace
@@ -15,4 +15,4 @@ if TYPE_CHECKING:
 
 __all__ = ["messages_in", "open_source", "overview_of", "read_trace", "survey"]
 
-__getattr__, __dir__ = loaded_when_used(globals())
+__getattr__, __dir__ = lazy_attributes(globals())

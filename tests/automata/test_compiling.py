@@ -299,7 +299,7 @@ def test_another_threshold_changes_what_propositions_say_and_no_move() -> None:
     first, second, same = (automaton(parse_specification(text.format(near))) for near in (1, 2, 5))
     assert [each.text for each in second.propositions] == ["a closeto[2] b", "a closeto[5] b"]
     assert [each.text for each in first.propositions] == ["a closeto[1] b", "a closeto[5] b"]
-    assert first.renamed(second.propositions) == second
+    assert first.with_propositions(second.propositions) == second
     # with one threshold for both, the two propositions are one, and the automaton another
     assert len(same.propositions) == 1
     assert len(same.states) < len(second.states)

@@ -18,10 +18,10 @@ from laws.strategies_monitor import leaf_runs
 from spatial_replay import Specification, automaton
 from spatial_replay.automata import TransitionTable, automaton_from, stored_text
 from spatial_replay.automata.automaton import Automaton, automaton_of
-from spatial_replay.automata.compile import joined, progressed
+from spatial_replay.automata.compile import join_machines, machine_by_progression
 from spatial_replay.automata.guards import Propositions
 from spatial_replay.automata.ltlf import Skeleton
-from spatial_replay.automata.machine import least, merged
+from spatial_replay.automata.machine import least, merge_equivalent_states
 from spatial_replay.spec.formula import Boolean, NamedSpec
 
 known = st.booleans()
@@ -178,6 +178,6 @@ def test_joining_the_automata_of_operands_gives_that_of_the_whole(first, second,
     propositions = Propositions(formula)
     skeleton, count = Skeleton(formula, propositions), len(propositions.all)
     kind, operands = skeleton.split(skeleton.root)
-    machines = [merged(progressed(skeleton, count, each)) for each in operands]
-    whole = least(reduce(lambda one, other: joined(one, other, kind == "and"), machines))
+    machines = [merge_equivalent_states(machine_by_progression(skeleton, count, each)) for each in operands]
+    whole = least(reduce(lambda one, other: join_machines(one, other, kind == "and"), machines))
     assert automaton_of(whole, "s", propositions.all) == compiled(formula)

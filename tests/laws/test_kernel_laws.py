@@ -103,7 +103,7 @@ def test_machine_code_lies_in_a_folder_of_its_own_sources(tmp_path):
 
 def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path):
     program = tmp_path / "program.py"
-    program.write_text(_ONE_KERNEL + "print(sum(doubled.compiled().stats.cache_hits.values()))")
+    program.write_text(_ONE_KERNEL + "print(sum(doubled.compiled_form().stats.cache_hits.values()))")
     environment = os.environ | {"SPATIAL_REPLAY_CACHE": str(tmp_path / "cache"), "SPATIAL_REPLAY_KERNELS": ""}
     begun = [
         subprocess.Popen([sys.executable, program], env=environment, stdout=subprocess.PIPE, text=True)

@@ -22,7 +22,7 @@ def test_a_kernel_finds_each_array_of_a_plan_by_its_name():
     arrays = PlanArrays(*(values.astype(kind) for values, kind in zip(numbers, kinds, strict=True)))
     extent = PlanExtent(samples=2, regions=3, places=4, signals=5, coded=6)
     packed = PackedPlan.of(extent, arrays)
-    places = plan_at.interpreted()(packed.whole)
+    places = plan_at.interpreted_form()(packed.whole)
 
     assert places[: len(extent)] == extent
     for name, array in arrays._asdict().items():
