@@ -88,7 +88,9 @@ class _Result:
         self.run: AutomatonRun | None = None
         if kept.automaton is not None:
             leaves = instance.program.leaves
-            self.run = AutomatonRun(tree.name, tree.object, kept.automaton, tree.formula, leaves, tree.named)
+            self.run = AutomatonRun(
+                tree.name, tree.object, kept.automaton, tree.formula, leaves, tree.with_object_name
+            )
 
     def extend(self, trace: Trace, block: SeriesBlock) -> list[EncodedEvent]:
         """Take in the next samples and their evaluation; return the events."""
@@ -107,7 +109,7 @@ class _Result:
             tree.name, tree.object, self._names, block.times_ns, block.series, final=final
         )
 
-    def evaluated(self, block: SeriesBlock, *, is_final: bool) -> EvaluatedResult:
+    def result_for_scene(self, block: SeriesBlock, *, is_final: bool) -> EvaluatedResult:
         """Return the result as the scene shows it."""
         of = self._since_ns, self.reporter.settled, is_final, self._shades.shades
         return EvaluatedResult(self.requirements, block, self._pairs, *of)
@@ -283,7 +285,7 @@ class Annotator:
         for follower, final in zip(self._results, finals, strict=True):
             events += follower.reporter.end(time_ns, final)
         for follower, result in zip(self._results, results, strict=False):
-            events += follower.reporter.untested(time_ns, result)
+            events += follower.reporter.untested_warnings(time_ns, result)
         return [*self._events(events), *self._finals(time_ns, finals)]
 
     def _finals(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
@@ -291,7 +293,7 @@ class Annotator:
         if self._latest is None or not self._trees:
             return []
         trace, blocks = self._latest
-        ended = [_ended(block, final) for block, final in zip(blocks, finals, strict=True)]
+        ended = [_with_final_intervals(block, final) for block, final in zip(blocks, finals, strict=True)]
         pairs = zip(self._results, ended, strict=True)
         robustness = Payloads.concatenate([result.robustness(block, final=True) for result, block in pairs])
         last_ns = int(trace.times_ns[-1])
@@ -354,7 +356,7 @@ class Annotator:
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False
     ) -> Messages:
         pairs = zip(self._results, blocks, strict=True)
-        results = [result.evaluated(block, is_final=is_final) for result, block in pairs]
+        results = [result.result_for_scene(block, is_final=is_final) for result, block in pairs]
         scene_messages = self._encoder.encode(trace, results, self._scene)
         if scene_messages.frames is not None:
             self._show(scene_messages.frames)
@@ -382,7 +384,7 @@ def _last_of(block: SeriesBlock) -> SeriesBlock:
     )
 
 
-def _ended(block: SeriesBlock, final: Floats) -> SeriesBlock:
+def _with_final_intervals(block: SeriesBlock, final: Floats) -> SeriesBlock:
     """Return a last sample, if there is one, with the interval (N, 2) of each node over the finished log."""
     series = block.series.copy()
     series[:, 2:] = final[:, :, None]

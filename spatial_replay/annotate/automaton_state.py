@@ -99,7 +99,7 @@ class AutomatonRun:
             [[state in members for members in about] for state in automaton.states], np.bool_
         )
         self._after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
-        self._text = lru_cache(_MOST_TEMPLATES)(self._described)
+        self._text = lru_cache(_MOST_TEMPLATES)(self._description)
 
     def encode(self, block: SeriesBlock) -> Sequence[bytes]:
         """Take in the next samples; return one message for each."""
@@ -160,7 +160,7 @@ class AutomatonRun:
     def _after_states(self, sample: int) -> tuple[int, ...]:
         return tuple(_members(self._after[sample]).tolist())
 
-    def _described(self, states: tuple[int, ...]) -> str:
+    def _description(self, states: tuple[int, ...]) -> str:
         """Return some states in words: what they decide, or what is still to be done."""
         numbers = listing([*map(str, states)], _MOST_NAMED)
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
@@ -177,7 +177,7 @@ class AutomatonRun:
         is_searched = len(states) == 1 and len(self._automaton.states) <= _MOST_SEARCHED
         if last == "not satisfied yet" and is_searched:
             [first, *_] = next(self._automaton.paths(states[0]))
-            last = f"still to come: {_shortened(self._guard(first), _LONGEST_STEP)}"
+            last = f"still to come: {_shorten(self._guard(first), _LONGEST_STEP)}"
         return f"{title}: {last}"
 
     def _guard(self, move: Transition) -> str:
@@ -233,7 +233,7 @@ class AutomatonRun:
             message.source = sources[0]
         if len(sources) == len(targets) == 1 and sources != targets:
             transition = self._automaton.transition(sources[0], targets[0])
-            message.guard = "" if transition is None else _shortened(self._guard(transition))
+            message.guard = "" if transition is None else _shorten(self._guard(transition))
         message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
         return WireTemplate.of(message)
 
@@ -276,7 +276,7 @@ _MOST_SEARCHED = 2_000
 """The most states of an automaton whose way to acceptance is looked for while it runs."""
 
 
-def _shortened(text: str, most: int = _LONGEST_GUARD) -> str:
+def _shorten(text: str, most: int = _LONGEST_GUARD) -> str:
     return text if len(text) <= most else f"{text[: most - 1].rstrip()}…"
 
 

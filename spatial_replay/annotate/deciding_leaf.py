@@ -274,7 +274,7 @@ class LeafHistory:
         """Whether all samples so far are kept."""
         return self._samples <= self._most
 
-    def settled(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
+    def settling_leaf(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
         """Return what settled a node's verdict at a sample; None beyond the bound.
 
         For a violated conjunction it settled the first violated conjunct.
@@ -291,7 +291,7 @@ class LeafHistory:
         evaluation = evaluate_prefix(self._formula, self._order, samples.leaves, samples.times_ns)
         return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
 
-    def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
+    def final_leaf(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return what decides a node that was pending up to the end of the log; None beyond the bound.
 
         For a violated conjunction it decides the first cause (see `find_causes`).

@@ -420,7 +420,7 @@ class EventReporter:
             return []
         return [self._final_event(node, time_ns, self._last_ns, final) for node in self._states.pending]
 
-    def untested(self, time_ns: int, result: SpecResult) -> list[EncodedEvent]:
+    def untested_warnings(self, time_ns: int, result: SpecResult) -> list[EncodedEvent]:
         """Return one warning for each part of the result that was not tested, or not wholly.
 
         Args:
@@ -456,8 +456,8 @@ class EventReporter:
         time_ns, settled = int(block.times_ns[change.sample]), None
         if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
             series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
-            settled = self._history.settled(reported.node, series, time_ns, verdict)
-            witness, because = self._settled(settled, verdict, time_ns, time_ns)
+            settled = self._history.settling_leaf(reported.node, series, time_ns, verdict)
+            witness, because = self._settling_words(settled, verdict, time_ns, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
                 self.settled = self._violation(settled, time_ns)
             self._remember(change.node, settled, time_ns)
@@ -474,7 +474,7 @@ class EventReporter:
             worst = self._words(self._deciding_leaf(change.node, before, block), time_ns, past=True)
             said = past_sentence(before, after.start_ns, worst, reported.unit)
             past = PeriodText(before, worst, said)
-        return self._encoded(reported, time_ns, now, past)
+        return self._encode(reported, time_ns, now, past)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
         reported, before = self._reported[node], self._states.period(node)
@@ -482,8 +482,8 @@ class EventReporter:
         verdict = final_verdict(lower, upper)
         low, witness, because, decided = verdict is not Verdict.VIOLATED, "", "", None
         if self._history is not None and self._history.is_complete:
-            decided = self._history.finished(reported.node, self._values, final)
-            witness, because = self._settled(decided, verdict, last_ns, time_ns)
+            decided = self._history.final_leaf(reported.node, self._values, final)
+            witness, because = self._settling_words(decided, verdict, last_ns, time_ns)
             self._remember(node, decided, time_ns)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
@@ -493,9 +493,9 @@ class EventReporter:
             worst = self._words(self._carried[node, OF_CURRENT], time_ns, past=True)
             said = past_sentence(before, last_ns, worst, reported.unit)
             past = PeriodText(before, worst, said)
-        return self._encoded(reported, time_ns, now, past)
+        return self._encode(reported, time_ns, now, past)
 
-    def _encoded(
+    def _encode(
         self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
     ) -> EncodedEvent:
         period, witness, sentence, decided = now
@@ -560,7 +560,7 @@ class EventReporter:
     def _leaf_text(self, leaf: Formula) -> str:
         return format_formula(leaf, relations=self._relations)
 
-    def _settled(
+    def _settling_words(
         self, found: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
     ) -> tuple[str, str]:
         """Return what decided in words, and the same with how long before a time; nothing for None."""

@@ -314,7 +314,7 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
                 case Variable() if object is not None:
                     objects.add(object)
                 case Group() as group:
-                    excluded = _excluded(group, object)
+                    excluded = _excluded_names(group, object)
                     if group.members is None:
                         groups.add(ClassMembers((group.class_name or ANY_CLASS).casefold(), excluded))
                     else:
@@ -334,6 +334,6 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
     )
 
 
-def _excluded(group: Group, object: str | None) -> frozenset[str]:
+def _excluded_names(group: Group, object: str | None) -> frozenset[str]:
     names = [object if isinstance(term, Variable) else term.name for term in group.excluded]
     return frozenset(name for name in names if name is not None)

@@ -180,7 +180,7 @@ class Thinning:
     def seconds(self, first_ns: int) -> Floats:
         """Return the times of the points, counted from a first one."""
         seconds = (self._times_ns - first_ns) / 1e9
-        return self._paired(seconds[self._starts], seconds[self._ends]) if self._is_needed else seconds
+        return self._interleave(seconds[self._starts], seconds[self._ends]) if self._is_needed else seconds
 
     def points(self, times_ns: Integers, numbers: Floats) -> Floats:
         """Return the points of one curve.
@@ -197,9 +197,9 @@ class Thinning:
         low = np.fmin.reduceat(whole, self._starts)
         high = np.fmax.reduceat(whole, self._starts)
         falls = whole[self._starts] > whole[self._ends]
-        return self._paired(np.where(falls, high, low), np.where(falls, low, high))
+        return self._interleave(np.where(falls, high, low), np.where(falls, low, high))
 
-    def _paired(self, first: Floats, second: Floats) -> Floats:
+    def _interleave(self, first: Floats, second: Floats) -> Floats:
         return np.column_stack([first, second]).reshape(-1)
 
 

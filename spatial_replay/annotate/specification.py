@@ -66,7 +66,7 @@ class ReportedTree(NamedTuple):
         title = self.name if self.object is None else f"{self.name}({self.object})"
         return name in names_of(title, self.requirement)
 
-    def named(self, text: str) -> str:
+    def with_object_name(self, text: str) -> str:
         """Return a text about the formula with the object in place of the template's parameter."""
         if self.parameter is None or self.object is None:
             return text
@@ -74,7 +74,7 @@ class ReportedTree(NamedTuple):
         name = written_name(self.object, RELATION_NAMES)
         return re.sub(rf'(?<![\w"]){parameter}(?![\w"])', lambda _: name, text)
 
-    def written(self, source: str) -> list[str]:
+    def written_texts(self, source: str) -> list[str]:
         """Return the text of each node as the file writes it, with the object in place of the parameter.
 
         The body of a `def` is in canonical form, below the node that has its call. So is what a
@@ -92,12 +92,12 @@ class ReportedTree(NamedTuple):
             is_quantifier.append(is_bound or _QUANTIFIER.match(source_text) is not None)
             is_expanded = parent is not None and spans[parent] == node.span
             text = "" if is_expanded or is_bound else source_text
-            texts.append(self.named(text or format_formula(node)))
+            texts.append(self.with_object_name(text or format_formula(node)))
         return texts
 
     def calls(self, source: str) -> dict[int, str]:
         """Return the text of each node that is a `def` with its arguments, as the file writes it."""
-        nodes, spec_text = list(iter_nodes(self.formula)), self.written(source)
+        nodes, spec_text = list(iter_nodes(self.formula)), self.written_texts(source)
         spans, defined = [node.span for _, _, node in nodes], set(_DEFINED.findall(source))
         # what a def stands for has the place of its call
         expanded = {
@@ -172,9 +172,9 @@ def encode_specification(
         result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
         result.propositions.extend(propositions[index] if propositions is not None else ())
         _add_nodes(result, tree, files[tree.file], units or {})
-        own = automata[index] if automata else None
-        if own is not None:
-            _add_automaton(result, tree, own)
+        tree_automaton = automata[index] if automata else None
+        if tree_automaton is not None:
+            _add_automaton(result, tree, tree_automaton)
     return message.SerializeToString(deterministic=True)
 
 
@@ -187,7 +187,7 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     Args:
         units: those that are declared, of signals by their names, of lengths by "".
     """
-    declared_units = {_declared(unit, units) for unit in units_of(formula)}
+    declared_units = {_declared_unit(unit, units) for unit in units_of(formula)}
     if len(declared_units) > 1:
         return MIXED
     if not declared_units and any(iter_atoms(formula)):
@@ -204,7 +204,7 @@ def unit_words(unit: str) -> str:
 def _add_nodes(
     result: SpecificationResult, tree: ReportedTree, file: Specification, units: Mapping[str, str]
 ) -> None:
-    relations, spec_text = RELATION_NAMES | file.relations, tree.written(file.source)
+    relations, spec_text = RELATION_NAMES | file.relations, tree.written_texts(file.source)
     for identifier, parent, formula_node in iter_nodes(tree.formula):
         node = result.nodes.add(
             id=identifier,
@@ -225,7 +225,7 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
     from spatial_replay.automata.drawing import draw_automaton, guard_of
 
     drawing, short = draw_automaton(automaton), abbreviate(automaton)
-    result.automaton.legend.extend(map(tree.named, meanings(short)))
+    result.automaton.legend.extend(map(tree.with_object_name, meanings(short)))
     result.automaton.summary = drawing.summary
     result.automaton.left_out = drawing.left_out
     for state in drawing.states:
@@ -239,11 +239,11 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
             distance=state.distance,
         )
     for move in drawing.moves:
-        guard, label = tree.named(move.guard), tree.named(guard_of(short, move))
+        guard, label = tree.with_object_name(move.guard), tree.with_object_name(guard_of(short, move))
         result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 
-def _declared(unit: Unit, units: Mapping[str, str]) -> str:
+def _declared_unit(unit: Unit, units: Mapping[str, str]) -> str:
     """Return the words for a unit of an atom's number."""
     if unit.divisor is not None or unit.kind == "orientation":
         return DIMENSIONLESS
@@ -276,7 +276,7 @@ def logged_specifications(files: Sequence[Specification], units: Mapping[str, st
             count += 1
             stem = f"{first}-{count}"
         stems.add(stem)
-        contained = replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}")
+        contained = replace(_logged_copy(_Same(file)), filename=f"{stem}{suffix}")
         logged.append(with_numbers(contained, units))
     return logged
 
@@ -301,7 +301,7 @@ class _Same:
 
 # many logs are evaluated with the same specifications
 @lru_cache(maxsize=64)
-def _self_contained(same: _Same) -> Specification:
+def _logged_copy(same: _Same) -> Specification:
     file = same.file
     for text_of in (attrgetter("source"), format_specification):
         try:

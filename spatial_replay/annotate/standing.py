@@ -15,7 +15,7 @@ import numpy as np
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.annotate.robustness import Codes, curved_nodes, standing_codes
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
-from spatial_replay.annotate.scene.scene_update import spaced
+from spatial_replay.annotate.scene.scene_update import samples_to_write
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined_code, equal_places
 from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, StandingUpdate
@@ -149,7 +149,7 @@ class StandingEncoder:
             blocks: of each tree; an object's result may have fewer samples.
             over: of each tree, what decided it, if that has happened in these samples or before.
         """
-        shown_ns = times_ns[spaced(times_ns, self._written_ns)]
+        shown_ns = times_ns[samples_to_write(times_ns, self._written_ns)]
         if len(shown_ns):
             self._written_ns = int(shown_ns[-1])
         return shown_ns, self._encode_at(shown_ns, blocks, over)
@@ -183,8 +183,8 @@ class StandingEncoder:
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
             series.append(self._numbers(index, block, at))
-            words.append(self._described(index, block, at))
-            since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
+            words.append(self._descriptions(index, block, at))
+            since.append(np.append(self._violated_ns[index], self._violated_since(index, block))[at])
             least.append(np.append(self._least_ns[index], self._became_least(index, block))[at])
         self.pass_over(blocks)
         if not len(shown_ns):
@@ -204,7 +204,7 @@ class StandingEncoder:
         for index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue
-            self._violated_ns[index] = int(self._violated(index, block)[-1])
+            self._violated_ns[index] = int(self._violated_since(index, block)[-1])
             self._least_ns[index] = int(self._became_least(index, block)[-1])
             self._least[index] = float(np.fmin.reduce(block.series[0, 3], initial=self._least[index]))
             self._last[index] = block.series[:, :, -1:].copy()
@@ -212,7 +212,7 @@ class StandingEncoder:
             if run is not None:
                 self._words[index] = run.latest_words
 
-    def _violated(self, index: int, block: SeriesBlock) -> Integers:
+    def _violated_since(self, index: int, block: SeriesBlock) -> Integers:
         """Return (T,) since when a result is violated, at each sample of a block; `LATEST_NS` where not."""
         is_violated = block.series[0, 3] < 0.0
         begins = is_violated & ~np.append(self._violated_ns[index] < LATEST_NS, is_violated)[:-1]
@@ -257,7 +257,7 @@ class StandingEncoder:
         [payload] = self._messages(times_ns, series, words, instants, over, final=True)
         return payload
 
-    def _described(self, index: int, block: SeriesBlock, at: Integers) -> tuple[list[str], Integers]:
+    def _descriptions(self, index: int, block: SeriesBlock, at: Integers) -> tuple[list[str], Integers]:
         """Return states of an automaton in words, and which of them (S,) is `at` samples into a block."""
         run = self._runs[index]
         if run is None or not len(block.times_ns):

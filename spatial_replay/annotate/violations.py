@@ -103,11 +103,11 @@ class ShadeTracker:
         """Take in the next samples."""
         if len(block.times_ns):
             self.shades = tuple(
-                self._extended(shade, leaf, trace, block)
+                self._extend_shade(shade, leaf, trace, block)
                 for shade, leaf in zip(self.shades, self._leaves, strict=True)
             )
 
-    def _extended(self, shade: Shade, leaf: Quantified | None, trace: Trace, block: SeriesBlock) -> Shade:
+    def _extend_shade(self, shade: Shade, leaf: Quantified | None, trace: Trace, block: SeriesBlock) -> Shade:
         part = shade.requirement
         now = part.sign * block.series[part.node, 1]
         determined = now[~np.isnan(now)]
@@ -330,7 +330,7 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
             violations.leaf[places], violations.holds[places] = _deciding(
                 result, result.leaf_pairs, requirement[places], at
             )
-            _point_at_settled(result, times_ns, places, violations)
+            _point_at_settling_leaf(result, times_ns, places, violations)
             leaf = violations.leaf[places]
             located = places[leaf >= 0]
             violations.robustness[located] *= result.leaf_pairs.divisors[leaf[leaf >= 0]]
@@ -338,7 +338,7 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
     return violations
 
 
-def _shows_settled(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
+def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
     """Return (S,), in which samples a result is pointed at by what settled its violation.
 
     That is the sample that settled it and, if the atom is not asked of every sample, all after it.
@@ -359,21 +359,23 @@ def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
     return within[-1] if within else None
 
 
-def _point_at_settled(
-    result: EvaluatedResult, times_ns: Integers, here: Integers, violations: Violations
+def _point_at_settling_leaf(
+    result: EvaluatedResult, times_ns: Integers, places: Integers, violations: Violations
 ) -> None:
     """Name the leaf that settled the violation, where that is what is pointed at."""
     if result.settled is None:
         return
-    violations.leaf[here[times_ns[here] == result.settled.time_ns]] = -1
+    violations.leaf[places[times_ns[places] == result.settled.time_ns]] = -1
     leaf = result.settled.shown
-    places = here[_shows_settled(result, times_ns[here])]
-    if leaf is None or not len(places):
+    settled_places = places[_shows_settling_leaf(result, times_ns[places])]
+    if leaf is None or not len(settled_places):
         return
-    violations.leaf[places], violations.node[places] = leaf.leaf, leaf.node
-    violations.robustness[places] = -abs(leaf.number)
-    violations.holds[places] = leaf.number > 0.0
-    violations.moment_ns[places] = np.where(times_ns[places] == leaf.time_ns, -1, leaf.time_ns)
+    violations.leaf[settled_places], violations.node[settled_places] = leaf.leaf, leaf.node
+    violations.robustness[settled_places] = -abs(leaf.number)
+    violations.holds[settled_places] = leaf.number > 0.0
+    violations.moment_ns[settled_places] = np.where(
+        times_ns[settled_places] == leaf.time_ns, -1, leaf.time_ns
+    )
 
 
 def _robustness(
@@ -419,7 +421,7 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
             earliest[is_first] = since_ns[number]
         if result.settled is not None and result.settled.shown is not None:
             # what settled a violation may be a goal whose time is over
-            is_first = _shows_settled(result, times_ns) & (result.settled.time_ns < earliest)
+            is_first = _shows_settling_leaf(result, times_ns) & (result.settled.time_ns < earliest)
             which[is_first], violated[is_first] = index, -abs(result.settled.shown.number)
             earliest[is_first] = result.settled.time_ns
     return which, place, violated
@@ -449,43 +451,45 @@ def _deciding(
 
 
 def _locate(
-    result: EvaluatedResult, trace: Trace, samples: Integers, here: Integers, found: Violations
+    result: EvaluatedResult, trace: Trace, samples: Integers, places: Integers, violations: Violations
 ) -> None:
-    """Fill in the points of the samples `here` (H,), whose leaves are given, and the atoms of quantifiers."""
+    """Fill in the points at `places` (H,), whose leaves are given, and the atoms of quantifiers."""
     if result.leaf_pairs is None:
         return
-    is_past = found.moment_ns[here] >= 0
-    _point_at_past(result, result.leaf_pairs, here[is_past], found)
-    here = here[(found.leaf[here] >= 0) & ~is_past]
-    if not len(here):
+    is_past = violations.moment_ns[places] >= 0
+    _point_at_past(result, result.leaf_pairs, places[is_past], violations)
+    places = places[(violations.leaf[places] >= 0) & ~is_past]
+    if not len(places):
         return
     # of all samples, these are often few
-    leaf, scene = found.leaf[here], TraceScene(trace.take(samples[here]), result.leaf_pairs.regions)
+    leaf, scene = violations.leaf[places], TraceScene(trace.take(samples[places]), result.leaf_pairs.regions)
     for index in np.unique(leaf).tolist():
         with_leaf = np.flatnonzero(leaf == index)
         pair = result.leaf_pairs.pairs[index]
         if pair is not None:
-            _point_at(scene, pair, with_leaf, here[with_leaf], found)
-        for body, places in _iter_deciding(result, result.leaf_pairs, index, scene, with_leaf):
+            _point_at(scene, pair, with_leaf, places[with_leaf], violations)
+        for body, members in _iter_deciding(result, result.leaf_pairs, index, scene, with_leaf):
             of_body = pair_of(body)
-            those = with_leaf[places]
-            if of_body is not None and len(those):
-                found.atom[here[those]] = len(found.atoms)
-                found.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), of_body))
-                _point_at(scene, of_body, those, here[those], found)
+            deciding_places = with_leaf[members]
+            if of_body is not None and len(deciding_places):
+                violations.atom[places[deciding_places]] = len(violations.atoms)
+                violations.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), of_body))
+                _point_at(scene, of_body, deciding_places, places[deciding_places], violations)
 
 
-def _point_at_past(result: EvaluatedResult, pairs: LeafPairs, past: Integers, found: Violations) -> None:
+def _point_at_past(
+    result: EvaluatedResult, pairs: LeafPairs, places: Integers, violations: Violations
+) -> None:
     """Point at what settled a violation in an earlier sample, where it stood then."""
     settled = result.settled
     pair = None if settled is None or settled.atom is None else pair_of(settled.atom)
-    if not len(past) or settled is None or settled.atom is None or settled.sample is None or pair is None:
+    if not len(places) or settled is None or settled.atom is None or settled.sample is None or pair is None:
         return
-    found.atom[past] = len(found.atoms)
-    found.atoms.append(BoundAtom(pairs.text_of(settled.atom), pair))
-    _point_at(TraceScene(settled.sample, pairs.regions), pair, np.zeros(1, np.int64), past[:1], found)
-    for column in (found.points, found.top, found.is_shown):
-        column[past] = column[past[0]]
+    violations.atom[places] = len(violations.atoms)
+    violations.atoms.append(BoundAtom(pairs.text_of(settled.atom), pair))
+    _point_at(TraceScene(settled.sample, pairs.regions), pair, np.zeros(1, np.int64), places[:1], violations)
+    for column in (violations.points, violations.top, violations.is_shown):
+        column[places] = column[places[0]]
 
 
 def _iter_deciding(
@@ -530,14 +534,16 @@ def _iter_worst(
         yield bodies[which], np.flatnonzero(worst == which)
 
 
-def _point_at(scene: TraceScene, pair: Pair, samples: Integers, there: Integers, found: Violations) -> None:
-    """Fill in the points of some samples of a scene, those of the violations `there`."""
+def _point_at(
+    scene: TraceScene, pair: Pair, samples: Integers, places: Integers, violations: Violations
+) -> None:
+    """Fill in the points of some samples of a scene, those of the violations at `places`."""
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
     first, second = (Operand(operand.rows[samples], operand.enlargement) for operand in operands)
     numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
-    found.points[there] = numbers[:, :4].reshape(-1, 2, 2)
-    found.top[there] = numbers[:, 5]
-    found.is_shown[there] = np.isfinite(numbers[:, :5]).all(axis=1)
+    violations.points[places] = numbers[:, :4].reshape(-1, 2, 2)
+    violations.top[places] = numbers[:, 5]
+    violations.is_shown[places] = np.isfinite(numbers[:, :5]).all(axis=1)
 
 
 def _columns(chosen: frozenset[str], names: Sequence[str]) -> list[int]:

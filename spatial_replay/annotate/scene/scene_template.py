@@ -116,7 +116,7 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
         parts = np.flatnonzero(is_round & (counts == count))
         corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
         radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
-        points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
+        points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded_rings(corners, radius)
     return Rings(part_start[footprints.part_start], points, form, forms, True)
 
 
@@ -152,7 +152,7 @@ _ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)
 _DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
-def _rounded(corners: Floats, radius: Floats) -> Floats:
+def _rounded_rings(corners: Floats, radius: Floats) -> Floats:
     """Return the rings (M, ROUND, 2) of M parts: the outermost point in each direction.
 
     Args:
@@ -503,7 +503,7 @@ def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedR
         _add_region(entity, region, depth, named=named)
         at = len(_STAMP_WORDS) + 3 * number
         order += [at, at + 1, at + 2] * (len(entity.lines) + len(entity.triangles))
-    return EncodedRegions(len(regions), _encoded(message), order)
+    return EncodedRegions(len(regions), _encode(message), order)
 
 
 def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> SceneTemplate:
@@ -549,7 +549,7 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
         order += range(middle, middle + 3 + len(label))
     objects = [_encoded_object(figure, lift) for figure in layout.objects]
     # messages are joined by joining their bytes
-    encoded = b"".join([_encoded(gone), regions.entities, *objects, _encoded(last)])
+    encoded = b"".join([_encode(gone), regions.entities, *objects, _encode(last)])
     # the arrow's label is the last of all fields
     slots = [*_offsets(encoded, SLOT_BYTES), *(len(encoded) - 8 - label[-1] + at for at in label)]
     stamps = _offsets(encoded, _STAMP_BYTES)
@@ -559,7 +559,7 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
     return SceneTemplate(template, np.array(order + [0, 1] * len(stamps), np.int64))
 
 
-def _encoded(message: SceneUpdate) -> bytes:
+def _encode(message: SceneUpdate) -> bytes:
     return message.SerializeToString(deterministic=True)
 
 
@@ -696,7 +696,7 @@ def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
         elevation = Elevation(SLOT, (SLOT, SLOT), SLOT)
     entity = _add_entity(message, OBJECT + drawn.name)
     draw(entity, drawn.label, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
-    return _encoded(message)
+    return _encode(message)
 
 
 # ------------------------------------------------------------------------------------------- timestamps
@@ -718,14 +718,14 @@ def _offsets(payload: bytes, wanted: bytes) -> list[int]:
 
 def encoded_stamps(times_ns: Integers) -> Words:
     """Encode nanoseconds (S,) as the contents of timestamps: (S, 2) words that overlap, at `_STAMP_WORDS`."""
-    seconds, nanos = map(_padded, np.divmod(times_ns, _NS))
+    seconds, nanos = map(_five_bytes, np.divmod(times_ns, _NS))
     # a tag, five bytes, another tag, five bytes; the words are its first eight bytes, and its last
     first = 0x08 | seconds << 8 | 0x10 << 48 | nanos << 56
     last = seconds >> 24 | 0x10 << 16 | nanos << 24
     return np.stack([first, last], axis=1).view(np.uint64)
 
 
-def _padded(numbers: Integers) -> Integers:
+def _five_bytes(numbers: Integers) -> Integers:
     """Return numbers of less than 35 bits as the five bytes that they are encoded in."""
     padded = np.full(len(numbers), 0x80808080)
     for place in range(5):

@@ -173,8 +173,8 @@ def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> S
         trace: from the first sample on.
         zero_ns: the time that texts count from.
     """
-    rows = trace.rows[spaced(trace.times_ns, None)]
-    return SceneEncoder(regions).scaled(SceneState(zero_ns), trace, rows)[0]
+    rows = trace.rows[samples_to_write(trace.times_ns, None)]
+    return SceneEncoder(regions).with_scale(SceneState(zero_ns), trace, rows)[0]
 
 
 class SceneMessages(NamedTuple):
@@ -223,11 +223,11 @@ class SceneEncoder:
         state = state or SceneState()
         if state.zero_ns is None and len(trace):
             state = replace(state, zero_ns=int(trace.times_ns[0]))
-        sample_places = spaced(trace.times_ns, state.written_ns)
+        sample_places = samples_to_write(trace.times_ns, state.written_ns)
         times_ns = trace.times_ns[sample_places]
         if not len(sample_places):
             return SceneMessages(times_ns, [], self.pass_over(trace, state), None)
-        state, scales, first = self.scaled(state, trace, trace.rows[sample_places])
+        state, scales, first = self.with_scale(state, trace, trace.rows[sample_places])
         names = tuple(sorted({*trace.names, *state.shown, *state.last}))
         missing, state = self._missing(names, trace, state, sample_places)
         missing[0][:first] = -1
@@ -303,7 +303,7 @@ class SceneEncoder:
         ]
         return (outline_numbers, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
 
-    def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
+    def with_scale(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale and upper edge, once an object is shown, the scale (S, 1) of each
         message, and the first message that shows one."""
         if state.scale is not None and state.top is not None:
@@ -369,7 +369,7 @@ def _shades_of(
     return of_objects, of_regions
 
 
-def spaced(times_ns: Integers, written_ns: int | None) -> Integers:
+def samples_to_write(times_ns: Integers, written_ns: int | None) -> Integers:
     """Return the indices of the samples to write: each at least `PERIOD_NS` after the one before.
 
     Args:
