@@ -154,6 +154,7 @@ class AnnotatedEvaluation:
         images: Collection[str] = (),
         planned_for: str = "",
         start: tuple[int, str] = (0, ""),
+        planned: str = "",
     ) -> Attachment:
         """Return the layout that opens the log in a viewer, once everything else is written.
 
@@ -163,11 +164,13 @@ class AnnotatedEvaluation:
             images: those of the topics that have images.
             planned_for: the file that decisions were made for, if these results are of another one.
             start: the time of the first message that a viewer shows, and the name of the log that has it.
+            planned: the name of the result that a planner worked for.
         """
         from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
 
         extent, standing = self.annotator.extent, self.annotator.standing
-        contents = self.contents(extent, topics, axes, images)._replace(planned_for=planned_for)
+        contents = self.contents(extent, topics, axes, images)
+        contents = contents._replace(planned_for=planned_for, planned=planned)
         if not self.annotator.has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
         zero = TextZero(self.annotator.scene.zero_ns or 0, *start)

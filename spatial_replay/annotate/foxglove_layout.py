@@ -354,6 +354,7 @@ class LayoutContents(NamedTuple):
         images: the topics with images.
         planned_for: the file that the planner's decisions were made for, if these results are of another one.
         zero: the time that texts count from; None before it is known.
+        planned: the name of the result that a planner worked for; "" without any.
     """
 
     trees: Sequence[ReportedTree]
@@ -367,10 +368,16 @@ class LayoutContents(NamedTuple):
     order: Sequence[int] = ()
     planned_for: str = ""
     zero: TextZero | None = None
+    planned: str = ""
 
     def worst_first(self) -> LayoutContents:
-        """Return the same with the worst results first, which then have lights and curves if not all can."""
-        order = self.order or range(len(self.trees))
+        """Return the same with the worst results first, which then have lights and curves if not all can.
+
+        The result that a planner worked for comes before them.
+        """
+        order = sorted(
+            self.order or range(len(self.trees)), key=lambda place: self.trees[place].name != self.planned
+        )
         return self._replace(
             trees=[self.trees[place] for place in order],
             has_states=[self.has_states[place] for place in order],
@@ -414,19 +421,24 @@ _PANELS: Final = "spatial-replay.spatial-replay {}!{}"
 """The identifier of a panel of the extension, by its name."""
 
 
-def with_panels(layout: Mapping[str, Any]) -> dict[str, Any]:
+def with_panels(layout: Mapping[str, Any], planned: str = "") -> dict[str, Any]:
     """Return the layout of a log for viewers that have the extension: scene, tree, curves and decisions.
 
     Args:
         layout: that of the log without them (see `viewer_layout`).
+        planned: the name of the result that a planner worked for, which the panels open on.
     """
+    state = {"result": planned} if planned else {}
     configs = {"3D!scene": layout["configById"]["3D!scene"]}
     curves = [Panel(*each) for each in layout["configById"].items() if each[0].startswith("Plot!")]
-    names = ["automaton", *(["decisions"] if "RawMessages!decision" in layout["configById"] else [])]
-    own = [(each, Panel(_PANELS.format(each, each), {})) for each in names]
+    automaton = ("automaton", Panel(_PANELS.format("automaton", "automaton"), state))
+    own = [automaton]
+    if "RawMessages!decision" in layout["configById"]:
+        decisions = ("decisions", Panel(_PANELS.format("decisions", "decisions"), {}))
+        own = [decisions, automaton] if planned else [automaton, decisions]
     own += [(_tab_title(each), each) for each in curves]
     tabs, panels = _tabs("Tab!panels", own)
-    tree = Panel(_PANELS.format("specification", "tree"), {})
+    tree = Panel(_PANELS.format("specification", "tree"), state)
     configs |= {panel.identifier: panel.config for panel in (tree, *panels)}
     right = _split("column", [(tree.identifier, 6.0), (tabs, 4.0)])
     whole = {"direction": "row", "first": "3D!scene", "second": right, "splitPercentage": 45}
@@ -453,14 +465,16 @@ def _details(contents: LayoutContents) -> _Details:
         sources = f"{SPECIFICATION}.files[{which}].source"
         title = "Specification" if zero is None else f"Specification; {zero}"
         shown.append(("specification", "RawMessages!specification", title, sources))
-    if any(contents.has_states):
+    if any(contents.has_states[:1] if contents.planned else contents.has_states):
         title = trees[contents.has_states.index(True)].title
         path = _standing_path(title, "automaton")
         shown.append(("automaton", "RawMessages!automaton", f"Automaton of {title}", path))
     if PLAN_DECISION in contents.topics:
         of = f", for {planned_for} as recorded" if planned_for else ""
         why = f"Why the planner decided so{of}"
-        shown.append(("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason"))
+        decision = ("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason")
+        # the first tab is open
+        shown.insert(0 if contents.planned else len(shown), decision)
     details = [(tab, _titled(panel, title, {"topicPath": path})) for tab, panel, title, path in shown]
     cameras = image_panels(contents.images, contents.topics)
     return details + [(each.config["foxglovePanelTitle"].lower(), each) for each in cameras]

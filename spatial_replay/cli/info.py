@@ -310,13 +310,16 @@ def _print_layout(log: LogFile, *, panels: bool) -> int:
     """Print the layout stored in a log, or the one for viewers that have the extension."""
     from spatial_replay.annotate.foxglove_layout import layout_text, with_panels
     from spatial_replay.logs.topics import LAYOUT
+    from spatial_replay.replay.engine import planned_result
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
     for attachment in source.attachments():
         if attachment.name == LAYOUT:
             text = attachment.data.decode("utf-8", "replace")
-            show_file(layout_text(with_panels(json.loads(text))) if panels else text)
+            if panels:
+                text = layout_text(with_panels(json.loads(text), planned_result(source)))
+            show_file(text)
             return ExitCode.SATISFIED
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"

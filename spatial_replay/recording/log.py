@@ -242,7 +242,8 @@ class Recording:
             annotator = self._evaluation.annotator
             self._sink.write_messages(merge(annotator.end(self._end_ns, self._evaluation.finals)))
         start = self._start_ns, "this log"
-        layout = self._evaluation.layout(self._topics, self._axes, self._images, start=start)
+        planned = (self._plan or {}).get("specification", "")
+        layout = self._evaluation.layout(self._topics, self._axes, self._images, start=start, planned=planned)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:

@@ -479,7 +479,12 @@ class Replay:
         """Return the viewer layout of the annotated log; call it after `run`."""
         planned = planned_for(self._source, self.files)
         return self._evaluation.layout(
-            self._topics, self._source.axes, self._images, planned, self._shown_start()
+            self._topics,
+            self._source.axes,
+            self._images,
+            planned,
+            self._shown_start(),
+            planned_result(self._source),
         )
 
     def _shown_start(self) -> tuple[int, str]:
@@ -624,6 +629,11 @@ def replayed_specs(
 
 _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
 """Prefixes of the attachments that a replay replaces."""
+
+
+def planned_result(source: Source) -> str:
+    """Return the name of the result that a planner worked for; "" without any."""
+    return dict(source.metadata()).get(PLAN_METADATA, {}).get("specification", "")
 
 
 def planned_for(source: Source, files: Sequence[Specification]) -> str:

@@ -22,6 +22,7 @@ from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.selection import ReplayOptions
 from spatial_replay.sources import open_source
 
+PUSH = Path(__file__).parents[2] / "recordings" / "push.spatial"
 TEXT = "spec near = F a closeto[2] b\nspec apart = G a farfrom[0] b"
 
 
@@ -129,6 +130,25 @@ def test_viewers_with_the_extension_have_a_layout_of_its_panels(tmp_path, capsys
     assert panels(layout) == set(layout["configById"])
     assert {"3D!scene", "spatial-replay.spatial-replay specification!tree"} < panels(layout)
     assert run_command(["info", str(log), "--panels"]) == 2
+
+
+def test_a_planned_run_opens_on_the_planned_result_and_its_decisions(tmp_path, capsys):
+    """Another result is violated, which would come first otherwise."""
+    spec = tmp_path / "two.spatial"
+    spec.write_text(f"{PUSH.read_text()}\nspec still = G (green dist red >= 100)\n")
+    log = tmp_path / "annotated.mcap"
+    assert run_command(["replay", str(PUSH.with_suffix(".mcap")), "--spec", str(spec), "-o", str(log)]) == 1
+    config = layout_of(log)["configById"]
+    assert config["Indicator!result0"]["path"] == '/spatial/standing.results[:]{name=="push"}.standing'
+    tabs = config["Tab!details"]
+    assert tabs["tabs"][tabs["activeTabIdx"]]["layout"] == "RawMessages!decision"
+    assert config["RawMessages!automaton"]["foxglovePanelTitle"] == "Automaton of push"
+    capsys.readouterr()
+    assert run_command(["info", str(log), "--layout", "--panels"]) == 0
+    config = json.loads(capsys.readouterr().out)["configById"]
+    named = {key: value for key, value in config.items() if key.startswith("spatial-replay")}
+    assert [value["result"] for value in named.values() if value] == ["push", "push"]
+    assert config["Tab!panels"]["tabs"][0]["title"] == "decisions"
 
 
 def test_any_node_is_found_by_name_and_by_id(tmp_path):
