@@ -114,7 +114,7 @@ class RunEnds:
         self._start, self._end, self._is_rest, self._within_ns = start, end, is_rest, within_ns
         self._spans: dict[str, TopicSpan] = {}
         self._since_ns: dict[str, int | None] = {}
-        self._held: list[Trace] = []
+        self._pending_traces: list[Trace] = []
         self._released_ns = -1
         self.log_begin_ns = self._log_end_ns = 0
         self._is_empty = True
@@ -137,7 +137,7 @@ class RunEnds:
                 self.log_begin_ns, self._is_empty = int(trace.times_ns[0]), False
             self._log_end_ns = int(trace.times_ns[-1])
             self._note(trace)
-        self._held.append(trace)
+        self._pending_traces.append(trace)
         if self.begin_ns is None and not self._decide_begin():
             return []
         return self._release(self._open_since_ns())
@@ -202,7 +202,7 @@ class RunEnds:
             self._remark_begin(latest_span, self.begin_ns)
 
     def _remark_begin(self, span: TopicSpan, begin_ns: int) -> None:
-        times_ns = np.concatenate([trace.times_ns for trace in self._held])
+        times_ns = np.concatenate([trace.times_ns for trace in self._pending_traces])
         left_out = times_ns[times_ns < begin_ns]
         reason: list[str | Instant] = [f"no transform places {span.topic} before"]
         if span.begun_ns is not None and span.begun_ns > int(left_out[-1]):
@@ -223,7 +223,7 @@ class RunEnds:
 
     def _remark_end(self) -> None:
         span = min(self._open_spans(), key=lambda span: self._since_ns[span.topic] or FOREVER)
-        times_ns = np.concatenate([trace.times_ns for trace in self._held])
+        times_ns = np.concatenate([trace.times_ns for trace in self._pending_traces])
         left_out = times_ns[times_ns >= self.end_ns]
         reason: list[str | Instant] = [f"no transform places {span.topic} then"]
         if span.heard_ns is not None and self.end_ns - span.heard_ns > span.limit_ns:
@@ -255,14 +255,14 @@ class RunEnds:
     def _release(self, before_ns: int) -> list[Trace]:
         """Return the traces that end before a time, and drop them here."""
         count = 0
-        for trace in self._held:
+        for trace in self._pending_traces:
             # a trace is released as a whole: callers count on one trace for each that they added
             if len(trace) and int(trace.times_ns[-1]) >= before_ns:
                 break
             if len(trace):
                 self._released_ns = int(trace.times_ns[-1])
             count += 1
-        released, self._held = self._held[:count], self._held[count:]
+        released, self._pending_traces = self._pending_traces[:count], self._pending_traces[count:]
         return [self.trim(trace) for trace in released]
 
     def trim(self, trace: Trace) -> Trace:

@@ -461,7 +461,7 @@ class _AwaitedNames:
         self._first_ns: int | None = None
         self._samples = 0
         self._objects, self._signals = set(object_names(specification)), set(signal_names(specification))
-        self._known: tuple[set[str], set[str], set[str]] = (set(), set(), set())
+        self._names_so_far: tuple[set[str], set[str], set[str]] = (set(), set(), set())
         self._remarks: tuple[Diagnostic, ...] = ()
         self.is_open = after is not None and bool(self._objects or self._signals)
         """Whether any is still to come."""
@@ -494,14 +494,14 @@ class _AwaitedNames:
         """Keep names, for hints."""
         if not self._remarks:
             # bounded: a run may bring a new track name at every sample
-            for names_so_far, new_names in zip(self._known, names, strict=True):
+            for names_so_far, new_names in zip(self._names_so_far, names, strict=True):
                 if len(names_so_far) < _MOST_KNOWN:
                     names_so_far.update(new_names)
 
     def _diagnose_missing_names(self) -> tuple[Diagnostic, ...]:
         limit = self._after or 0
         during = time_text(limit) if self._is_time else plural(limit, "sample")
-        objects, signals, classes = self._known
+        objects, signals, classes = self._names_so_far
         diagnostics = check_names(
             self._specification,
             sorted(objects.union(object_names(self._specification)) - self._objects),

@@ -305,10 +305,10 @@ def plausibility_warnings(
         if count < log.samples:
             at = time_text(first_ns, zero_ns)
             message = (
-                f"{part.shown} is missing in {count:,} of {plural(log.samples, 'sample')}, first at {at}"
+                f"{part.title} is missing in {count:,} of {plural(log.samples, 'sample')}, first at {at}"
             )
             hint = "atoms about it are unknown there, and so may be a verdict"
-            warnings[part.shown] = source.diagnostic("warning", span, message, hint)
+            warnings[part.title] = source.diagnostic("warning", span, message, hint)
     for node, bound in bound_nodes(specification):
         doubts: Iterator[tuple[str, str]] = iter(())
         key = ""

@@ -62,7 +62,7 @@ class Cause:
     least: Witness | None = None
 
     @property
-    def shown(self) -> Witness | None:
+    def robustness_witness(self) -> Witness | None:
         """The atom that its robustness is of."""
         return self.least or self.witness
 
@@ -436,9 +436,9 @@ def _join(first: Sentence, *others: Sentence) -> Sentence:
 
 def cause_reason(cause: Cause, first_ns: int) -> Sentence:
     """Return what gave a cause its robustness, and how it began if that was earlier; "" without a witness."""
-    if cause.shown is None:
+    if cause.robustness_witness is None:
         return Sentence("")
-    reason = reason_sentence(cause.shown, first_ns=first_ns)
+    reason = reason_sentence(cause.robustness_witness, first_ns=first_ns)
     if cause.least is None or cause.witness is None:
         return reason
     return Sentence(reason, " ", _first_failure(cause.witness, first_ns))

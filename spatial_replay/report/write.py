@@ -167,7 +167,9 @@ def _results(
     for index, result in enumerate(replayed.results):
         tree, unit = replay.trees[index], unit_of(result.formula, declared)
         is_explained = index in explained
-        witness = (result.causes[0].shown if result.causes else result.worst) if is_explained else None
+        witness = (
+            (result.causes[0].robustness_witness if result.causes else result.worst) if is_explained else None
+        )
         yield ReportedResult(
             result,
             tree,

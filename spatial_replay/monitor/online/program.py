@@ -83,7 +83,7 @@ class SignalTable:
         self._leaf_numbers: dict[object, int] = {}
         self._rows: dict[Row, int] = {}
         # an expansion holds an operand more than once; without this, nested ones would take 2**depth steps
-        self._added: dict[int, tuple[Formula, int]] = {}
+        self._row_by_id: dict[int, tuple[Formula, int]] = {}
         for leaf in leaves:
             self._leaf_number(leaf)
 
@@ -121,11 +121,11 @@ class SignalTable:
     def add(self, formula: Formula) -> int:
         """Return the row of a formula without future operators."""
         formula = expand(formula)
-        if id(formula) not in self._added:
+        if id(formula) not in self._row_by_id:
             operands = [self.add(operand) for operand in operands_of(formula)]
             # the formula is stored to stay alive: a freed one would leave its id to another
-            self._added[id(formula)] = formula, self._added_row(formula, operands)
-        return self._added[id(formula)][1]
+            self._row_by_id[id(formula)] = formula, self._added_row(formula, operands)
+        return self._row_by_id[id(formula)][1]
 
     def _added_row(self, formula: Formula, operands: list[int]) -> int:
         match formula:
@@ -235,7 +235,7 @@ class PartRows:
         self._rows: dict[Row, int] = {}
         self._signals = signals
         self._is_past = root.operator not in FUTURE_OPERATORS
-        self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
+        self._row_by_id: dict[tuple[int, bool], tuple[Formula, int]] = {}
         is_bounded = root.bound is not None or root.operator in ("X", "WX")
         if is_bounded and not self._is_past:
             self._ending(root, True)
@@ -304,9 +304,9 @@ class PartRows:
         while isinstance(formula, Boolean) and formula.operator == "not":
             formula, positive = expand(formula.operands[0]), not positive
         key = (id(formula), positive)
-        if key not in self._added:
-            self._added[key] = formula, self._build(formula, positive)
-        return self._added[key][1]
+        if key not in self._row_by_id:
+            self._row_by_id[key] = formula, self._build(formula, positive)
+        return self._row_by_id[key][1]
 
     def _build(self, formula: Formula, positive: bool) -> int:
         if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):

@@ -146,7 +146,7 @@ class Evidence:
         gaps = [_gap(None, filling, times_ns, time_ns)] if filling.any() else []
         for part, missing in zip(kinds, columns, strict=True):
             if missing[is_recorded].any():
-                gap = _gap(part.shown, missing[is_recorded], times_ns[is_recorded])
+                gap = _gap(part.title, missing[is_recorded], times_ns[is_recorded])
                 comes_and_goes = part in members and part in absent
                 gaps.append(replace(gap, window=None) if comes_and_goes else gap)
         return tuple(gaps)
@@ -191,7 +191,7 @@ class NamedPart(NamedTuple):
     is_signal: bool
 
     @property
-    def shown(self) -> str:
+    def title(self) -> str:
         """Its name in sentences."""
         return f"signal {self.name!r}" if self.is_signal else self.name
 
