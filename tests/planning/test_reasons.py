@@ -146,7 +146,9 @@ def test_a_place_that_was_not_chosen_is_explained_by_the_demands_that_fail_there
     lines = call("plan", "--why", log, "--step", 0, "--object", "red", "--at", "0.6,0.15")
     assert "  red dist blue >= 0.03 fails by " in lines[1]
     assert any(line.startswith("  blue is in the way: they overlap by ") for line in lines)
-    assert lines[-1].startswith("  possible instead: (")
+    assert lines[-1].startswith("  chosen instead: (")
+    *_, last = call("plan", "--why", log, "--step", 0, "--object", "blue", "--at", "0.5,-0.05")
+    assert last.startswith("  possible instead: (")
     for arguments, error in {
         ("--object", "pink", "--at", "0.6,0.15"): "did not consider 'pink'; it considered: blue, green, red",
         ("--object", "red", "--at", "9,9"): "outside the map of red",
