@@ -587,4 +587,7 @@ def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
 
 
 MOST_YIELDED: Final = 300
-"""The most samples for which motions wait for others to pass, until one succeeds."""
+"""The most samples for which motions wait for others to pass, until one succeeds.
+
+In ten seconds at 30 Hz, a person who walks half a metre to and fro at 0.1 m/s leaves the way free once.
+"""
