@@ -263,7 +263,7 @@ class Automaton(Displayed):
     def to_dot(self) -> str:
         """Return the automaton for Graphviz, with guards in words and long propositions in a legend.
 
-        Accepting states have a double outline. Those that accept permanently are blue, traps are vermillion.
+        Accepting states have a double outline. States that accept permanently are blue, traps are vermillion.
         If not all transitions can be listed, it has the states nearest to the start.
         """
         short = abbreviate(self)
