@@ -82,8 +82,13 @@ _MOST_VISITS: Final = 200
 """The most cells tried for one set of objects."""
 _MOST_SOLUTIONS: Final = 6
 """The most arrangements of one set of objects."""
-_WIDEST: Final = 150_000
-"""The most cells of a stencil, over all orientations; pairs with a larger one are compared at the end."""
+_WIDEST: Final = 360_000
+"""The most cells of a stencil, over all orientations; pairs with a larger one are compared at the end.
+
+Two objects on 300 x 300 cells need as many, if they are not turned. Without stencils, most placements fail.
+"""
+_MISS: Final = 0.5
+"""Cost of a placement that does not meet all demands, in maps; it looks at all cells of the objects left."""
 _MOST_NAMED: Final = 3
 """The most things that a sentence names."""
 _ENOUGH: Final = 0.5
@@ -257,6 +262,8 @@ class Arranger:
                     if poses is not None and self.meets(move_objects(self._sample, poses)):
                         yield poses
                         effort += 1
+                    elif not self._slack and not self._budget.spend(_MISS):
+                        return
                     if effort >= most_effort:
                         break
             if len(group) < most and group:

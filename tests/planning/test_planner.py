@@ -377,19 +377,7 @@ def test_a_guard_of_too_many_cubes_is_refused_at_the_first_decision():
         one.next_step()
 
 
-def test_successful_motions_do_not_use_up_attempts():
-    one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
-    table = Table(dict(THINGS), one)
-    for _ in range(2 * TABLE.attempts):
-        table.objects["cup"] = THINGS["cup"]
-        table.look()
-        step = one.next_step()
-        assert step.kind == "execute"
-        one.conclude(table.execute(step))
-        assert one.next_step().kind == "hold"
-
-
-def test_successful_motions_are_limited_too():
+def test_successful_motions_use_up_no_attempts_and_are_limited():
     one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
     table = Table(dict(THINGS), one)
     table.look()

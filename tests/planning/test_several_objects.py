@@ -153,6 +153,18 @@ def test_motions_go_on_as_planned_and_do_not_undo_each_other():
     assert left == [motion.name for motion in planner.next_step().aim.motions]
 
 
+def test_objects_are_lined_up_on_a_grid_of_200_columns():
+    things = {name: block(0.8 + 2.5 * number, 0.5, size=0.4) for number, name in enumerate("abcd")}
+    line = " and ".join(f"{a} rightof {b} and {a} dist {b} <= 0.3" for a, b in pairwise(things))
+    settings = Settings(
+        Workspace(Grid.over(0, 0, 10, 1, 0.05), clearance=0.05), movable=tuple(things), margin=0.05
+    )
+    planner = Planner(sr.parse_specification(f"F ({line})"), settings)
+    planner.observe(sr.Sample(0, things))
+    step = planner.next_step()
+    assert (step.kind, step.search.arrangements) == ("execute", 1)
+
+
 def test_a_slot_for_two_is_not_taken_in_the_middle():
     text = "region slot = box(4, 4, 6.6, 5.6)\n"
     text += "spec s = (F G (a enclosedin slot)) and (F (a leftof d and b enclosedin slot))"
