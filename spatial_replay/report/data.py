@@ -366,7 +366,7 @@ def _result_value(
     if reported.compiled.automaton is not None:
         inside = np.searchsorted(reported.path.times_ns, times_ns)
         value["automaton"] = {
-            **automaton_value(reported.compiled.automaton, reported.path, reported.tree.named),
+            **automaton_value(reported.compiled.automaton, reported.path, reported.tree.with_object_name),
             "sets": list(reported.path.sets),
             "path": packing.add(np.array(reported.path.codes)[inside], "i4"),
         }
