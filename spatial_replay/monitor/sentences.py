@@ -637,6 +637,8 @@ def _flip(
         would = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"
     elif threshold.verdict is Verdict.UNKNOWN:
         would = "It would not have been violated then"
+    if _is_overlap(deciding, threshold):
+        return f"No distance {_place(deciding, threshold)} makes it {threshold.verdict}: the objects overlap."
     if threshold.is_written:
         is_idle = deciding is witness.deciding and witness.missed is not None and witness.missed.is_condition
         reason = ", as the condition would not hold there" if is_idle else ""
@@ -647,6 +649,13 @@ def _flip(
     margin = with_unit(abs(threshold.flips_at), unit)
     direction = "more" if threshold.flips_at < 0.0 else "less"
     return f"{would} in a log in which `{deciding.text}` holds by {margin} {direction}."
+
+
+def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
+    """Return whether only a distance below 0 would flip a verdict, which is a depth of overlap."""
+    is_distance = deciding.atom.relation in ("dist", "closeto", "farfrom") and threshold.is_written
+    is_settled = threshold.verdict is not Verdict.UNKNOWN
+    return is_distance and is_settled and threshold.flips_at < 0.0 <= threshold.value
 
 
 def _limit(threshold: Threshold) -> str:
