@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -47,6 +48,8 @@ class Coloured(NamedTuple):
 Line: TypeAlias = str | tuple[str | Coloured, ...]
 
 
+_NO_BREAK: Final = "\N{NO-BREAK SPACE}"
+_BEFORE_UNIT: Final = re.compile(r"(?<=\d) (?=[^\W\d][\w/^²]{0,4}(?![\w]))")
 _LEAST_WIDTH: Final = 60
 """Width of lines on narrow terminals."""
 
@@ -110,9 +113,10 @@ def _fit_lines(line: str) -> list[str]:
     """Return a line cut at spaces, so that it fits into the terminal; the rest is indented."""
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
     width = max(terminal_width(), _LEAST_WIDTH)
-    return wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False) or [
-        line
-    ]
+    # a number stays with its unit
+    joined = _BEFORE_UNIT.sub(_NO_BREAK, line)
+    pieces = wrap(joined, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return [piece.replace(_NO_BREAK, " ") for piece in pieces] or [line]
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:

@@ -233,14 +233,16 @@ def luminance(number: int) -> float:
 
 
 def test_on_a_terminal_lines_fit_and_verdicts_have_colours_for_black_and_for_white(folder: Path) -> None:
-    shown = written_on_terminal((*PROGRAM, *EXPLAIN), folder, {"COLUMNS": "72"})
+    shown = written_on_terminal((*PROGRAM, *EXPLAIN), folder, {"COLUMNS": "68"})
     colours = {int(each) for each in re.findall(r"\x1b\[38;5;(\d+)m", shown)}
     assert len(colours) == 3  # satisfied, violated and unknown
     for each in colours:
         assert (luminance(each) + 0.05) / 0.05 >= 4.0  # on black
         assert 1.05 / (luminance(each) + 0.05) >= 3.5  # on white
     plain = re.sub(r"\x1b\[[\d;]*m", "", shown).replace("\r", "")
-    assert max(map(len, plain.splitlines())) <= 72
+    assert max(map(len, plain.splitlines())) <= 68
+    # no line parts a number from its unit
+    assert not re.search(r"\d\n +s\b", plain)
     piped = run_program(*EXPLAIN, cwd=folder).stdout
     assert plain.split() == piped.split()
 
