@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from operator import add
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
@@ -30,7 +31,7 @@ from spatial_replay.batch.run_table import (
 )
 from spatial_replay.html import Html, element
 from spatial_replay.report.page import asset, html_page, text
-from spatial_replay.report.panels import sentence_parts
+from spatial_replay.report.panels import sentence_parts, signed
 from spatial_replay.text import first_lines, plural, with_unit
 from spatial_replay.version import __version__
 
@@ -194,13 +195,13 @@ def _histogram(numbers: Floats, unit: str) -> Html:
         side = "bad" if number < below else "good"
         place = {"x": number * step + 0.5, "y": _HEIGHT - height, "width": step - 1.0, "height": height}
         # what is read is the text beside the drawing, so the tip of a bar says its count
-        tip = element("title", f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}")
+        tip = element("title", signed(f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}"))
         attributes = {name: f"{value:.2f}" for name, value in place.items()}
         bars.append(element("rect", tip, **attributes, **{"class": side}))
     zero = f"{below * step:.2f}"
     axis = element("line", x1=zero, x2=zero, y1="0", y2=f"{_HEIGHT + 3:.0f}")
     labels = [
-        element("text", with_unit(low, unit), x="0", y=f"{_HEIGHT + 12:.0f}"),
+        element("text", signed(with_unit(low, unit)), x="0", y=f"{_HEIGHT + 12:.0f}"),
         element(
             "text",
             with_unit(high, unit),
@@ -209,7 +210,7 @@ def _histogram(numbers: Floats, unit: str) -> Html:
             **{"text-anchor": "end"},
         ),
     ]
-    name = f"Distribution of robustness from {low:.4g} to {high:.4g}"
+    name = signed(f"Distribution of robustness from {low:.4g} to {high:.4g}")
     view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
     return element("svg", *bars, axis, *labels, viewBox=view, role="img", **{"aria-label": name})
 
@@ -240,9 +241,14 @@ def _matrix(
     cases = {case for case, _, _ in columns}
     yield _filter()
     titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
+    units = [f" [{total.unit}]" if total.unit not in (None, "", "1") else "" for total in by_spec]
     abouts = [total.about for total in by_spec]
     label = [_sortable(LABEL, "")] if is_judged else []
-    head = [_sortable("log", ""), *label, *map(_sortable, titles, ["number"] * len(titles), abouts)]
+    head = [
+        _sortable("log", ""),
+        *label,
+        *map(_sortable, map(add, titles, units), ["number"] * len(titles), abouts),
+    ]
     body = []
     for name, of_log in cells.items():
         row_cells = [_cell(of_log.get(column)) for column in columns]
@@ -301,7 +307,7 @@ def _cell(row: Values | None) -> Html:
         ]
     )
     words = f"{words}{damage_word(row)}{before}"
-    return element("td", words, title=tip, **{"class": kind, "data-value": value})
+    return element("td", signed(words), title=signed(tip), **{"class": kind, "data-value": value})
 
 
 def _sortable(title: str, kind: str, about: str = "") -> Html:
@@ -315,7 +321,7 @@ def _tip(about: str) -> dict[str, str]:
 
 
 def _number(tag: str, words: str) -> Html:
-    return element(tag, words, **{"class": "number"})
+    return element(tag, signed(words), **{"class": "number"})
 
 
 def _log_link(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
 from spatial_replay.batch.suite import DOUBTFUL, UNTESTED
 from spatial_replay.errors import UsageError
-from spatial_replay.text import interval_text, listing, nearest_hint, plural, requirement_text
+from spatial_replay.text import interval_text, listing, nearest_hint, plural, requirement_text, with_unit
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -56,7 +56,7 @@ class Total:
         worse: how many of unchanged specs are worse than a baseline, or gone; None without one.
         worse_edited: how many of specs that were edited since; None without a baseline.
         is_edited: whether the spec was edited since the baseline.
-        requirement, title: of the spec; None for a log, and where it has none.
+        requirement, title, unit: of the spec; None for a log, and where it has none.
     """
 
     group: Values
@@ -73,6 +73,7 @@ class Total:
     is_edited: bool = False
     requirement: str | None = None
     title: str | None = None
+    unit: str | None = None
 
     @property
     def about(self) -> str:
@@ -166,7 +167,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
     columns["least"] = number
     sums = [(f"n_{name}", "sum") for name in counted]
-    about = ("requirement", "title") if by == "spec" else ()
+    about = ("requirement", "title", "unit") if by == "spec" else ()
     columns |= {name: table.column(name) for name in about}
     # the first one: what is gone comes last, with that of its time
     sums += [(name, "first") for name in about]
@@ -720,5 +721,7 @@ def total_cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
         spec = total.group["spec"] or total.group["file"]
         names = [total.group["case"], f"{spec} ({EDITED_SINCE})" if total.is_edited else spec, total.about]
         counts = [f"{numbers[place]:,}" for numbers in columns.values()]
-        cells.append([*names, *counts, "" if total.least is None else f"{total.least:.6g}"])
+        cells.append(
+            [*names, *counts, "" if total.least is None else with_unit(total.least, total.unit or "")]
+        )
     return [*columns, "least robustness"], cells

@@ -34,7 +34,7 @@ from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
-from spatial_replay.text import first_lines, json_value, plural, without_numbers
+from spatial_replay.text import first_lines, json_value, plural, with_unit, without_numbers
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def print_totals(table: pa.Table, by: By) -> None:
             colour = _COLOURS.get(name) if total.failures or name == "satisfied" else None
             cell = f"{count:>9,}" if count else f"{'-':>9}"
             line += ["  ", Coloured(cell, colour) if count and colour else cell]
-        least = "not determined" if total.least is None else f"{total.least:.6g}"
+        least = "not determined" if total.least is None else with_unit(total.least, total.unit or "")
         show((*line, f"  {least:>16}"))
         for text in filter(None, (total.title, EDITED_SINCE if total.is_edited else None)):
             show(f"    {text}")

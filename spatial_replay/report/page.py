@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -20,7 +21,7 @@ from spatial_replay.monitor.sentences import settled_time
 from spatial_replay.monitor.verdict import Verdict, counts_text
 from spatial_replay.palette import SIGNS
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
-from spatial_replay.report.panels import final_text, json_text, sentence_parts
+from spatial_replay.report.panels import final_text, json_text, sentence_parts, signed
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import declared_unit, units_of, units_text
 from spatial_replay.text import CALENDAR_NS, Instant, Sentence, plural, printable, time_text
@@ -28,6 +29,11 @@ from spatial_replay.version import __version__
 
 HEADER: Final = '<header class="top">'
 """Begins the header of a report."""
+_HEADLINE: Final = re.compile(
+    r"`.+` (?:for .+ )?is (?:satisfied|violated): robustness [^ ]+(?: [^ ]+)?"
+    r"(?:, certain since [\d.]+ s(?:, least at [\d.]+ s)?)?\."
+)
+"""A sentence that says no more than the line of its result does."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
@@ -166,7 +172,8 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
             **result_attribute,
             **unfolded,
         }
-        content = [element("p", *sentence_html(sentence, first_ns)) for sentence in reported.sentences]
+        sentences = [sentence for sentence in reported.sentences if not _HEADLINE.fullmatch(sentence)]
+        content = [element("p", *sentence_html(sentence, first_ns)) for sentence in sentences]
         content += [_specs(reported, first_ns)] if reported.sentences else []
         yield element("details" if content else "div", _summary(reported, first_ns), *content, **attributes)
 
@@ -195,7 +202,7 @@ def _summary(reported: ReportedResult, first_ns: int) -> Html:
         chip(result.verdict, is_sound=_is_sound(result)),
         *marks,
         *_requirement(result.spec.id, result.title, result.spec.title),
-        element("span", text(", ".join(numbers)), **{"class": "numbers"}),
+        element("span", text(signed(", ".join(numbers))), **{"class": "numbers"}),
         **{"class": "summary"},
     )
 
@@ -237,7 +244,7 @@ def _specs(reported: ReportedResult, first_ns: int) -> Html:
         numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
         if settled_ns is not None:
             numbers += f", violated since {Instant(settled_ns, first_ns)}"
-        line = element("span", text(numbers), **{"class": "numbers"})
+        line = element("span", text(signed(numbers)), **{"class": "numbers"})
         rows.append(
             element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
         )

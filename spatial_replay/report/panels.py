@@ -153,9 +153,21 @@ _CODE: Final = re.compile(
 def sentence_parts(sentence: str) -> list[str]:
     """Split a sentence into text and code, in turn, beginning with text.
 
-    Code is between backquotes, which names of objects may contain, too.
+    Code is between backquotes, which names of objects may contain, too. Numbers in the text have a minus
+    sign.
     """
-    return _CODE.split(sentence)
+    parts = _CODE.split(sentence)
+    parts[::2] = map(signed, parts[::2])
+    return parts
+
+
+_MINUS: Final = re.compile(r"(?<![\w.\]-])-(?=\.?\d|inf\b)")
+_INFINITE: Final = re.compile(r"(?<![\w.-])[+]?inf(?![\w-])")
+
+
+def signed(words: str) -> str:
+    """Return a text whose numbers are written as on pages: "−0.05", "−∞"; names such as run-1 stay."""
+    return _INFINITE.sub("∞", _MINUS.sub("\N{MINUS SIGN}", words))
 
 
 MOST_NODES: Final = 400

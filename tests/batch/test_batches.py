@@ -27,6 +27,7 @@ from pyarrow import parquet
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
 from logs.servers import s3_server
+from spatial_replay.batch.overview import overview_page
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording.source_recording import record_source
 from spatial_replay.testing import assert_satisfied
@@ -237,6 +238,11 @@ def test_the_worst_results_of_several_units_take_turns(fleet: Path) -> None:
     done = batch("logs/force-*.mcap", "--spec", "two.spatial")
     worst = [line.split("robustness ")[1] for line in done.out.splitlines() if "violated, robustness" in line]
     assert worst == ["-17 N", "-0.5 m", "-16 N", "-0.4 m", "-15 N", "-0.3 m"]
+    totals, _, _ = done.out.partition("failed:")
+    assert "  -17 N\n" in totals
+    page = overview_page(sr.read_results("results"), "two", {}).decode()
+    assert ">soft [N]</button>" in page
+    assert ">\N{MINUS SIGN}17 N</td>" in page
 
 
 def test_an_interrupted_recording_is_said(fleet: Path) -> None:

@@ -40,6 +40,8 @@ def test_logs_are_sorted_by_what_is_pressed_and_lead_to_their_reports(
     apart.get_by_role("button").click()
     assert logs_of(page) == worst_first[::-1]
     expect(apart).to_have_attribute("aria-sort", "descending")
+    for link in page.locator("td a").all():
+        assert (link.bounding_box() or {})["height"] >= 24
     # rows are filtered, and those that fail are gone through
     page.get_by_label("Name of a log").fill("RUN-1")
     expect(page.get_by_role("status")).to_have_text("2 of 4 listed")

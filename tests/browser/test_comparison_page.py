@@ -41,6 +41,7 @@ def test_two_specifications_are_shown_at_the_sample_at_which_they_part(page: Pag
         re.compile("satisfied → .*violated.*table_set")
     )
     expect(page.locator(".now")).to_contain_text("5.433 s")
+    expect(page.locator("#scene-a h2")).to_have_css("text-transform", "none")
     # the curves part here: the legend reads both
     expect(page.locator(".legend-entry").nth(0)).to_contain_text("0.1543")
     expect(page.locator(".legend-entry").nth(1)).to_contain_text("0.1552")

@@ -152,7 +152,7 @@ def test_of_equal_times_what_was_certain_comes_before_what_only_the_end_decided(
 
 def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -> None:
     said = violated.within("section#verdicts")
-    assert "violatedtable_setrobustness -0.1552," in said
+    assert "violatedtable_setrobustness \N{MINUS SIGN}0.1552," in said
     assert "which fails by 0.1552 at 4.000 s" in said
     assert "with 0.2353 or more instead of 0.08" in said
 
@@ -447,9 +447,9 @@ def task(tmp_path_factory: pytest.TempPathFactory) -> Page:
 
 def test_the_headline_is_what_settled_the_verdict_and_says_which_part_is_least(task: Page) -> None:
     said = task.within("section#verdicts")
-    assert "robustness -2.1, violated since 2.300 s" in said
+    assert "robustness \N{MINUS SIGN}2.1, violated since 2.300 s" in said
     assert "first satisfied" not in said
-    assert "task is violated: robustness -2.1, certain since 2.300 s" in said
+    assert "task is violated: robustness \N{MINUS SIGN}2.1, certain since 2.300 s" in said
     assert "(the least robustness is that of delivered)" in said
     assert said.index("robot dist vase >= 0.05") < said.index("robot enclosedin bin")
 
@@ -475,8 +475,10 @@ def test_a_goal_that_is_still_to_come_has_no_arrow(task: Page) -> None:
 
 def test_named_specs_have_a_row_each_with_their_requirement_and_number(task: Page) -> None:
     said = task.within("ul#")
-    assert "violatedREQ-3safenothing is bumped intorobustness -0.1, violated since 2.300 s" in said
-    assert "violatedREQ-1deliveredthe robot ends in the binrobustness -2.1" in said
+    assert (
+        "violatedREQ-3safenothing is bumped intorobustness \N{MINUS SIGN}0.1, violated since 2.300 s" in said
+    )
+    assert "violatedREQ-1deliveredthe robot ends in the binrobustness \N{MINUS SIGN}2.1" in said
     assert "satisfiedREQ-4poweredthe battery never runs lowrobustness 0.31" in said
 
 

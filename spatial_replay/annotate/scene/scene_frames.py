@@ -30,7 +30,7 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.spec.formula import RegionName, TrackedName
-from spatial_replay.text import Instant, cut
+from spatial_replay.text import Instant, cut, with_unit
 
 
 def failed_objects(
@@ -112,7 +112,7 @@ def arrow_texts(
     """
     messages = np.flatnonzero(found.is_shown)
     robustness = np.where(found.holds, -found.robustness, found.robustness)[messages].tolist()
-    texts = [robustness_text(number, unit).encode() for number in robustness]
+    texts = [with_unit(number, unit).encode() for number in robustness]
     lengths = np.fromiter(map(len, texts), np.int64, len(texts))
     of = found.result, found.leaf, found.holds, found.moment_ns, found.atom
     columns = [column[messages] for column in of]
@@ -147,11 +147,6 @@ def _outlines_then(settled: SettledViolation | None) -> tuple[float, ...]:
 
 
 _LONGEST_CAUSE: Final = 60
-
-
-def robustness_text(number: float, unit: str) -> str:
-    """Return a number with three digits and its unit."""
-    return f"{number:.3g} {unit}" if unit not in ("", "1") else f"{number:.3g}"
 
 
 _LEAST: Final = 0.4

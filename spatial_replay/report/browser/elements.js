@@ -45,7 +45,7 @@ function numberText(number) {
 
 // A text with the sign of numbers as `numberText` writes it; names such as run-1 keep theirs.
 function minusWords(text) {
-  return text.replace(/(?<![\p{L}\p{N}_])-(?=[\d.])/gu, "−");
+  return text.replace(/(?<![\p{L}\p{N}_.\]-])-(?=[\d.]|inf\b)/gu, "−").replace(/(?<![\p{L}\p{N}_.-])inf\b/gu, "∞");
 }
 
 // What grounds mean, each with its words, and how high and how strong it is.
