@@ -504,6 +504,12 @@ class _Part(NamedTuple):
         return literal_text(self.formula, self.wanted)
 
     @property
+    def brief(self) -> str:
+        """Its text, with the name of a named formula in place of what it stands for."""
+        name = self.formula.name
+        return self.text if name is None else name if self.wanted else f"not {name}"
+
+    @property
     def members(self) -> list[_Part]:
         """The parts that it is made of; none of a relation."""
         operands = self.formula.operands if isinstance(self.formula, Boolean) else ()
@@ -612,7 +618,7 @@ def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, 
         robustness = cube_robustness(upper, lower, cube, shape)
         which[robustness > danger] = number
         np.maximum(danger, robustness, out=danger)
-    return tuple(" and ".join(part.text for part in guard) for guard in guards), which
+    return tuple(" and ".join(part.brief for part in guard) for guard in guards), which
 
 
 def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:

@@ -72,7 +72,7 @@ from spatial_replay.planning.decision_log import (
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import cut, json_fields, with_unit
+from spatial_replay.text import cut, json_fields, plural, with_unit
 
 Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
 """Numbers of an array in the page: float64, float32, int32, uint16, uint8."""
@@ -663,10 +663,11 @@ class ReportedDecisions:
 
     Attributes:
         maps: by the number by which decisions name them, in the order of the log.
+        is_pushed: whether the robot pushes objects, so that the nearest cell that will do is chosen.
     """
 
-    def __init__(self) -> None:
-        self.maps: dict[int, Grid] = {}
+    def __init__(self, *, is_pushed: bool = False) -> None:
+        self.maps, self.is_pushed = dict[int, Grid](), is_pushed
         self._decisions: list[PlanDecision] = []
 
     def add_decision(self, payload: bytes) -> None:
@@ -746,7 +747,11 @@ def decisions_value(
     others = {redone_decision.number: redone_decision for redone_decision in redone.decisions}
     decisions = []
     for decision, maps in zip(plan.decisions, maps_by_decision, strict=True):
-        values = [_map_value(drawn_map, packing) for drawn_map in maps if id(drawn_map) in kept_maps]
+        values = [
+            {**_map_value(drawn_map, packing), "why": _why(drawn_map, decision, plan.is_pushed)}
+            for drawn_map in maps
+            if id(drawn_map) in kept_maps
+        ]
         value = _decision_value(decision, values, first_ns, packing)
         redone_decision = others.get(decision.number)
         if redone_decision is not None and _outcome(redone_decision) != _outcome(decision):
@@ -852,6 +857,40 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
     }
 
 
+def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
+    """Return why the target of the chosen map is where it is; "" for other maps."""
+    owner = drawn.owner
+    if not drawn.is_chosen or owner is None or owner.target is None or not decision.HasField("margin"):
+        return ""
+    at_target = _value_at(drawn, owner.target)
+    if at_target is None:
+        return ""
+    will_do, higher = int((drawn.values >= decision.margin).sum()), int((drawn.values > at_target).sum())
+    enough = f"{will_do:,} of {plural(drawn.values.size, 'cell')} will do"
+    if not higher:
+        return f"{enough}, and none has a higher robustness than the target."
+    motions = len(decision.considered[owner.edge].motions)
+    if motions > 1:
+        rule = f"the places of {motions} motions are chosen together"
+    elif is_pushed:
+        rule = "a robot that pushes takes the nearest"
+    else:
+        rule = "cells with enough room come first" if owner.candidate.HasField("room") else ""
+    return f"{enough}, {higher:,} with a higher robustness than the target{rule and f': {rule}'}."
+
+
+def _value_at(drawn: _Drawn, target: PlanTarget) -> float | None:
+    """Return the robustness in the cell of a target; None outside of the map."""
+    shares = [
+        (number - low) / (high - low)
+        for number, low, high in zip((target.y, target.x), drawn.low[::-1], drawn.high[::-1], strict=True)
+    ]
+    if not all(0.0 <= share < 1.0 for share in shares):
+        return None
+    row, column = (int(share * count) for share, count in zip(shares, drawn.values.shape, strict=True))
+    return float(drawn.values[row, column])
+
+
 def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, Any]:
     """Return what limits and what blocks each cell and, of the chosen map, the layer of each conjunct."""
     if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
@@ -861,7 +900,7 @@ def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, A
     layers = [
         {"number": number, "title": name, "values": packing.add(drawn.fields[name], "f4")}
         for number, name in named
-        if drawn.is_chosen and name in drawn.fields
+        if drawn.is_chosen and name in drawn.fields and np.ptp(drawn.fields[name]) != 0.0
     ]
     value: dict[str, Any] = {
         "limited": packing.add(drawn.fields["limited_by"], "u2"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -17,7 +18,7 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.html import Html, element
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
@@ -27,6 +28,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.planning.settings import settings_from_text
 from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.data import ReportedResult, RunReport, page_data, worst_results
@@ -59,9 +61,9 @@ _COLLECTED: Final = frozenset(
 class Collector:
     """Collects what a page shows from a run, as its messages come."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_pushed: bool) -> None:
         self.scene = ReportedScene()
-        self.decisions, self.redone = ReportedDecisions(), ReportedDecisions()
+        self.decisions, self.redone = ReportedDecisions(is_pushed=is_pushed), ReportedDecisions()
         self.events: list[Event] = []
         self.ticks: list[bytes] = []
         self.paths: defaultdict[tuple[str, str | None], StatePath] = defaultdict(StatePath)
@@ -138,7 +140,7 @@ def report_of(
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Replayed, RunReport]:
     """Evaluate specifications over a source, and collect what a page shows of it; see `write_report`."""
-    collector = Collector()
+    collector = Collector(is_pushed=_is_pushed(source))
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     replayed = replay.run(collector.add, advance=advance)
     report = RunReport(
@@ -157,6 +159,14 @@ def report_of(
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
     replay.draw_samples(replayed.results, missing_ns, collector.scene.insert)
     return replayed, report
+
+
+def _is_pushed(source: Source) -> bool:
+    """Return whether a log was planned for a robot that pushes."""
+    settings = dict(source.metadata()).get(log_topics.PLAN_METADATA, {}).get("settings")
+    with suppress(LogError):
+        return settings is not None and settings_from_text(settings).skill == "push"
+    return False
 
 
 def _results(

@@ -44,7 +44,8 @@ function makeMap(clock, map, decision, isTitled) {
     ask(steppedCell(map, cell, step));
   });
   const layers = map.layers?.length ? layerChoice(run, map, (chosen) => { layer = chosen; redraw(); }) : null;
-  return element("figure", {}, made, layers, isTitled ? element("figcaption", {}, map.title || "a candidate") : null,
+  const why = map.why ? element("p", {class: "why"}, `Why there? ${map.why}`) : null;
+  return element("figure", {}, made, layers, why, isTitled ? element("figcaption", {}, map.title || "a candidate") : null,
     answer);
 }
 
@@ -116,6 +117,11 @@ function demandRows(run, map, {place, value, cause, limit, target}) {
       [layer ? run.numbers(layer.values)[place] : value, map.at_target?.[index] ?? null]);
   });
   if (!cause) add("all that has to hold", false, [value, target]);
+  const rest = (map.limits?.length ?? 0) - rows.filter((row) => row.querySelector("code")).length;
+  if (rest > 0 && map.layers?.length) {
+    rows.push(element("tr", {}, element("td", {class: "quiet", colspan: map.target ? 3 : 2},
+      `${rest} more do${rest === 1 ? "es" : ""} not depend on where ${map.object} is.`)));
+  }
   return rows;
 }
 
@@ -188,7 +194,7 @@ function drawFigure(context, run, {map, layer, cell, decision}, width, height) {
   context.strokeStyle = colour("line");
   context.lineWidth = 1;
   context.strokeRect(left, top, right - left, bottom - top);
-  drawAxes(context, map, at, [left, top, right, bottom]);
+  drawAxes(context, map, run.lengths, at, [left, top, right, bottom]);
   drawScale(context, layer.scale, decision.margin, [right + 8, top, bottom]);
 }
 
@@ -286,7 +292,7 @@ function roundStep(length, parts) {
   return power * ([1, 2, 5].find((factor) => length / (factor * power) <= parts) ?? 10);
 }
 
-function drawAxes(context, map, at, [left, top, right, bottom]) {
+function drawAxes(context, map, unit, at, [left, top, right, bottom]) {
   context.font = FONT;
   context.fillStyle = context.strokeStyle = colour("quiet");
   context.lineWidth = 1;
@@ -310,6 +316,10 @@ function drawAxes(context, map, at, [left, top, right, bottom]) {
     context.lineTo(left, at.y(tick));
     context.fillText(numberText(tick), left - 6, at.y(tick));
   }
+  if (unit) {
+    context.textBaseline = "top";
+    context.fillText(unit, left - 6, bottom + 6);
+  }
   context.stroke();
 }
 
@@ -331,7 +341,7 @@ function drawScale(context, scale, margin, [left, top, bottom]) {
     context.fillRect(left, height - 0.5, SCALE_WIDTH + 3, 1);
     if (rows.some((other) => Math.abs(other - row) < 12)) continue;
     rows.push(row);
-    context.fillText(numberText(Number(number.toPrecision(3))), left + SCALE_WIDTH + 5, row);
+    context.fillText(numberText(number), left + SCALE_WIDTH + 5, row);
   }
 }
 
