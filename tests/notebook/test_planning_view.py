@@ -61,6 +61,23 @@ def test_the_colours_of_a_map_are_symmetric_around_zero():
 
 
 @pytest.mark.usefixtures("figures")
+def test_a_line_is_where_a_map_reaches_the_margin():
+    gradient = mat_map()
+    values = gradient.values[0]
+    margin = float(np.nanquantile(values, 0.6))
+    (line,) = gradient.plot(margin=margin).collections[:1]
+    x, y = (axis.reshape(gradient.grid.shape) for axis in gradient.grid.centres().T)
+    for path in line.get_paths():
+        for corner in path.vertices:
+            near = np.hypot(x - corner[0], y - corner[1]) <= gradient.grid.cell_size
+            assert np.nanmin(values[near]) <= margin <= np.nanmax(values[near])
+    assert sum(len(path.vertices) for path in line.get_paths()) > 4
+    # without a margin, or where every cell reaches it, there is no line
+    assert len(gradient.plot().collections) == len(gradient.plot(margin=-1e3).collections)
+    assert len(gradient.plot(margin=margin).collections) == len(gradient.plot().collections) + 1
+
+
+@pytest.mark.usefixtures("figures")
 def test_the_target_orientation_of_a_map_is_drawn():
     workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), yaws=(0.0, 0.785), supports=frozenset({"mat"}))
     found = mat_map(workspace)
