@@ -82,9 +82,9 @@ def tree_cell(stem: str, node: Formula) -> Html:
     return code(indented, *name, title_of(node))
 
 
-def _left_out(results: Sequence[NamedSpec], shown: int) -> Html:
+def _left_out(results: Sequence[NamedSpec], rows: int) -> Html:
     nodes = _size(results)
-    return quiet(f"… and {plural(nodes - shown, 'node')} more") if shown < nodes else Html("")
+    return quiet(f"… and {plural(nodes - rows, 'node')} more") if rows < nodes else Html("")
 
 
 class _Place(NamedTuple):

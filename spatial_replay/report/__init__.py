@@ -2,9 +2,8 @@
 
 The flow, file by file:
 
-    write → contents → data, *_panel → page
+    write → data → panels → page
 
-`write` replays a log and collects the facts, which `contents` defines. `data`, with one module for each
-panel, turns them into JSON and packed arrays (`panels`). `page` is the HTML around those, with the scripts
-of `browser/`.
+`write` replays a log and collects the facts, as a `RunReport`. `data` turns them into JSON and packed arrays,
+with the parts of each panel in `panels`. `page` is the HTML around those, with the scripts of `browser/`.
 """

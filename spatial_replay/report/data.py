@@ -284,26 +284,26 @@ def page_data(report: RunReport) -> PageData:
     ]
     room = _room(reported_results, len(times_ns))
     shown_ns = _shown_times(report, times_ns, room // 2)
-    kept_ns = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
+    page_ns = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
     decisions = decisions_value(report.decisions, report.redone, first_ns, packing)
     facts = {
         "settles": report.replayed.semantics == "ltlf",
         "lengths": report.axes.unit,
-        "is_thinned": len(kept_ns) < len(times_ns),
-        "times": packing.add((kept_ns - first_ns) / 1e9, "f8"),
+        "is_thinned": len(page_ns) < len(times_ns),
+        "times": packing.add((page_ns - first_ns) / 1e9, "f8"),
         "palette": {
             **SIGNS,
             # without those of the signs
             "curves": CURVES[2:],
         },
-        "results": [_result_value(reported, kept_ns, report, packing) for reported in reported_results],
-        "scene": scene_value(report.scene, kept_ns, first_ns, _places(report), packing),
+        "results": [_result_value(reported, page_ns, report, packing) for reported in reported_results],
+        "scene": scene_value(report.scene, page_ns, first_ns, _places(report), packing),
         "events": event_values(report.events, first_ns),
         "decisions": decisions["decisions"],
         "ticks": ticks_value(report.ticks, first_ns),
         "camera": dict(report.pictures),
     }
-    omissions = tuple(_omissions(report, len(times_ns), len(kept_ns), decisions["maps_left_out"]))
+    omissions = tuple(_omissions(report, len(times_ns), len(page_ns), decisions["maps_left_out"]))
     return PageData(facts, packing.text(), omissions)
 
 
@@ -338,11 +338,11 @@ def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
 
 
 def _result_value(
-    reported: ReportedResult, kept: Integers, report: RunReport, packing: Packing
+    reported: ReportedResult, page_ns: Integers, report: RunReport, packing: Packing
 ) -> Mapping[str, Any]:
     first_ns = report.replayed.first_ns
     relations = RELATION_NAMES | reported.file.relations
-    samples = np.flatnonzero(np.isin(reported.result.times_ns, kept))
+    samples = np.flatnonzero(np.isin(reported.result.times_ns, page_ns))
     times_ns = reported.result.times_ns[samples]
     # (nodes, 4, samples), of the shown nodes
     series = reported.result.series[list(shown_nodes(reported.result.formula))][:, :, samples]
@@ -350,7 +350,7 @@ def _result_value(
         **json_fields(reported.result, "title", "name", "object", "verdict"),
         "pointer": _pointer_value(reported, first_ns, report.axes.unit),
         "fault": None if reported.fault_ns is None else (reported.fault_ns - first_ns) / 1e9,
-        "first": int(np.searchsorted(kept, times_ns[0])) if len(times_ns) else 0,
+        "first": int(np.searchsorted(page_ns, times_ns[0])) if len(times_ns) else 0,
         "samples": len(times_ns),
         "decided": _place_of(reported),
         "decided_text": _decided_text(reported),
@@ -416,11 +416,11 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
     }
 
 
-def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterator[str]:
-    if kept < samples:
+def _omissions(report: RunReport, samples: int, page_samples: int, maps: int) -> Iterator[str]:
+    if page_samples < samples:
         yield (
-            f"Curves and tree have {kept:,} of {samples:,} samples: those at equal distances, those around "
-            "changes of sign, and the extremes of every curve in between."
+            f"Curves and tree have {page_samples:,} of {samples:,} samples: those at equal distances, those "
+            "around changes of sign, and the extremes of every curve in between."
         )
     if report.scene.stride > 1:
         yield (

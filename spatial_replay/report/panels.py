@@ -616,7 +616,7 @@ def _join_points(points: Sequence[Floats]) -> Floats:
 
 def _entity_value(
     identifier: str,
-    shown: Mapping[int, DrawnEntity],
+    entities: Mapping[int, DrawnEntity],
     frames: int,
     results: Sequence[int],
     box: _Box,
@@ -629,14 +629,14 @@ def _entity_value(
     """
     forms: dict[tuple[tuple[int, ...], bool], int] = {}
     of_frame = np.full(frames, _ABSENT, np.int64)
-    for number, entity in shown.items():
+    for frame, entity in entities.items():
         form = tuple(len(ring) for ring in entity.rings), entity.is_last
-        of_frame[number] = forms.setdefault(form, len(forms))
+        of_frame[frame] = forms.setdefault(form, len(forms))
     kind, _, name = identifier.partition("/")
-    rings = [ring for entity in shown.values() for ring in entity.rings]
-    has_shades = all(entity.shades for entity in shown.values())
+    rings = [ring for entity in entities.values() for ring in entity.rings]
+    has_shades = all(entity.shades for entity in entities.values())
     shades = [
-        np.frombuffer(entity.shades, np.uint8)[list(results)] for entity in shown.values() if has_shades
+        np.frombuffer(entity.shades, np.uint8)[list(results)] for entity in entities.values() if has_shades
     ]
     return {
         "kind": kind,
@@ -646,7 +646,7 @@ def _entity_value(
         "last": [number for (_, is_last), number in forms.items() if is_last],
         "form": packing.add(of_frame, "u2"),
         "points": packing.add(box.steps(_join_points(rings)), "u2"),
-        "colours": packing.add(np.array([entity.colour for entity in shown.values()]), "u1"),
+        "colours": packing.add(np.array([entity.colour for entity in entities.values()]), "u1"),
         "shades": packing.add(np.array(shades), "u1") if has_shades else None,
     }
 
