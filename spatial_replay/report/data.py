@@ -47,7 +47,7 @@ from spatial_replay.report.panels import (
 from spatial_replay.report.ticks import MOST_TICKS, ticks_value
 from spatial_replay.spec.formula import Quantified, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.text import Sentence, json_fields, json_number
+from spatial_replay.text import Sentence, json_fields, json_number, with_unit
 from spatial_replay.trace.units import Axes
 
 MANY: Final = 6
@@ -407,7 +407,7 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
         "time": (reported.fault_ns - first_ns) / 1e9,
         "ends": [*map(float, (*contact.first, *contact.second))],
         "text": deciding.text,
-        "label": open_text(witness) or f"{holds}{number:.3g} {lengths}".rstrip(),
+        "label": open_text(witness) or f"{holds}{with_unit(number, lengths)}",
         "number": json_number(number),
         "is_condition": not is_response and witness.missed is not None and witness.missed.is_condition,
         "is_response": is_response,
