@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -29,26 +30,44 @@ def place_names(low: Floats, high: Floats, letters: Floats, blocked: Floats, lin
         line: the height of a name.
     """
     middles = np.empty(low.shape)
-    boxes = list(blocked.swapaxes(0, 1))
+    # x and y apart: numpy compares long columns, not pairs
+    boxes = [(box[:, 0].T.copy(), box[:, 1].T.copy()) for box in blocked.swapaxes(0, 1)]
     for number in range(low.shape[1]):
-        half = np.full((len(low), 2), line / 2.0)
-        half[:, 0] *= LETTER * letters[:, number]
-        middle = (low[:, number] + high[:, number]) / 2.0
-        reach = (high[:, number] - low[:, number]) / 2.0 + half + _GAP * line
-        left = np.arange(len(low))
-        for side in _SIDES:
-            places = middle[left] + side * reach[left]
-            middles[left, number] = places
-            begin, end = places - half[left], places + half[left]
-            is_covered = np.zeros(len(left), np.bool_)
-            for box in boxes:
-                is_covered |= ((begin < box[left, 1]) & (box[left, 0] < end)).all(axis=1)
-            left = left[is_covered]
-            if not len(left):
-                break
-        top = np.nanmax([box[left, 1, 1] for box in boxes], axis=0, initial=-np.inf)
-        middles[left, number, 0] = middle[left, 0]
-        middles[left, number, 1] = top + half[left, 1] + _GAP * line
-        centres = middles[:, number]
-        boxes.append(np.stack([centres - half, centres + half], axis=1))
+        half = np.full((2, len(low)), line / 2.0)
+        half[0] *= LETTER * letters[:, number]
+        middle = (low[:, number] + high[:, number]).T / 2.0
+        reach = (high[:, number] - low[:, number]).T / 2.0 + half + _GAP * line
+        centres = _first_free(middle, reach, half, boxes, line)
+        middles[:, number] = centres.T
+        boxes.append((centres - half, centres + half))
     return middles
+
+
+_Box = tuple[Floats, Floats]
+"""Low and high corners (2, K) of a box in each scene."""
+
+
+def _first_free(middle: Floats, reach: Floats, half: Floats, boxes: Sequence[_Box], line: float) -> Floats:
+    """Return the middles (2, K) of one name in each scene: at the first free side, or above all boxes."""
+    centres = np.empty(middle.shape)
+    left = np.arange(middle.shape[1])
+    for side in _SIDES:
+        is_first = len(left) == middle.shape[1]
+        columns = [middle, reach, half] if is_first else [column[:, left] for column in (middle, reach, half)]
+        places = columns[0] + side[:, None] * columns[1]
+        centres[:, left] = places
+        begin, end = places - columns[2], places + columns[2]
+        is_covered = np.zeros(len(left), np.bool_)
+        for low, high in boxes:
+            if not is_first:
+                low, high = low[:, left], high[:, left]
+            is_covered |= (
+                (begin[0] < high[0]) & (low[0] < end[0]) & (begin[1] < high[1]) & (low[1] < end[1])
+            )
+        left = left[is_covered]
+        if not len(left):
+            return centres
+    top = np.nanmax([high[1, left] for _, high in boxes], axis=0, initial=-np.inf)
+    centres[0, left] = middle[0, left]
+    centres[1, left] = top + half[1, left] + _GAP * line
+    return centres
