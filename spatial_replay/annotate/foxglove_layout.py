@@ -81,7 +81,7 @@ def scene_panel(
 
     A viewer can show the planner's redone decisions instead.
     """
-    shown: dict[str, Config] = {
+    displays: dict[str, Config] = {
         SCENE: {},
         GRADIENT_MAP: {"colorMode": "rgba-fields"},
         PLAN_PATH: {},
@@ -92,14 +92,18 @@ def scene_panel(
         "cameraState": camera,
         "followMode": "follow-none",
         "followTf": FRAMES[0],
-        "topics": {topic: {"visible": True, **how} for topic, how in shown.items() if topic in topics},
+        "topics": {
+            topic: {"visible": True, **display} for topic, display in displays.items() if topic in topics
+        },
         # axes are a metre long, whatever the scene's size
         "scene": {"labelScaleFactor": 1, "transforms": {"showLabel": False, "axisScale": 0}},
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
     of = f" of {planned_for} as recorded" if planned_for else ""
     legend = f" (map{of}: vermillion fails, white is 0, blue holds)" if GRADIENT_MAP in topics else ""
-    return _titled("3D!scene", f"Scene{legend}" if axes == OUR_AXES else f"Scene{legend}, {axes}", config)
+    return _title_panel(
+        "3D!scene", f"Scene{legend}" if axes == OUR_AXES else f"Scene{legend}, {axes}", config
+    )
 
 
 def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:
@@ -114,7 +118,7 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
         for number, (words, colour) in _STANDING_COLOURS.items()
     ]
     return [
-        _titled(
+        _title_panel(
             f"Indicator!result{index}",
             titles[index],
             {
@@ -137,14 +141,17 @@ def sample_curves(
     results = [(tree.title, tree.formula) for tree in trees]
     return [
         panel
-        for name, title, shown in (
+        for name, title, formulas in (
             ("robustness", "Robustness of results", results),
             ("parts", "Robustness of named specs", _parts(trees)),
         )
         for panel in _plots(
             name,
             title,
-            [_Curve(each, _standing_path(each, "robustness"), unit_of(node, units)) for each, node in shown],
+            [
+                _Curve(label, _standing_path(label, "robustness"), unit_of(node, units))
+                for label, node in formulas
+            ],
             zero,
         )
     ]
@@ -198,7 +205,7 @@ def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Pa
         }
         for label, path in [*strips, *more[:_MOST_STRIPS]]
     ]
-    return _titled("StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": paths})
+    return _title_panel("StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": paths})
 
 
 def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
@@ -206,26 +213,26 @@ def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
 
     A log without annotated images shows its first topic with images.
     """
-    own = {topic_of_camera(CAMERA_VIDEO, number) for number in range(1, len(images) + 1)}
-    copied = iter([each for each in images if each not in own])
+    cameras = {topic_of_camera(CAMERA_VIDEO, number) for number in range(1, len(images) + 1)}
+    copied = iter([image for image in images if image not in cameras])
     panels = []
     for number in range(1, len(images) + 1):
         video, calibration, annotations = (
-            topic_of_camera(each, number) for each in (CAMERA_VIDEO, CAMERA_CALIBRATION, CAMERA_ANNOTATIONS)
+            topic_of_camera(topic, number) for topic in (CAMERA_VIDEO, CAMERA_CALIBRATION, CAMERA_ANNOTATIONS)
         )
         if number > 1 and annotations not in topics:
             break
-        shown = video if video in images else next(copied, None)
-        if shown is None:
+        image = video if video in images else next(copied, None)
+        if image is None:
             continue
-        mode: Config = {"imageTopic": shown}
+        mode: Config = {"imageTopic": image}
         if calibration in topics:
             mode["calibrationTopic"] = calibration
         if annotations in topics:
             mode["annotations"] = {annotations: {"visible": True}}
         name = "camera" if number == 1 else f"camera{number}"
         title = "Camera" if number == 1 else f"Camera {number}"
-        panels.append(_titled(f"Image!{name}", title, {"imageMode": mode, "synchronize": False}))
+        panels.append(_title_panel(f"Image!{name}", title, {"imageMode": mode, "synchronize": False}))
     return panels
 
 
@@ -243,7 +250,7 @@ def _with_clock(at: Instant) -> str:
     return f"{at} ({clock_text(at.time_ns)})" if at.first_ns else str(at)
 
 
-def _titled(identifier: str, title: str, config: Config) -> Panel:
+def _title_panel(identifier: str, title: str, config: Config) -> Panel:
     # each of the two viewers reads a key of its own
     return Panel(identifier, {**config, "foxglovePanelTitle": title, "lichtblickPanelTitle": title})
 
@@ -267,7 +274,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
     offset = "" if text_zero is None else text_zero.offset
     panels = []
     for index, unit in enumerate(list(dict.fromkeys(curve.unit for curve in curves))[:_MOST_PLOTS]):
-        own = [curve for curve in curves if curve.unit == unit][:_MOST_CURVES]
+        same_unit = [curve for curve in curves if curve.unit == unit][:_MOST_CURVES]
         words = unit_words(unit)
         paths = [
             {
@@ -278,7 +285,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
                 "timestampMethod": "receiveTime",
                 "value": curve.path,
             }
-            for index, curve in enumerate(own)
+            for index, curve in enumerate(same_unit)
         ]
         zero = {"color": _ZERO, "enabled": True, "label": "0", "timestampMethod": "receiveTime", "value": "0"}
         config = {
@@ -292,20 +299,20 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
             "xAxisLabel": f"time [s]; texts count from {offset}" if offset else "time [s]",
             "yAxisLabel": words,
         }
-        panels.append(_titled(f"Plot!{name}{index or ''}", f"{title} [{words}]", config))
+        panels.append(_title_panel(f"Plot!{name}{index or ''}", f"{title} [{words}]", config))
     return panels
 
 
 def _standing_path(title: str, field: str) -> str:
-    return f"{STANDING}.results[:]{{name=={_quoted(title)}}}.{field}"
+    return f"{STANDING}.results[:]{{name=={_quote(title)}}}.{field}"
 
 
 def _curves_path(tree: ReportedTree, identifier: int) -> str:
-    which = f"{{name=={_quoted(tree.name)}}}{{object=={_quoted(tree.object or '')}}}"
+    which = f"{{name=={_quote(tree.name)}}}{{object=={_quote(tree.object or '')}}}"
     return f"{CURVES_TOPIC}.specifications[:]{which}.nodes[:]{{id=={identifier}}}"
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
@@ -410,9 +417,9 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     details = _details(contents)
     if contents.trees:
         summary = {"topicPath": f"{CURVES_TOPIC}.summary"}
-        details.insert(0, ("whole log", _titled("RawMessages!summary", "The whole log", summary)))
+        details.insert(0, ("whole log", _title_panel("RawMessages!summary", "The whole log", summary)))
     title = "Playback and constants of the specification"
-    constants = _titled("Parameters!constants", title, {"title": title})
+    constants = _title_panel("Parameters!constants", title, {"title": title})
     curves = whole_curves(contents.trees, contents.units)
     return _layout(contents, curves, details, state_strips(contents.trees, by_stamp=True), below=constants)
 
@@ -430,14 +437,18 @@ def with_panels(layout: Mapping[str, Any], planned: str = "") -> dict[str, Any]:
     """
     state = {"result": planned} if planned else {}
     configs = {"3D!scene": layout["configById"]["3D!scene"]}
-    curves = [Panel(*each) for each in layout["configById"].items() if each[0].startswith("Plot!")]
+    curves = [
+        Panel(identifier, config)
+        for identifier, config in layout["configById"].items()
+        if identifier.startswith("Plot!")
+    ]
     automaton = ("automaton", Panel(_PANELS.format("automaton", "automaton"), state))
-    own = [automaton]
+    titled = [automaton]
     if "RawMessages!decision" in layout["configById"]:
         decisions = ("decisions", Panel(_PANELS.format("decisions", "decisions"), {}))
-        own = [decisions, automaton] if planned else [automaton, decisions]
-    own += [(_tab_title(each), each) for each in curves]
-    tabs, panels = _tabs("Tab!panels", own)
+        titled = [decisions, automaton] if planned else [automaton, decisions]
+    titled += [(_tab_title(plot), plot) for plot in curves]
+    tabs, panels = _tabs("Tab!panels", titled)
     tree = Panel(_PANELS.format("specification", "tree"), state)
     configs |= {panel.identifier: panel.config for panel in (tree, *panels)}
     right = _split("column", [(tree.identifier, 6.0), (tabs, 4.0)])
@@ -454,30 +465,30 @@ def _details(contents: LayoutContents) -> _Details:
     trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
     # the seconds in both tables are not those of the axes
     clock = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
-    shown = list[tuple[str, str, str, str]]()
+    rows = list[tuple[str, str, str, str]]()
     if trees:
-        shown.append(("violated", "Table!violated", f"Violated results{clock}", f"{STANDING}.violated"))
+        rows.append(("violated", "Table!violated", f"Violated results{clock}", f"{STANDING}.violated"))
     if trees and RECENT_EVENTS in contents.topics:
-        shown.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
+        rows.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
     if trees:
         # a list of texts is shown centred, one text is not
         which = "0" if all(tree.file == 0 for tree in trees) else ":"
         sources = f"{SPECIFICATION}.files[{which}].source"
         title = "Specification" if zero is None else f"Specification; {zero}"
-        shown.append(("specification", "RawMessages!specification", title, sources))
+        rows.append(("specification", "RawMessages!specification", title, sources))
     if any(contents.has_states[:1] if contents.planned else contents.has_states):
         title = trees[contents.has_states.index(True)].title
         path = _standing_path(title, "automaton")
-        shown.append(("automaton", "RawMessages!automaton", f"Automaton of {title}", path))
+        rows.append(("automaton", "RawMessages!automaton", f"Automaton of {title}", path))
     if PLAN_DECISION in contents.topics:
         of = f", for {planned_for} as recorded" if planned_for else ""
         why = f"Why the planner decided so{of}"
         decision = ("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason")
         # the first tab is open
-        shown.insert(0 if contents.planned else len(shown), decision)
-    details = [(tab, _titled(panel, title, {"topicPath": path})) for tab, panel, title, path in shown]
+        rows.insert(0 if contents.planned else len(rows), decision)
+    details = [(tab, _title_panel(panel, title, {"topicPath": path})) for tab, panel, title, path in rows]
     cameras = image_panels(contents.images, contents.topics)
-    return details + [(each.config["foxglovePanelTitle"].lower(), each) for each in cameras]
+    return details + [(camera.config["foxglovePanelTitle"].lower(), camera) for camera in cameras]
 
 
 def layout_text(layout: Mapping[str, Any]) -> str:
@@ -506,13 +517,13 @@ def _layout(
         left.append((below.identifier, 3.0))
     right: list[tuple[_Tree, float]] = []
     if curves:
-        plots, own = _tabs("Tab!curves", [(_tab_title(each), each) for each in curves])
-        panels += [*own, states]
+        plots, tab_panels = _tabs("Tab!curves", [(_tab_title(plot), plot) for plot in curves])
+        panels += [*tab_panels, states]
         # curves have at least 140 pixels on a screen of 1280 × 720
         right += [(plots, 4.5), (states.identifier, 2.0)]
     if details:
-        tabs, own = _tabs("Tab!details", details)
-        panels += own
+        tabs, tab_panels = _tabs("Tab!details", details)
+        panels += tab_panels
         right.append((tabs, 4.0))
     tree = _split("column", left)
     if right:
@@ -554,7 +565,7 @@ def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
     (first, share), *rest = parts
     if not rest:
         return first
-    whole = share + sum(other for _, other in rest)
+    whole = share + sum(part_share for _, part_share in rest)
     return {
         "direction": direction,
         "first": first,

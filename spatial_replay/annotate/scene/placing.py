@@ -61,9 +61,7 @@ def _first_free(middle: Floats, reach: Floats, half: Floats, boxes: Sequence[_Bo
         for low, high in boxes:
             if not is_first:
                 low, high = low[:, left], high[:, left]
-            is_covered |= (
-                (begin[0] < high[0]) & (low[0] < end[0]) & (begin[1] < high[1]) & (low[1] < end[1])
-            )
+            is_covered |= (begin[0] < high[0]) & (low[0] < end[0]) & (begin[1] < high[1]) & (low[1] < end[1])
         left = left[is_covered]
         if not len(left):
             return centres
