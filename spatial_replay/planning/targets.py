@@ -174,7 +174,33 @@ def _nearest_cell(
     if cells[0] == cell and len(cells) > 1:
         first = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
     turns = [gradient.grid.centre(*corner) for corner in cells[first:]]
-    return _target(gradient, tracked, (turned, *cells[-1]), (start, *turns))
+    way = _without_corners((start, *turns), gradient, free, settings)
+    return _target(gradient, tracked, (turned, *cells[-1]), way)
+
+
+def _without_corners(
+    way: Sequence[tuple[float, float]], gradient: GradientMap, free: Booleans, settings: Settings
+) -> tuple[tuple[float, float], ...]:
+    """Return a way without the corners that a straight leg over free and clear cells saves.
+
+    A robot that pushes has to take hold again at each corner.
+    """
+    grid = gradient.grid
+    least = settings.workspace.clearance + grid.cell_size / math.sqrt(2.0)
+    passable = free & (gradient.clearance[0] > least)
+
+    def is_passable(leg: Sequence[tuple[float, float]]) -> bool:
+        points = points_along(leg, grid.cell_size / _PLACES_IN_CELL)
+        return all(passable[grid.cell(*point)] for point in points)
+
+    straightened, rest = [way[0]], list(way[1:])
+    while rest:
+        farthest = next(
+            (place for place in range(len(rest) - 1, 0, -1) if is_passable((straightened[-1], rest[place]))), 0
+        )
+        straightened.append(rest[farthest])
+        rest = rest[farthest + 1 :]
+    return tuple(straightened)
 
 
 def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
