@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -15,21 +15,32 @@ import numpy as np
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_copies, moved_object
+from spatial_replay.geometry.footprint import (
+    TrackedObject,
+    centre_of,
+    moved_object,
+    with_poses,
+)
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.planning.decisions import Target, points_along
+from spatial_replay.planning.decisions import Consideration, Target, points_along
 from spatial_replay.planning.edges import Attempts, Pose, with_objects
 from spatial_replay.planning.maps import FREE
 from spatial_replay.planning.motions import Movables
 from spatial_replay.planning.settings import Settings, Skill
+from spatial_replay.planning.targets import target_in
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.trace import Sample, Trace
 
 AHEAD: Final = 90
-"""How many samples ahead the motion of other objects is expected to go on."""
-_NUMBERS: Final[tuple[int, ...]] = (*range(1, 31), *range(33, AHEAD + 1, 3))
-"""The samples ahead that are looked at: all of the first, and every third after them."""
+"""How many samples ahead the motion of other objects is expected to go on, at least."""
+MOST_AHEAD: Final = 600
+"""How many samples ahead, at most, if a motion takes long."""
+_BEGINNINGS: Final = 15
+"""The samples between two beginnings of a motion that are looked at."""
+_MOST_BEGINNINGS: Final = 9
+_CORNER: Final = math.radians(2.0)
+"""The least change of direction at which a robot that pushes takes hold again."""
 _UNSURE: Final = 2
 """By how many of its steps an object may be elsewhere than expected; it may have turned back."""
 _JITTER: Final = 1.0 / 30.0
@@ -150,6 +161,73 @@ def _point_at(waypoints: Sequence[tuple[float, float]], length: float) -> tuple[
     return waypoints[-1]
 
 
+class Timing(NamedTuple):
+    """How a robot moves an object; times are numbers of samples.
+
+    Attributes:
+        step: the length by which the object is moved between two samples.
+        rest: the longest time until the object moves, or moves on.
+        approach: the longest time until an object moves once a motion has begun.
+    """
+
+    step: float
+    rest: int = 0
+    approach: int = 0
+
+
+@dataclass
+class MotionTimes:
+    """Times of a robot's motions so far, from which those of the next one are expected.
+
+    Attributes:
+        approach: the longest time for which an object stood before it was moved, or moved on, in samples.
+    """
+
+    approach: int = 0
+    _length: float = 0.0
+    _samples: int = 0
+    _newest: float = 0.0
+    _stood: int = 0
+
+    def end(self) -> None:
+        """End a motion."""
+        self._newest, self._stood = 0.0, 0
+
+    def observe(self, length: float, least: float) -> None:
+        """Take the length by which the object was moved between two samples; at most `least` is none."""
+        if length <= least:
+            self._newest = 0.0
+            self._stood += 1
+            return
+        self.approach = max(self.approach, self._stood)
+        self._newest, self._stood = length, 0
+        self._length += length
+        self._samples += 1
+
+    def timing(self, cell_size: float) -> Timing:
+        """Return how the robot is expected to go on with a motion, or to begin one.
+
+        Without an earlier motion, an object moves by a cell between two samples.
+        """
+        mean = self._length / self._samples if self._samples else cell_size
+        rest = 0 if self._newest else max(self.approach - self._stood, 0)
+        return Timing(max(self._newest, mean), rest, self.approach)
+
+
+class Course(NamedTuple):
+    """Where an object is in some later samples.
+
+    Attributes:
+        places: (N, 2).
+        turn: the angle by which the object turns between two samples.
+        uncertainty: (N,), of the places.
+    """
+
+    places: Floats
+    turn: float = 0.0
+    uncertainty: Floats | None = None
+
+
 class Prospect(NamedTuple):
     """After how many samples acceptance would be lost; infinite if it would not be.
 
@@ -193,38 +271,81 @@ class Lookout:
         states: frozenset[int],
         motions: Mapping[str, Pose],
         target: Target,
-        pace: float,
+        timing: Timing,
     ) -> Evasion | None:
         """Return how an object keeps out of the way of others; None if its motion to a target may go on.
 
         Args:
             motions: of all objects, for each sample.
-            pace: by how much the object is moved between two samples.
+            timing: of the motion to the target.
         """
-        # standing objects jitter
-        least = self._settings.workspace.grid.cell_size * _JITTER
-        others = {
-            name: motion
-            for name, motion in motions.items()
-            if name != target.name and math.hypot(*motion[:2]) > least
-        }
+        others = self._others(motions, target)
         if not others:
             return None
         name, tracked = target.name, sample.objects[target.name]
-        start, about = centre_of(tracked.footprint), (sample, states, others, target.name)
-        ways: list[Sequence[tuple[float, float]]] = [_way_from(target.waypoints, tracked), (start,)]
-        going, staying = self._prospects(*about, ways, pace)
+        start, way = centre_of(tracked.footprint), _way_from(target.waypoints, tracked)
+        skill = self._settings.skill
+        numbers = _numbers_ahead(way, timing, skill)
+        about = sample, states, others, name, numbers
+        # the robot may begin soon or late
+        ways = [_places(way, timing, share, numbers, skill) for share in _beginnings(way, timing, skill)]
+        *prospects, staying = self._prospects(*about, [*ways, np.tile(start, (len(numbers), 1))])
+        going = Prospect(*map(min, zip(*prospects, strict=True)))
         if going.perhaps == math.inf:
             return None
         best = max(going, staying)
         aside: Target | None = None
         if best.perhaps < math.inf:
-            ways = self._clear_ways(sample, name, _ways_aside(start, pace))
-            for way, prospect in zip(ways, self._prospects(*about, ways, pace), strict=True):
+            clear_ways = self._clear_ways(sample, name, _ways_aside(start, timing.step))
+            # another motion has to begin first
+            afresh = timing._replace(rest=timing.approach)
+            ways = [_places(way, afresh, 1.0, numbers, skill) for way in clear_ways]
+            for way, prospect in zip(clear_ways, self._prospects(*about, ways), strict=True):
                 if prospect > best:
                     aside = Target(name, *way[-1], 0.0, tracked.yaw, tuple(way), target.robustness)
                     best = prospect
         return Evasion(aside, f"{' and '.join(sorted(others))} may come too near") if best > going else None
+
+    def past_others(
+        self,
+        sample: Sample,
+        motions: Mapping[str, Pose],
+        target: Target,
+        aim: Consideration,
+        timing: Timing,
+    ) -> Target:
+        """Return the target of a push with fewer corners, if others that go on leave such a way free.
+
+        Args:
+            motions: of all objects, for each sample.
+            aim: the edge that the push takes.
+            timing: of the push.
+        """
+        skill, others = self._settings.skill, self._others(motions, target)
+        stops = _stops(target.waypoints, skill)
+        if not others or not stops:
+            return target
+        number = _numbers_ahead(target.waypoints, timing, skill)[-1]
+        ahead = {
+            name: _advance(sample.objects[name], (number * x, number * y, number * turn))
+            for name, (x, y, turn) in others.items()
+        }
+        sample = with_objects(sample, ahead)
+        movables = Movables(self._formulas, self._regions, sample, self._settings, Attempts())
+        gradient = movables.gradient(target.name, aim.progress.cubes, aim.constraints.cubes)
+        direct = target_in(gradient, sample.objects[target.name], self._settings, target.pose)
+        if isinstance(direct, str) or len(_stops(direct.waypoints, skill)) >= len(stops):
+            return target
+        return replace(target, waypoints=(*direct.waypoints[:-1], (target.x, target.y)))
+
+    def _others(self, motions: Mapping[str, Pose], target: Target) -> dict[str, Pose]:
+        """Return the motions of objects that move by themselves."""
+        least = least_motion(self._settings)
+        return {
+            name: motion
+            for name, motion in motions.items()
+            if name != target.name and math.hypot(*motion[:2]) > least
+        }
 
     def _clear_ways(
         self, sample: Sample, name: str, ways: Sequence[Sequence[tuple[float, float]]]
@@ -249,84 +370,141 @@ class Lookout:
         states: frozenset[int],
         motions: Mapping[str, Pose],
         name: str,
-        ways: Sequence[Sequence[tuple[float, float]]],
-        pace: float,
+        numbers: Sequence[int],
+        ways: Sequence[Floats],
     ) -> list[Prospect]:
-        """Return the prospects of moving an object along some ways, at whose ends it stands.
+        """Return the prospects of moving an object along some ways (N, 2), its places in samples ahead.
 
         Args:
             motions: of the other objects, for each sample.
-            pace: by how much the object is moved between two samples.
+            numbers: of the samples ahead.
         """
-        certain = {who: replace(tracked, uncertainty=0.0) for who, tracked in sample.objects.items()}
-        others = self._others_ahead(certain, motions)
-        points = [_point_at(way, number * pace) for way in ways for number in _NUMBERS]
-        samples = [
-            Sample(
-                sample.time_ns + 1 + number,
-                {**certain, **others[number % len(_NUMBERS)], name: tracked},
-                sample.signals,
-                sample.unknown,
-            )
-            for number, tracked in enumerate(_copies_at(certain[name], points))
-        ]
-        if not samples:
+        if not ways:
             return []
-        leaves = leaf_values(TraceScene(Trace.from_samples(samples), self._regions), self._formulas, {})
+        certain = {who: replace(tracked, uncertainty=0.0) for who, tracked in sample.objects.items()}
+        courses = {who: _course_ahead(certain[who], motion, numbers) for who, motion in motions.items()}
+        courses[name] = Course(np.concatenate(ways))
+        trace = _trace_ahead(replace(sample, objects=certain, reported_ns={}), courses, numbers)
+        leaves = leaf_values(TraceScene(trace, self._regions), self._formulas, {})
         surely, perhaps = (leaves[0], leaves[min(1, len(leaves) - 1)]), (leaves[-2 % len(leaves)], leaves[-1])
+        count = len(numbers)
         return [
             Prospect(
                 *(
-                    self._until_loss(states, [ends[:, begin : begin + len(_NUMBERS)] for ends in bounds])
+                    self._until_loss(states, [ends[:, begin : begin + count] for ends in bounds], numbers)
                     for bounds in (perhaps, surely)
                 )
             )
-            for begin in range(0, len(samples), len(_NUMBERS))
+            for begin in range(0, len(trace), count)
         ]
 
-    def _others_ahead(
-        self, objects: Mapping[str, TrackedObject], motions: Mapping[str, Pose]
-    ) -> list[dict[str, TrackedObject]]:
-        """Return the objects that move by themselves in each of the next samples."""
-        ahead: list[dict[str, TrackedObject]] = [{} for _ in _NUMBERS]
-        for name, (x, y, turn) in motions.items():
-            u, v = centre_of(objects[name].footprint)
-            places = [(u + number * x, v + number * y) for number in _NUMBERS]
-            copies = _copies_at(objects[name], places, turn)
-            for number, moved, objects_then in zip(_NUMBERS, copies, ahead, strict=True):
-                unsure = min(number, _UNSURE) * math.hypot(x, y)
-                objects_then[name] = replace(moved, uncertainty=unsure)
-        return ahead
-
-    def _until_loss(self, states: frozenset[int], bounds: Sequence[Floats]) -> float:
+    def _until_loss(self, states: frozenset[int], bounds: Sequence[Floats], numbers: Sequence[int]) -> float:
         """Return after how many samples acceptance may be lost, by bounds (P, N) of the propositions."""
         can_accept = self._automaton.can_accept
         is_sure = states <= can_accept
         passed = 0
         rows = zip(*(ends.T.tolist() for ends in bounds), strict=True)
-        for number, (lower, upper) in zip(_NUMBERS, rows, strict=True):
+        for number, (lower, upper) in zip(numbers, rows, strict=True):
             values = zip(lower, upper, strict=True)
             symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
             # samples in between are taken to be the same
             for _ in range(number - passed):
-                states = self._automaton.step_set(states, symbol)
+                before, states = states, self._automaton.step_set(states, symbol)
+                if states == before:
+                    break
             passed = number
             if not states <= can_accept if is_sure else states.isdisjoint(can_accept):
                 return number
         return math.inf
 
 
-def _copies_at(
-    tracked: TrackedObject, points: Sequence[tuple[float, float]], turn: float = 0.0
-) -> list[TrackedObject]:
-    """Return an object at some places; with an angle, at those of `_NUMBERS`, turned by it at each sample."""
-    if turn or not points:
-        numbers = _NUMBERS[: len(points)]
-        return [
-            moved_object(tracked, *point, number * turn)
-            for number, point in zip(numbers, points, strict=True)
-        ]
-    return moved_copies(tracked, np.array(points))
+def least_motion(settings: Settings) -> float:
+    """Return the length of a motion between two samples that standing objects do not make by jittering."""
+    return settings.workspace.grid.cell_size * _JITTER
+
+
+def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> tuple[int, ...]:
+    """Return the samples ahead that are looked at, until a motion has ended: the later, the fewer."""
+    length = sum(math.dist(begin, end) for begin, end in pairwise(way))
+    ended = timing.rest + len(_stops(way, skill)) * timing.approach + length / timing.step
+    last = math.ceil(min(max(ended, AHEAD), MOST_AHEAD))
+    return (*range(1, 31), *range(33, AHEAD + 1, 3), *range(AHEAD + 9, last + 9, 9))
+
+
+def _beginnings(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> list[float]:
+    """Return shares of the longest times of rest that are looked at."""
+    longest = max(timing.rest, timing.approach if _stops(way, skill) else 0)
+    count = min(1 + math.ceil(longest / _BEGINNINGS), _MOST_BEGINNINGS)
+    return np.linspace(0.0, 1.0, count).tolist() if longest else [0.0]
+
+
+def _stops(way: Sequence[tuple[float, float]], skill: Skill) -> list[int]:
+    """Return the numbers of the points of a way at which a robot takes hold again: corners of a push."""
+    if skill != "push":
+        return []
+    angles = [math.atan2(y - v, x - u) for (u, v), (x, y) in pairwise(way)]
+    turns = (abs(math.remainder(after - before, math.tau)) for before, after in pairwise(angles))
+    return [number for number, turn in enumerate(turns, 1) if turn > _CORNER]
+
+
+def _places(
+    way: Sequence[tuple[float, float]], timing: Timing, share: float, numbers: Sequence[int], skill: Skill
+) -> Floats:
+    """Return (N, 2): where an object on a way is in samples ahead, with a share of the longest rests."""
+    points = np.array(way)
+    lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
+    rests = np.zeros(len(way))
+    rests[0] = timing.rest
+    rests[_stops(way, skill)] = timing.approach
+    leaves = lengths / timing.step + share * np.cumsum(rests)
+    comes = leaves - share * rests
+    times = np.stack((comes, leaves), axis=1).reshape(-1)
+    passed = np.interp(numbers, times, np.repeat(lengths, 2))
+    return np.stack([np.interp(passed, lengths, points[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _course_ahead(tracked: TrackedObject, motion: Pose, numbers: Sequence[int]) -> Course:
+    """Return where an object that moves by itself is in samples ahead."""
+    steps, length = np.array(numbers, np.float64), math.hypot(*motion[:2])
+    places = np.array(centre_of(tracked.footprint)) + steps[:, None] * np.array(motion[:2])
+    return Course(places, motion[2], np.minimum(steps, _UNSURE) * length)
+
+
+def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequence[int]) -> Trace:
+    """Return a trace whose samples repeat a sample but for objects on courses.
+
+    The longest course is as long as the trace. A shorter one, over `numbers`, comes again and again.
+    """
+    now = Trace.from_samples([sample])
+    count = max(len(course.places) for course in courses.values())
+    footprints, rows = now.footprints, np.repeat(now.rows, count, axis=0)
+    columns = {"yaw": [now.yaw], "uncertainty": [now.uncertainty], "class_code": [now.class_code]}
+    for name, course in courses.items():
+        tracked, column, length = sample.objects[name], now.names.index(name), len(course.places)
+        rows[:, column] = len(footprints) + np.arange(count) % length
+        turns = course.turn * np.array(numbers if course.turn else [0] * length, np.float64)
+        if course.turn:
+            for place, turn in zip(course.places, turns, strict=True):
+                footprints = with_poses(footprints, tracked, place[None, :], np.array([turn]))
+        else:
+            footprints = with_poses(footprints, tracked, course.places, np.zeros(1))
+        row = now.rows[0, column]
+        uncertainty = np.zeros(length) if course.uncertainty is None else course.uncertainty
+        for key, values in (
+            ("yaw", now.yaw[row] + turns),
+            ("uncertainty", uncertainty),
+            ("class_code", np.full(length, now.class_code[row])),
+        ):
+            columns[key].append(values)
+    return Trace(
+        times_ns=np.arange(count, dtype=np.int64),
+        names=now.names,
+        rows=rows,
+        footprints=footprints,
+        classes=now.classes,
+        signals={signal: np.repeat(values, count) for signal, values in now.signals.items()},
+        **{key: np.concatenate(values) for key, values in columns.items()},
+    )
 
 
 def _ways_aside(start: tuple[float, float], pace: float) -> list[tuple[tuple[float, float], ...]]:

@@ -51,6 +51,9 @@ from spatial_replay.planning.motions import Expectations, Movables, costs_of, wi
 from spatial_replay.planning.movers import (
     Evasion,
     Lookout,
+    MotionTimes,
+    Timing,
+    least_motion,
     motions_between,
     next_sample,
 )
@@ -154,7 +157,7 @@ class Planner:
         self._running: Step | None = None
         # of the objects, between the newest two samples
         self._motions: dict[str, Pose] = {}
-        self._pace = 0.0
+        self._times = MotionTimes()
         self._decided: Sample | None = None
         # whether the motion has to stop because of objects that move by themselves
         self._is_evaded = False
@@ -206,8 +209,8 @@ class Planner:
 
         A motion has to stop when one more sample would lose acceptance. In that sample every object moves by
         as much as between the newest two, and the moved one no farther than its way leads. It also has to
-        stop when another object that moves may come too near within `AHEAD` samples, if waiting or going
-        aside is better. A robot that asks after each sample ends the motion with
+        stop when another object that moves may come too near before its end, if waiting or going aside is
+        better. A robot that asks after each sample ends the motion with
         `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
@@ -242,8 +245,9 @@ class Planner:
         before, self._sample = self._sample, sample
         self._motions = {} if before is None else motions_between(before, sample)
         running = None if self._running is None else self._running.target
-        if running is not None and running.name in self._motions:
-            self._pace = math.hypot(*self._motions[running.name][:2]) or self._pace
+        if running is not None and running.name in sample.objects:
+            length = math.hypot(*self._motions.get(running.name, (0.0, 0.0))[:2])
+            self._times.observe(length, least_motion(self._settings))
         self._is_evaded = False
         states, symbol = self._states, self._symbol
         self._symbol = self._observer.symbol(sample)
@@ -303,9 +307,15 @@ class Planner:
 
     def _evasion(self, target: Target) -> Evasion | None:
         """Return how to keep out of the way of others that move; None if a motion to a target may go on."""
-        lookout = Lookout(self.automaton, self._formulas, self._regions, self.settings)
-        pace = self._pace or self.settings.workspace.grid.cell_size
-        return lookout.evasion(self._newest(), self._states, self._motions, target, pace)
+        return self._lookout.evasion(self._newest(), self._states, self._motions, target, self._timing)
+
+    @property
+    def _lookout(self) -> Lookout:
+        return Lookout(self.automaton, self._formulas, self._regions, self.settings)
+
+    @property
+    def _timing(self) -> Timing:
+        return self._times.timing(self.settings.workspace.grid.cell_size)
 
     def next_step(self) -> Step:
         """Return the next decision (Algorithm 1).
@@ -347,6 +357,7 @@ class Planner:
         if step is None or step.target is None or step.aim is None:
             raise UsageError("no step is being executed; call next_step() first")
         self._running = None
+        self._times.end()
         # it stands from here on
         self._motions.pop(step.target.name, None)
         is_stopped = not outcome.succeeded and outcome.reason == self._stop_reason
@@ -365,9 +376,12 @@ class Planner:
 
     def _yielding(self, step: Step, target: Target) -> Step:
         """Return the step of a motion, or the one that keeps out of the way of others before it."""
-        evasion = self._evasion(target)
-        if evasion is None or step.aim is None:
+        if step.aim is None:
             return step
+        target = self._lookout.past_others(self._newest(), self._motions, target, step.aim, self._timing)
+        evasion = self._evasion(target)
+        if evasion is None:
+            return replace(step, target=target)
         self._attempts.withdraw(step.aim.edge, target.name)
         self._delayed = target
         self._yielded += 1
@@ -586,8 +600,8 @@ def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
     return f"{worse} {numbers}" if cost > least else f"{better} {numbers}, {_LEADS_NOWHERE}"
 
 
-MOST_YIELDED: Final = 300
+MOST_YIELDED: Final = 1800
 """The most samples for which motions wait for others to pass, until one succeeds.
 
-In ten seconds at 30 Hz, a person who walks half a metre to and fro at 0.1 m/s leaves the way free once.
+In a minute at 30 Hz, a person who walks two metres to and fro at 0.1 m/s leaves the way free.
 """

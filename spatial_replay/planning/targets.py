@@ -196,7 +196,8 @@ def _without_corners(
     straightened, rest = [way[0]], list(way[1:])
     while rest:
         farthest = next(
-            (place for place in range(len(rest) - 1, 0, -1) if is_passable((straightened[-1], rest[place]))), 0
+            (place for place in range(len(rest) - 1, 0, -1) if is_passable((straightened[-1], rest[place]))),
+            0,
         )
         straightened.append(rest[farthest])
         rest = rest[farthest + 1 :]

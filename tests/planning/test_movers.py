@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -33,12 +34,16 @@ class Robot:
     Attributes:
         write: takes each sample.
         person: gives the person at a sample's number.
+        step: how far an object is moved from sample to sample.
+        approach: for how many samples an object stands before each straight leg of its way.
     """
 
     objects: dict[str, sr.TrackedObject]
     planner: Planner
     write: object
     person: object = None
+    step: float = STEP
+    approach: int = 0
     samples: list[sr.Sample] = field(default_factory=list)
     stops: int = 0
 
@@ -52,12 +57,13 @@ class Robot:
 
     def execute(self, step):
         name = step.target.name
-        for point in [*points_along(step.target.waypoints, STEP)][1:]:
-            self.objects[name] = moved_object(self.objects[name], *point)
-            self.look()
-            if self.planner.stop_reason:
-                self.stops += 1
-                return Outcome(False, self.planner.stop_reason)
+        for begin, end in pairwise(step.target.waypoints):
+            for point in (*[begin] * self.approach, *islice(points_along((begin, end), self.step), 1, None)):
+                self.objects[name] = moved_object(self.objects[name], *point)
+                self.look()
+                if self.planner.stop_reason:
+                    self.stops += 1
+                    return Outcome(False, self.planner.stop_reason)
         return Outcome(True)
 
 
@@ -99,6 +105,21 @@ def past_a_person(skill, speed, phase):
 @pytest.mark.parametrize(("speed", "phase"), [(0.1, 10), (0.3, 3), (0.3, 13)])
 def test_an_object_keeps_away_from_a_person_who_walks_to_and_fro(speed, phase, skill):
     assert act(*past_a_person(skill, speed, phase)) == ("hold", "satisfied")
+
+
+@pytest.mark.parametrize("phase", [0, 12])
+def test_an_arm_that_needs_time_to_begin_pushes_past_a_person(phase):
+    def person(number):
+        passed = (number / 90 + phase / 8) % 2.0
+        return sr.TrackedObject(sr.Footprint.disc(0.475, 1.8 * min(passed, 2.0 - passed) - 0.9, 0.03))
+
+    text = "(F (cup enclosedin goal)) and (G (cup dist person >= 0.04))"
+    file = sr.parse_specification(f"region goal = box(0.62, -0.08, 0.76, 0.08)\nspec task = {text}")
+    area = Workspace(Grid.over(0.2, -0.3, 0.8, 0.3, 0.01))
+    planner = Planner(file, Settings(area, "push", movable=("cup",), margin=0.01, constraint_margin=0.008))
+    cup = block(0.33, 0.0, size=0.04)
+    robot = Robot({"cup": cup}, planner, planner.observe, person, step=0.01, approach=35)
+    assert act(planner, robot) == ("hold", "satisfied")
 
 
 def test_a_motion_aside_during_which_no_sample_comes_becomes_a_wait():
