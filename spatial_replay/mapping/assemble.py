@@ -243,9 +243,9 @@ class _Assembling:
         numbers = map(self._number_of_topic.get, topics, repeat(-1))
         number_of_message = np.fromiter(numbers, np.int64, len(arrived))
         stamped: list[_Stamped] = []
-        come = set(topics)
+        arrived_topics = set(topics)
         for reader in self._readers.values():
-            if reader.planned.topic not in come or (
+            if reader.planned.topic not in arrived_topics or (
                 self._knows_static and reader.planned.is_static and not reader.is_mapped
             ):
                 continue
@@ -483,9 +483,9 @@ class Assembler(_Assembling):
                 times_ns = {"log": log_ns, "publish": publish_ns, "header": None}
                 self._add_transforms(reader, times_ns[reader.planned.clock], log_ns, contents[0])
 
-    def move_faults(self, other: FaultList) -> None:
+    def move_faults(self, target: FaultList) -> None:
         """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
-        self._faults.move_to(other)
+        self._faults.move_to(target)
 
 
 class _Stamped(NamedTuple):
@@ -880,20 +880,20 @@ class LiveAssembler(_Assembling):
         Nothing of what they reported holds on: not while a connection is lost, nor after silence. It stays
         unknown until they report it again. Messages of other topics wait as before.
         """
-        gone = self._names_of(topics) - self._lost
-        if not gone:
+        newly_lost = self._names_of(topics) - self._lost
+        if not newly_lost:
             return Trace.empty()
         self._now_s = now_s
-        self._lost |= gone
-        self._held = [waiting for waiting in self._held if waiting.topic not in gone]
-        gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in gone))
+        self._lost |= newly_lost
+        self._held = [waiting for waiting in self._held if waiting.topic not in newly_lost]
+        gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in newly_lost))
         so_far = self._settle(max(self._upto_ns(now_s), gone_ns), is_last=True)
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return so_far
         self._tracker.advance(lost_ns)
-        self._tracker.lose(lost_ns, gone)
-        if any(self._readers[topic].transforms is not None for topic in gone):
+        self._tracker.lose(lost_ns, newly_lost)
+        if any(self._readers[topic].transforms is not None for topic in newly_lost):
             self._tree.forget_moving()
         self._settled_ns = lost_ns
         lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)

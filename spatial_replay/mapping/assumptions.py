@@ -404,10 +404,10 @@ def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
     if layout is None or layout.origin is None or _no_degrees(evidence, log):
         return None
     origin = np.array(layout.origin)
-    away = max(np.abs(evidence.low[:2] - origin).max(), np.abs(evidence.high[:2] - origin).max())
-    if not (away > _FAR_DEGREES and np.abs(evidence.high[:2]).max() <= 360):
+    distance = max(np.abs(evidence.low[:2] - origin).max(), np.abs(evidence.high[:2] - origin).max())
+    if not (distance > _FAR_DEGREES and np.abs(evidence.high[:2]).max() <= 360):
         return None
-    return f"its fixes are up to {number_text(away)} degrees from the origin, where the earth is not flat"
+    return f"its fixes are up to {number_text(distance)} degrees from the origin, where the earth is not flat"
 
 
 _FAR_DEGREES: Final = 2.0

@@ -171,26 +171,26 @@ class Namer:
                 self._get = lambda _, index, message: get_names(message)[index]
             elif not path.from_message:
                 get = getter(path, example)
-                self._get = lambda thing, *_: get(thing)
+                self._get = lambda element, *_: get(element)
 
-    def _name(self, thing: object, index: int | str, message: object) -> str:
+    def _name(self, element: object, index: int | str, message: object) -> str:
         words = (
-            p if isinstance(p, str) else self._word(p, thing, index, message) for p in self._template.parts
+            p if isinstance(p, str) else self._word(p, element, index, message) for p in self._template.parts
         )
         return _check_name("".join(words))
 
     def _word(
-        self, alternatives: tuple[FieldPath, ...], thing: object, index: int | str, message: object
+        self, alternatives: tuple[FieldPath, ...], element: object, index: int | str, message: object
     ) -> str:
         for path in alternatives:
-            if path.text in (INDEX, TOPIC) and path.text not in field_names(thing):
+            if path.text in (INDEX, TOPIC) and path.text not in field_names(element):
                 if path.text == TOPIC:
                     return self._topic
                 is_one_of_several = self._has_ids or (isinstance(index, int) and index > 0)
                 self.is_by_place = self.is_by_place or is_one_of_several
                 return str(index)
             try:
-                root = message if path.from_message else thing
+                root = message if path.from_message else element
                 word = _text(walk(path, root, index, is_strict=len(alternatives) > 1), path)
             except FieldError:
                 if len(alternatives) == 1:
@@ -211,8 +211,8 @@ def class_codes(
         return [codes[layout.class_name]] * len(objects)
     code_by_value: dict[Any, int] = {}
     result = []
-    for thing in objects:
-        value = _first_value(binding.class_gets, thing)
+    for element in objects:
+        value = _first_value(binding.class_gets, element)
         code = code_by_value.get(value)
         if code is None:
             code = code_by_value[value] = codes[_class_name(layout, value, binding.class_names)]
@@ -220,10 +220,10 @@ def class_codes(
     return result
 
 
-def _first_value(gets: Sequence[Get], thing: object) -> Any:
+def _first_value(gets: Sequence[Get], element: object) -> Any:
     for get in gets:
         try:
-            value = get(thing)
+            value = get(element)
         except (AttributeError, LookupError, TypeError):
             continue
         if isinstance(value, Zero):
@@ -651,7 +651,7 @@ def _polygon(layout: MessageLayout, columns: _Columns) -> tuple[Get | None, bool
         return None, False
     path = FieldPath.of(text)
     if (rings := path_of_rings(path, example)) is not None:
-        return (getter(rings, example) if rings.steps else lambda thing: thing), True
+        return (getter(rings, example) if rings.steps else lambda element: element), True
     value = walk(path, example)
     if "points" in field_names(value):
         # geometry_msgs/Polygon

@@ -278,10 +278,10 @@ def _triangles(pose: tuple[Numbers, Numbers], corners: Sequence[Numbers]) -> lis
     return [Solid(HULL, *pose, (nan,) * 3, corners[i : i + 3]) for i in range(0, len(corners) - 2, 3)]
 
 
-def solids_of_perceived_object(thing: Any, get: GetField) -> list[Solid]:
+def solids_of_perceived_object(perceived_object: Any, get: GetField) -> list[Solid]:
     """Return the solid of a derived_object_msgs/Object: its shape, else its polygon, else its position."""
-    pose = _pose(get(thing, "pose"), get)
-    shape = get(thing, "shape")
+    pose = _pose(get(perceived_object, "pose"), get)
+    shape = get(perceived_object, "shape")
     kind = get(shape, "type")
     sizes = [float(size) for size in get(shape, "dimensions")]
     if kind == 1 and len(sizes) >= 3:
@@ -290,7 +290,7 @@ def solids_of_perceived_object(thing: Any, get: GetField) -> list[Solid]:
         return [Solid(SPHERE, *pose, (2 * sizes[0],) * 3)]
     if kind in (3, 4) and len(sizes) >= 2:
         return [Solid(CYLINDER, *pose, (2 * sizes[1], 2 * sizes[1], sizes[0]))]
-    corners = [_vector(point, get) for point in get(get(thing, "polygon"), "points") or ()]
+    corners = [_vector(point, get) for point in get(get(perceived_object, "polygon"), "points") or ()]
     if len(corners) >= 3:
         return [Solid(POLYGON, (0.0, 0.0, pose[0][2]), _NO_ROTATION, (nan,) * 3, corners)]
     return [Solid(SPHERE, *pose, (0.0,) * 3)]
@@ -300,8 +300,8 @@ def _pose(pose: Any, get: GetField) -> tuple[Numbers, Numbers]:
     if pose is None:
         return (0.0,) * 3, _NO_ROTATION
     quaternion = get(pose, "orientation")
-    turned = _NO_ROTATION if quaternion is None else _coordinates(quaternion, "xyzw", get)
-    return _vector(get(pose, "position"), get), turned
+    rotation = _NO_ROTATION if quaternion is None else _coordinates(quaternion, "xyzw", get)
+    return _vector(get(pose, "position"), get), rotation
 
 
 def _vector(vector: Any, get: GetField) -> Numbers:
@@ -397,17 +397,17 @@ class Detections:
 
     def repeat(self, index: int, count: int) -> Detections:
         """Return one of the objects `count` times, each in a message of its own, without frame and stamp."""
-        same = np.full(count, index, np.int64)
+        rows = np.full(count, index, np.int64)
         poses = self.poses
         return Detections(
             message=np.arange(count, dtype=np.int64),
-            name=self.name[same],
-            class_code=self.class_code[same],
-            poses=select(poses, same),
+            name=self.name[rows],
+            class_code=self.class_code[rows],
+            poses=select(poses, rows),
             solids=self.solids.repeat(index, count),
-            height=None if self.height is None else self.height[same],
-            uncertainty=self.uncertainty[same],
-            covariance=None if self.covariance is None else self.covariance[same],
+            height=None if self.height is None else self.height[rows],
+            uncertainty=self.uncertainty[rows],
+            covariance=None if self.covariance is None else self.covariance[rows],
         )
 
 
@@ -583,7 +583,7 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
     """Return the covariances (R, 3, 3) of positions, times the square of the number of deviations."""
     if binding.covariance is None or layout.uncertainty is None:
         return None
-    rows = np.array([list(binding.covariance(thing)) for thing in objects], np.float64)
+    rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)
     size = {4: 2, 9: 3, 36: 6}[rows.shape[1]]
     # of 6 x 6, the position comes first, as in geometry_msgs
     used = min(size, 3)
@@ -592,10 +592,10 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
     return matrices * layout.uncertainty.sigmas**2
 
 
-def _listed_solids(listed: list[list[Solid]]) -> tuple[Solids, Poses]:
+def _listed_solids(solid_lists: list[list[Solid]]) -> tuple[Solids, Poses]:
     """Return the solids of objects with at least one each, and the pose of each object's first solid."""
-    counts = np.array([len(solids) for solids in listed], np.int64)
-    solids = list(chain.from_iterable(listed))
+    counts = np.array([len(solids) for solids in solid_lists], np.int64)
+    solids = list(chain.from_iterable(solid_lists))
     position = _array([solid.position for solid in solids], 3)
     rotation, yaw = matrices_from_quaternions(_array([solid.quaternion for solid in solids], 4))
     first = np.cumsum(counts) - counts

@@ -66,11 +66,16 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
 
 def order_remarks(objects: Iterable[BoundObject], columns: Columns) -> Iterator[str]:
     """Yield remarks on quaternions without names that are upright only in the other order."""
-    for thing in objects:
-        places = thing.quaternion
-        if not places or HANDS.search(thing.name) or not all(place.name.endswith("]") for place in places):
+    for bound_object in objects:
+        places = bound_object.quaternion
+        if (
+            not places
+            or HANDS.search(bound_object.name)
+            or not all(place.name.endswith("]") for place in places)
+        ):
             continue
         rows = [columns[place.feature].reshape(len(columns[place.feature]), -1) for place in places]
         quaternions = np.column_stack([row[:, place.number] for row, place in zip(rows, places, strict=True)])
         if quaternion_order([quaternions]) == "wxyz":
-            yield f"{thing.name} stands upright only if its orientation has the other order; check `order`"
+            name = bound_object.name
+            yield f"{name} stands upright only if its orientation has the other order; check `order`"

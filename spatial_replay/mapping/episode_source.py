@@ -177,14 +177,14 @@ class EpisodeSource(Source):
                 f"{mapping.name}: model: {self.data_set.name} ({self.data_set.kind}) has no states of a"
                 " model; leave it out"
             )
-        class_of = {thing.name: thing.class_name for thing in features.objects}
+        class_of = {bound_object.name: bound_object.class_name for bound_object in features.objects}
         # features contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
             detections = {
-                thing.name: thing.detections(
+                bound_object.name: bound_object.detections(
                     columns.features, count, mapping.name if mapping else "", self.name
                 )
-                for thing in features.objects
+                for bound_object in features.objects
             }
             rows_by_name: dict[str, ObservationRows] = {}
             for body in columns.bodies:
@@ -228,7 +228,11 @@ class EpisodeSource(Source):
         """
         names, parts = list(rows_by_name), list(rows_by_name.values())
         for has_height in (False, True):
-            group = [name for name, thing in detections.items() if (thing.height is not None) == has_height]
+            group = [
+                name
+                for name, object_detections in detections.items()
+                if (object_detections.height is not None) == has_height
+            ]
             if not group:
                 continue
 
@@ -307,7 +311,9 @@ def read_together(sources: Sequence[Source]) -> list[Source]:
             read += group
             continue
         episodes = cast(Iterator[EpisodeSource], group)
-        for _, alike in groupby(episodes, lambda one: (id(one.data_set), id(one.mapped_by), one.reading)):
+        for _, alike in groupby(
+            episodes, lambda source: (id(source.data_set), id(source.mapped_by), source.reading)
+        ):
             read += _read_alike(list(alike))
     return read
 

@@ -285,16 +285,16 @@ class Motions:
         reports = np.concatenate([self._tail, reports])
         name = reports[:, _NAME].astype(np.int64)
         reports = reports[np.argsort(name, kind="stable")]
-        same = reports[1:, _NAME] == reports[:-1, _NAME]
+        is_same_object = reports[1:, _NAME] == reports[:-1, _NAME]
         # an object is as far from its last report as that one's place says
-        last = np.append(np.flatnonzero(~same), len(reports) - 1)
+        last = np.append(np.flatnonzero(~is_same_object), len(reports) - 1)
         behind = np.repeat(last, np.diff(last, prepend=-1)) - np.arange(len(reports))
         self._tail = reports[behind < _MOST_LEAPS].copy()
         self._tail[:, _IS_NEW] = 0.0
         if len(self._tail) > _MOST_ROWS:
             message = self._tail[:, _MESSAGE]
             self._tail = self._tail[message >= np.partition(message, -_MOST_ROWS)[-_MOST_ROWS]]
-        after = np.flatnonzero(same & (reports[1:, _IS_NEW] > 0)) + 1
+        after = np.flatnonzero(is_same_object & (reports[1:, _IS_NEW] > 0)) + 1
         if not len(after):
             return
         earlier, later = reports[after - 1], reports[after]
@@ -361,9 +361,9 @@ class Motions:
             after: the places of those that are new, and not the first of their object.
         """
         place, name = reports[:, _X : _Y + 1], reports[:, _NAME]
-        gone = np.diff(place, axis=0, prepend=place[:1])
-        leap = np.hypot(gone[:, 0], gone[:, 1])
-        took = np.diff(reports[:, _SECONDS], prepend=0.0)
+        step_xy = np.diff(place, axis=0, prepend=place[:1])
+        leap = np.hypot(step_xy[:, 0], step_xy[:, 1])
+        step_s = np.diff(reports[:, _SECONDS], prepend=0.0)
         leap = np.where(leap > np.fmax(reports[:, _SIZE], 0.0), leap, 0.0)
         self.chances += int(np.count_nonzero((after > 1) & (name[after] == name[after - 2])))
         if not leap[after].any():
@@ -375,7 +375,7 @@ class Motions:
             apart = place[after] - place[before]
             is_same = (name[before] == name[after]) & (after >= steps)
             is_back |= is_same & (np.hypot(apart[:, 0], apart[:, 1]) < least / 4)
-        is_slow = is_back & (took[after] >= 1.0) & (leap[after] < _FAST * took[after])
+        is_slow = is_back & (step_s[after] >= 1.0) & (leap[after] < _FAST * step_s[after])
         self.returns += int(np.count_nonzero(is_back))
         self.slow_returns += int(np.count_nonzero(is_slow))
         if self.return_moment is None and is_back.any():

@@ -133,7 +133,7 @@ class FeatureReading:
     @cached_property
     def features(self) -> tuple[str, ...]:
         """The features that it reads."""
-        places = [place for thing in self.objects for place in thing.places]
+        places = [place for bound_object in self.objects for place in bound_object.places]
         places += [signal.place for signal in self.signals]
         return tuple(dict.fromkeys(place.feature for place in places))
 
@@ -165,9 +165,9 @@ def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
                 _claim(signals, signal.name, key, "signal")
                 signals[signal.name] = _bind_signal(signal, entry, places)
             if entry.position is not None:
-                thing = _bind_object(entry, places, mapping.episodes.order)
-                _claim(objects, thing.name, key, "object")
-                objects[thing.name] = thing
+                bound_object = _bind_object(entry, places, mapping.episodes.order)
+                _claim(objects, bound_object.name, key, "object")
+                objects[bound_object.name] = bound_object
         except UsageError as error:
             faults.append(f"{mapping.name}: {error}")
     if faults:
@@ -257,15 +257,18 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
     """Join detections of several objects, each in all frames; either all have a height or none."""
     if len(objects) == 1:
         return objects[0]
-    solids, counts = [thing.solids for thing in objects], [len(thing.name) for thing in objects]
+    solids, counts = (
+        [detections.solids for detections in objects],
+        [len(detections.name) for detections in objects],
+    )
     first, first_point = np.cumsum([0, *counts]), np.cumsum([0, *(len(part.points) for part in solids)])
     starts = [part.point_start[:-1] + begin for part, begin in zip(solids, first_point[:-1], strict=True)]
-    heights = [thing.height for thing in objects if thing.height is not None]
+    heights = [detections.height for detections in objects if detections.height is not None]
     return Detections(
-        message=np.concatenate([thing.message for thing in objects]),
+        message=np.concatenate([detections.message for detections in objects]),
         name=np.repeat(np.arange(len(objects)), counts),
-        class_code=np.concatenate([thing.class_code for thing in objects]),
-        poses=concatenate_tables([thing.poses for thing in objects]),
+        class_code=np.concatenate([detections.class_code for detections in objects]),
+        poses=concatenate_tables([detections.poses for detections in objects]),
         solids=Solids(
             owner=np.concatenate([part.owner + begin for part, begin in zip(solids, first, strict=False)]),
             kind=np.concatenate([part.kind for part in solids]),
@@ -275,7 +278,7 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
             point_start=np.concatenate([*starts, first_point[-1:]]),
             points=np.concatenate([part.points for part in solids]),
         ),
-        uncertainty=np.concatenate([thing.uncertainty for thing in objects]),
+        uncertainty=np.concatenate([detections.uncertainty for detections in objects]),
         height=np.concatenate(heights) if heights else None,
     )
 

@@ -234,7 +234,9 @@ class Keyed:
         names = self.names(value)
         if names is not None:
             return elements[names.index(self.key)] if self.key in names else None  # type: ignore[index]
-        matching = [thing for thing in elements_of(elements) if _word(walk(self.path, thing)) == self.key]
+        matching = [
+            element for element in elements_of(elements) if _word(walk(self.path, element)) == self.key
+        ]
         return matching[-1] if matching else None
 
     def names(self, value: object) -> list[str] | None:

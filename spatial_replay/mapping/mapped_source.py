@@ -323,11 +323,11 @@ class _TreeLog:
 
 
 def _first_ns(
-    opened: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
+    open_reader: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
 ) -> int | None:
     """Return when the first message of some topics was logged, from a time on; None without any."""
     named = [topic for topic in topics if topic is not None]
-    messages = opened().iter_messages(named, log_ns) if named else ()
+    messages = open_reader().iter_messages(named, log_ns) if named else ()
     return next((message.log_time_ns for message in messages), None)
 
 

@@ -184,7 +184,9 @@ def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
     counts = set()
     for message in messages:
         try:
-            places = [walk(FieldPath.of(str(guess.position)), thing) for thing in _objects_in(guess, message)]
+            places = [
+                walk(FieldPath.of(str(guess.position)), element) for element in _objects_in(guess, message)
+            ]
         except FieldError:
             return False
         if not all(isinstance(place, dict) for place in places):
@@ -294,7 +296,7 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
     """Return whether a field has another value in each object of a message, or in each sender's messages."""
     try:
         texts = [
-            [str(walk(FieldPath.of(name), thing)) for thing in _objects_in(guess, message)]
+            [str(walk(FieldPath.of(name), element)) for element in _objects_in(guess, message)]
             for message in messages
         ]
     except FieldError:
@@ -307,9 +309,9 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
 def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None:
     """Return the path of the corners of objects whose size is 0."""
     with suppress(FieldError):
-        for thing in (thing for message in messages for thing in _objects_in(guess, message)):
-            if not any(walk(FieldPath.of(path), thing) for path in guess.size[:2]):
-                return _outline_in(dict(_iter_fields(thing)))[0]
+        for element in (element for message in messages for element in _objects_in(guess, message)):
+            if not any(walk(FieldPath.of(path), element) for path in guess.size[:2]):
+                return _outline_in(dict(_iter_fields(element)))[0]
     return None
 
 
@@ -318,7 +320,7 @@ def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -
     for message in messages:
         for path in paths:
             with suppress(FieldError):
-                yield from [walk(FieldPath.of(path), thing) for thing in _objects_in(guess, message)]
+                yield from [walk(FieldPath.of(path), element) for element in _objects_in(guess, message)]
 
 
 def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> bool:
@@ -329,9 +331,9 @@ def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> boo
     near = count = 0
     with suppress(FieldError, TypeError):
         for message in messages:
-            places = [_place_of(first, thing) for thing in _objects_in(first, message)]
-            for thing in _objects_in(second, message):
-                place = _place_of(second, thing)
+            places = [_place_of(first, element) for element in _objects_in(first, message)]
+            for element in _objects_in(second, message):
+                place = _place_of(second, element)
                 count += 1
                 near += any(hypot(x - place[0], y - place[1]) < _SAME_PLACE for x, y, *_ in places)
     return 2 * near > count
@@ -341,15 +343,15 @@ _SAME_PLACE = 0.2
 """Two objects in two lists are nearer only if they are one."""
 
 
-def _place_of(guess: Guess, thing: object) -> tuple[float, ...]:
+def _place_of(guess: Guess, element: object) -> tuple[float, ...]:
     """Return the position of an object, or the first number of its outline or bounds."""
     if isinstance(guess.position, tuple):
-        return tuple(float(walk(FieldPath.of(path), thing)) for path in guess.position)  # type: ignore[arg-type]
+        return tuple(float(walk(FieldPath.of(path), element)) for path in guess.position)  # type: ignore[arg-type]
     if guess.position is not None:
-        return _point(walk(FieldPath.of(guess.position), thing)) or (inf, inf)
+        return _point(walk(FieldPath.of(guess.position), element)) or (inf, inf)
     if guess.bounds is not None:
-        return _box_at(guess.bounds, thing) or (inf, inf)
-    return next(_corners_in(walk(FieldPath.of(str(guess.polygon)), thing)), (inf, inf))
+        return _box_at(guess.bounds, element) or (inf, inf)
+    return next(_corners_in(walk(FieldPath.of(str(guess.polygon)), element)), (inf, inf))
 
 
 def _objects_in(guess: Guess, message: object) -> Iterator[object]:
@@ -391,7 +393,7 @@ def _table_of_objects(value: object) -> list[object]:
     objects = [value[key] for key in keys]
     if not isinstance(value, dict):
         return objects
-    fields = {frozenset(field_names(thing)) for thing in objects}
+    fields = {frozenset(field_names(element)) for element in objects}
     is_table = len(objects) > 1 and len(fields) == 1 and _PARTS.isdisjoint(keys)
     return objects if is_table and not any(map(_is_no_place, keys)) else []
 
@@ -476,14 +478,14 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
     return None
 
 
-def _box_at(bounds: str | tuple[str, ...], thing: object) -> tuple[float, ...]:
+def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]:
     """Return the four numbers of the bounds of an object.
 
     Raises:
         FieldError: there are none.
     """
     numbers = [
-        walk(FieldPath.of(path), thing) for path in (bounds if isinstance(bounds, tuple) else [bounds])
+        walk(FieldPath.of(path), element) for path in (bounds if isinstance(bounds, tuple) else [bounds])
     ]
     return tuple(_numbers(numbers if len(numbers) == 4 else numbers[0], 4))
 
@@ -496,7 +498,7 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
     last = bounds.split(".")[-1]
     if "xywh" in last:
         return True
-    boxes = [_box_at(bounds, thing) for message in messages for thing in _objects_in(guess, message)]
+    boxes = [_box_at(bounds, element) for message in messages for element in _objects_in(guess, message)]
     return "xyxy" not in last and any(
         right < left or top < low for left, low, right, top in filter(None, boxes)
     )

@@ -88,19 +88,19 @@ def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     return counts // 2, np.column_stack([pairs, np.zeros(len(pairs))])
 
 
-def read_rows(get: Get, things: Sequence[object], width: int, style: Style) -> Floats:
-    """Return the numbers (N, width) of things, NaN for the null of JSON and for what a list lacks.
+def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) -> Floats:
+    """Return the numbers (N, width) of elements, NaN for the null of JSON and for what a list lacks.
 
     Args:
-        get: returns the numbers of one thing.
+        get: returns the numbers of one element.
     """
-    count = len(things)
+    count = len(elements)
     if style == "attributes":
         # faster than a list of tuples, but it does not take None
         with suppress(TypeError):
-            numbers = chain.from_iterable(map(get, things))
+            numbers = chain.from_iterable(map(get, elements))
             return np.fromiter(numbers, np.float64, count * width).reshape(count, width)
-    return np.array(list(map(get, things)), np.float64).reshape(count, width)
+    return np.array(list(map(get, elements)), np.float64).reshape(count, width)
 
 
 def features_in(message: object) -> dict[str, object]:

@@ -488,17 +488,17 @@ def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]
         return False
     namer = Namer(NameTemplate.of(layout.name), topic.name, Codes(), (), ())
     for message in examples:
-        things = [thing for _, thing in _iter_objects(layout, [message])]
+        elements = [element for _, element in _iter_objects(layout, [message])]
         with suppress(FieldError):
-            namer.codes(things, range(len(things)))
+            namer.codes(elements, range(len(elements)))
     return namer.is_by_place
 
 
 def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
     """Yield the frame of each object, where the layout looks for it."""
     alternatives = [FieldPath.of(path) for path in layout.frame]
-    for message, thing in _iter_objects(layout, examples):
-        roots = [(path, message if path.from_message else thing) for path in alternatives]
+    for message, element in _iter_objects(layout, examples):
+        roots = [(path, message if path.from_message else element) for path in alternatives]
         frame = next((walk(path, root) for path, root in roots if leads_somewhere(path, root)), None)
         if isinstance(frame, str) and frame:
             yield frame.removeprefix("/")
@@ -509,7 +509,9 @@ def _iter_objects(layout: MessageLayout, examples: Sequence[object]) -> Iterator
     path = FieldPath.of(layout.objects) if layout.objects else None
     for message in examples:
         try:
-            yield from ((message, thing) for thing in (iter_elements(path, message) if path else (message,)))
+            yield from (
+                (message, element) for element in (iter_elements(path, message) if path else (message,))
+            )
         except FieldError:
             continue
 
@@ -718,19 +720,21 @@ def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
         return "log", ""
     first, last = min(medians, key=medians.__getitem__), max(medians, key=medians.__getitem__)
     apart_s = medians[last] - medians[first]
-    said = f"stamps of {_comment(last)} are {apart_s:.3g} s later recorded than those of {_comment(first)}"
+    sentence = (
+        f"stamps of {_comment(last)} are {apart_s:.3g} s later recorded than those of {_comment(first)}"
+    )
     widest = max(
         ((float(np.ptp(lateness)), topic) for topic, lateness in late if lateness is not None),
         key=itemgetter(0),
     )
     if apart_s > _ONE_CLOCK_S:
-        return "log", f"{said}, so they are of two clocks"
+        return "log", f"{sentence}, so they are of two clocks"
     if without:
         return "log", f"{_comment(without[0])} has no stamps that advance with its messages"
     if max(apart_s, widest[0]) <= _EXACT_S:
         return "log", f"stamps and times of recording advance together, to {max(apart_s, widest[0]):.2g} s"
     if apart_s >= widest[0]:
-        return "header", said
+        return "header", sentence
     return "header", f"{_comment(widest[1])} is recorded with a delay that varies by {widest[0]:.3g} s"
 
 

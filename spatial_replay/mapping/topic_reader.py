@@ -227,7 +227,7 @@ class Extractor:
                 self._bind_time(example, message)
             self._fill(chunk, self._binding, messages, objects)
             paths = list(map(FieldPath.of, self.unseen))
-            if any(leads_somewhere(path, thing) for path in paths for thing in objects.values):
+            if any(leads_somewhere(path, element) for path in paths for element in objects.values):
                 self.unseen = ()
         if not is_early:
             # a message that fails is read again, alone
@@ -265,12 +265,12 @@ class Extractor:
         cornerless = 0
         if self.layout.solids:
             get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self.layout.solids]
-            solids = [solids_of(thing, get) for thing in objects.values]
+            solids = [solids_of(element, get) for element in objects.values]
             chunk.solids = list(filter(None, solids))
             chunk.skipped = len(solids) - len(chunk.solids)
             objects = objects.where(list(map(bool, solids)))
             if self.layout.stays:
-                chunk.locked = [bool(get(thing, "frame_locked")) for thing in objects.values]
+                chunk.locked = [bool(get(element, "frame_locked")) for element in objects.values]
         elif binding.polygon is not None:
             corners = list(map(binding.polygon, objects.values))
             if self.layout.is_bounds and not self.layout.bounds_have_size:
@@ -307,7 +307,7 @@ class Extractor:
         if binding.lifetime is not None:
             chunk.lifetimes = binding.lifetime.nanoseconds(values)
         elif self.layout.stays:
-            chunk.lifetimes = [ns_from_json(thing.get("lifetime")) for thing in values]
+            chunk.lifetimes = [ns_from_json(element.get("lifetime")) for element in values]
         chunk.message, chunk.name = objects.message, objects.name
         self.cornerless += cornerless
 
@@ -368,10 +368,10 @@ class Extractor:
                     names = list(stamps_ns)
                 else:
                     names = self.namer.codes([deletion], [0], [message])
-                gone = [name for name in names if stamps_ns.get(name, 0) <= stamp_ns]
-                for name in gone:
+                deleted_names = [name for name in names if stamps_ns.get(name, 0) <= stamp_ns]
+                for name in deleted_names:
                     stamps_ns.pop(name, None)
-                deleted += [(number, name) for name in gone]
+                deleted += [(number, name) for name in deleted_names]
             reported = slice(starts[number], starts[number + 1])
             stamps_ns.update(zip(entities.name[reported], stamps[reported], strict=True))
         return deleted, stamps_ns
@@ -423,11 +423,11 @@ class Extractor:
             chunk.noted_stamps = list(zip(places, chunk.stamps, strict=True))
 
 
-def _stamp_of_scene(thing: Any) -> int:
+def _stamp_of_scene(entity: Any) -> int:
     """Return the timestamp of an entity or a deletion; 0 for none."""
-    if isinstance(thing, dict):
-        return ns_from_json(thing.get("timestamp"))
-    stamp = thing.timestamp
+    if isinstance(entity, dict):
+        return ns_from_json(entity.get("timestamp"))
+    stamp = entity.timestamp
     # protobuf or ROS
     return int(
         stamp.seconds * 10**9 + stamp.nanos

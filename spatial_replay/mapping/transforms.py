@@ -458,8 +458,10 @@ class FrameTree:
         share = np.where(moves, (times_ns - start) / span, 0.0)
         first, second = series.poses[before], series.poses[after]
         translation = first[:, :3] + share[:, None] * (second[:, :3] - first[:, :3])
-        turned = slerp(first[:, 3:], second[:, 3:], share)
-        return _transforms(translation, np.where((share == 0.0)[:, None], first[:, 3:], turned), is_known)
+        quaternions = slerp(first[:, 3:], second[:, 3:], share)
+        return _transforms(
+            translation, np.where((share == 0.0)[:, None], first[:, 3:], quaternions), is_known
+        )
 
     def _series_of(self, frame: str, ask: _Question) -> tuple[_Series, Integers]:
         """Return the transforms of a child that a question is about, in order, and the times to look for.
@@ -610,9 +612,9 @@ class _Question(NamedTuple):
     run: int | None = None
     is_apart: bool = False
 
-    def part(self, chosen: Booleans) -> _Question:
-        log_ns = None if self.log_ns is None else self.log_ns[chosen]
-        return self._replace(places=self.places[chosen], times_ns=self.times_ns[chosen], log_ns=log_ns)
+    def part(self, selected: Booleans) -> _Question:
+        log_ns = None if self.log_ns is None else self.log_ns[selected]
+        return self._replace(places=self.places[selected], times_ns=self.times_ns[selected], log_ns=log_ns)
 
 
 def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
@@ -657,10 +659,10 @@ def _place(entry: _Entry) -> str:
     return f"({', '.join(f'{number:.4g}' for number in entry.pose[:3])})"
 
 
-def _transforms(translation: Floats, quaternions: Floats, known: NDArray[np.bool_]) -> Transforms:
+def _transforms(translation: Floats, quaternions: Floats, is_known: NDArray[np.bool_]) -> Transforms:
     rotation, _ = matrices_from_quaternions(np.ascontiguousarray(quaternions))
     finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
-    return Transforms(rotation, np.asarray(translation), known & finite)
+    return Transforms(rotation, np.asarray(translation), is_known & finite)
 
 
 _SECONDS = ("sec", "secs", "seconds")
@@ -710,7 +712,7 @@ class TransformReader:
         if self._list is None:
             has_list = "transforms" in field_names(message)
             path = FieldPath.of("transforms")
-            self._list = getter(path, message) if has_list else lambda one: (one,)
+            self._list = getter(path, message) if has_list else lambda message: (message,)
         return iter(self._list(message))
 
     def _values(self, transform: Any) -> Sequence[Any]:

@@ -127,7 +127,7 @@ def _value(node: yaml.Node, place: Place, document: Document) -> Value:
 
     document.lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
-        return [_value(item, (*place, index), document) for index, item in enumerate(node.value)]
+        return [_value(element, (*place, index), document) for index, element in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
         return _table(node, place, document)
     if not isinstance(node, yaml.ScalarNode) or node.style is not None:
