@@ -12,7 +12,7 @@ from urllib.parse import quote
 from spatial_replay.batch.curves import Curve, read_curves
 from spatial_replay.batch.overview import INDEX, overview_page
 from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
-from spatial_replay.batch.run import BatchResult, Wanted
+from spatial_replay.batch.run import BatchResult, RowRequest
 from spatial_replay.batch.run_table import worst_rows
 from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
@@ -94,28 +94,28 @@ def _link_pages(pages: Mapping[tuple[str, str], Path]) -> None:
                 stream.write(linked)
 
 
-def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:
-    """Return what is wanted of each log with a failing verdict, by case and log."""
+def _failing(result: BatchResult) -> dict[tuple[str, str], list[RowRequest]]:
+    """Return the requests of each log with a failing verdict, by case and log."""
     names = ("case", "log", "failure", "error")
     rows = zip(*(result.table.column(name).to_pylist() for name in names), strict=True)
-    wanted_by_log: dict[tuple[str, str], list[Wanted]] = {
+    requests_by_log: dict[tuple[str, str], list[RowRequest]] = {
         (case, log): [] for case, log, failure, error in rows if failure and not error
     }
-    for request in result.wanted:
-        if (request.case.name, request.log.name) in wanted_by_log:
-            wanted_by_log[request.case.name, request.log.name].append(request)
+    for request in result.requests:
+        if (request.case.name, request.log.name) in requests_by_log:
+            requests_by_log[request.case.name, request.log.name].append(request)
     # a result that is gone may have no log any more
-    return {key: requests for key, requests in wanted_by_log.items() if requests}
+    return {key: requests for key, requests in requests_by_log.items() if requests}
 
 
-def _task(wanted: list[Wanted]) -> Task:
-    first = wanted[0]
-    return Task(first.log.path, tuple(request.file.text for request in wanted), first.case.conditions)
+def _task(requests: list[RowRequest]) -> Task:
+    first = requests[0]
+    return Task(first.log.path, tuple(request.file.text for request in requests), first.case.conditions)
 
 
-def _file_name(log: str, wanted: list[Wanted]) -> str:
+def _file_name(log: str, requests: list[RowRequest]) -> str:
     """Return a name that says which log it is, and changes with what the page shows."""
-    digest = hashlib.sha256("".join(request.key or "" for request in wanted).encode()).hexdigest()[:12]
+    digest = hashlib.sha256("".join(request.key or "" for request in requests).encode()).hexdigest()[:12]
     return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
 
 

@@ -433,7 +433,7 @@ def _files(
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class RowRequest:
     """The rows that a case wants of one log and one specification file.
 
     Attributes:
@@ -454,14 +454,14 @@ class BatchResult:
         table: one row for each case, log, spec and object of a template; see `store`.
         logs: how many logs.
         evaluated: on how many of them something was evaluated in this run; the rest was known.
-        wanted: what the suite asks for.
+        requests: rows that the suite asks for.
         remarks: which stored files were damaged and replaced.
     """
 
     table: pa.Table
     logs: int
     evaluated: int
-    wanted: tuple[Wanted, ...]
+    requests: tuple[RowRequest, ...]
     remarks: tuple[str, ...] = ()
 
     @property
@@ -599,7 +599,7 @@ class _Groups:
             self._size = max(1, min(size, _GROWTH * len(seconds), _MOST_IN_GROUP))
 
 
-def _requests(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
+def _requests(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[RowRequest]:
     requests = []
     for prepared in cases:
         case = prepared.case
@@ -608,7 +608,7 @@ def _requests(cases: Sequence[PreparedCase], identities: Mapping[str, str | None
             identity = identities[log.path]
             for file in prepared.files:
                 key = _key(identity, conditions, file.hash)
-                requests.append(Wanted(case, log, file, None if identity is None else key))
+                requests.append(RowRequest(case, log, file, None if identity is None else key))
     return requests
 
 
@@ -638,11 +638,11 @@ def _key_of(conditions: Conditions) -> list[Any]:
     ]
 
 
-def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> dict[Task, tuple[str, ...]]:
+def _tasks(requests: Sequence[RowRequest], stored: set[str]) -> dict[Task, tuple[str, ...]]:
     """Return a task for each log and conditions that lack rows, with the keys of these."""
     groups: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
     keys = set(stored)
-    for request in wanted:
+    for request in requests:
         if request.key is not None and request.key not in keys:
             keys.add(request.key)
             groups[request.log.path, request.case.conditions][request.key] = request.file
@@ -653,7 +653,7 @@ def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> dict[Task, tuple[str, 
 
 
 def _table(
-    wanted: Sequence[Wanted],
+    requests: Sequence[RowRequest],
     stored: Sequence[pa.Table],
     unstored: Mapping[str, Sequence[ResultRow]],
     fail_on: frozenset[str],
@@ -663,47 +663,47 @@ def _table(
 
     unreadable = {
         f"{request.log.path}\0{request.file.hash}": _unreadable(request)
-        for request in wanted
+        for request in requests
         if request.key is None
     }
     rows = pa.concat_tables([*stored, table_of({**unstored, **unreadable})])
     places: dict[str, list[int]] = defaultdict(list)
     for place, key in enumerate(rows.column("key").to_pylist()):
         places[key].append(place)
-    indices, asked = [], []
-    for request in wanted:
+    indices, row_requests = [], []
+    for request in requests:
         for place in places[request.key or f"{request.log.path}\0{request.file.hash}"]:
             indices.append(place)
-            asked.append(request)
-    asked_rows = rows.take(pa.array(indices, pa.int64()))
-    return _judge_rows(_restore_file_names(asked_rows, asked), asked, fail_on)
+            row_requests.append(request)
+    request_rows = rows.take(pa.array(indices, pa.int64()))
+    return _judge_rows(_restore_file_names(request_rows, row_requests), row_requests, fail_on)
 
 
-def _record_of(wanted: Sequence[Wanted]) -> RunRecord:
+def _record_of(requests: Sequence[RowRequest]) -> RunRecord:
     cases: dict[str, dict[str, Any]] = {}
-    for request in wanted:
+    for request in requests:
         case, file = request.case, request.file
         if case.name not in cases:
             cases[case.name] = {"conditions": recorded_conditions(case.conditions), "files": {}}
         cases[case.name]["files"][file.name] = [file.text.text, file.text.filename]
-    return RunRecord(_folder_of(wanted), cases)
+    return RunRecord(_folder_of(requests), cases)
 
 
-def _folder_of(wanted: Sequence[Wanted]) -> str:
+def _folder_of(requests: Sequence[RowRequest]) -> str:
     """Return what the names of logs are relative to."""
-    for request in wanted:
+    for request in requests:
         log = request.log
         if not is_address(log.path) and log.path.endswith(log.name) and not Path(log.name).is_absolute():
             return str(Path(log.path.removesuffix(log.name)).absolute())
     return str(Path.cwd())
 
 
-def _restore_file_names(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
+def _restore_file_names(rows: pa.Table, requests: Sequence[RowRequest]) -> pa.Table:
     """Return rows whose texts name the file that was asked for, not another one that holds the same."""
     import pyarrow as pa
 
     sources = rows.column(SOURCE).to_pylist()
-    names = [encodable(log_file(request.log.path).name) for request in asked]
+    names = [encodable(log_file(request.log.path).name) for request in requests]
     renamed = [
         place for place, (old, new) in enumerate(zip(sources, names, strict=True)) if old not in (None, new)
     ]
@@ -725,42 +725,44 @@ def _rename_file(text: str | list[str] | None, old: str, new: str) -> str | list
     return text and [str(_rename_file(line, old, new)) for line in text]
 
 
-def _unreadable(wanted: Wanted) -> tuple[ResultRow, ...]:
+def _unreadable(request: RowRequest) -> tuple[ResultRow, ...]:
     """Return the rows of a log that cannot even be hashed."""
-    task = Task(wanted.log.path, (wanted.file.text,), wanted.case.conditions)
+    task = Task(request.log.path, (request.file.text,), request.case.conditions)
     (rows,) = rows_from_task(task)
     if all(row.error is None for row in rows):
         # it came back while it was looked at
-        message = f"{wanted.log.name} could not be read at first; run the batch again"
+        message = f"{request.log.name} could not be read at first; run the batch again"
         (rows,) = error_rows(task, message, "machine")
     return rows
 
 
-def _judge_rows(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) -> pa.Table:
+def _judge_rows(rows: pa.Table, requests: Sequence[RowRequest], fail_on: frozenset[str]) -> pa.Table:
     """Return the table of a run: rows with what was asked for, and with why they fail."""
     import pyarrow as pa
 
     names = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
     judged = rows.select(_JUDGED).to_pylist()
-    lines = {id(request.file): dict(request.file.lines) for request in asked}
-    meanings = {id(request.file): dict(request.file.meanings) for request in asked}
-    requirements = zip(columns["requirement"].to_pylist(), asked, strict=True)
+    lines = {id(request.file): dict(request.file.lines) for request in requests}
+    meanings = {id(request.file): dict(request.file.meanings) for request in requests}
+    requirements = zip(columns["requirement"].to_pylist(), requests, strict=True)
     columns |= {
         "verdict": [
             request.case.expectation.verdict_of(row["verdict"], _lower(row))
-            for row, request in zip(judged, asked, strict=True)
+            for row, request in zip(judged, requests, strict=True)
         ],
-        "case": [request.case.name for request in asked],
-        "log": [request.log.name for request in asked],
-        "file": [request.file.name for request in asked],
-        "meaning": [meanings[id(request.file)].get(name) for request, name in zip(asked, names, strict=True)],
-        "expected": [request.case.expectation.text for request in asked],
+        "case": [request.case.name for request in requests],
+        "log": [request.log.name for request in requests],
+        "file": [request.file.name for request in requests],
+        "meaning": [
+            meanings[id(request.file)].get(name) for request, name in zip(requests, names, strict=True)
+        ],
+        "expected": [request.case.expectation.text for request in requests],
         "failure": [
             _failure(row, request.case.expectation, fail_on)
-            for row, request in zip(judged, asked, strict=True)
+            for row, request in zip(judged, requests, strict=True)
         ],
-        "line": [lines[id(request.file)].get(name, 1) for request, name in zip(asked, names, strict=True)],
+        "line": [lines[id(request.file)].get(name, 1) for request, name in zip(requests, names, strict=True)],
         "requirement": [
             requirement or ", ".join(request.case.requirements) or None
             for requirement, request in requirements

@@ -178,8 +178,8 @@ def run_columns() -> pa.Schema:
     """Return the columns of the table of a run: those of rows, and what the run asked for."""
     pa = _pyarrow()
     text = pa.string()
-    asked = [(name, text) for name in ("case", "log", "file", "meaning", "expected", "failure")]
-    return _schema([*asked, *(column for column in columns() if column.name != SOURCE)])
+    run_columns = [(name, text) for name in ("case", "log", "file", "meaning", "expected", "failure")]
+    return _schema([*run_columns, *(column for column in columns() if column.name != SOURCE)])
 
 
 def _schema(columns: Sequence[Any]) -> pa.Schema:
@@ -343,7 +343,7 @@ class ResultsFolder:
         """
         return self._files.lock(_FORMAT_FILE)
 
-    def rows(self, wanted: set[str]) -> tuple[pa.Table, list[str]]:
+    def rows(self, lasting: set[str]) -> tuple[pa.Table, list[str]]:
         """Return the stored rows of keys, those of each together, and a remark on each damaged file.
 
         Damaged files are removed, and small ones are joined; call it inside `lock`.
@@ -365,7 +365,7 @@ class ResultsFolder:
             taken_keys |= new_keys
             if len(new_keys) < _MOST_TOGETHER:
                 small[name] = table.filter([key in new_keys for key in keys])
-            tables.append(table.filter([key in new_keys and key in wanted for key in keys]))
+            tables.append(table.filter([key in new_keys and key in lasting for key in keys]))
         if len(small) > _MOST_SMALL:
             self._join(small)
         return _pyarrow().concat_tables(tables), remarks

@@ -520,9 +520,9 @@ def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    requests = tuple(request for request in batch.wanted if request.log.name in logs)
+    requests = tuple(request for request in batch.requests if request.log.name in logs)
     is_about = pc.is_in(batch.table["log"], pa.array(sorted(logs), pa.string()))
-    return replace(batch, table=batch.table.filter(is_about), wanted=requests)
+    return replace(batch, table=batch.table.filter(is_about), requests=requests)
 
 
 def _rows_of(table: pa.Table, spec: _Spec) -> pa.Table:

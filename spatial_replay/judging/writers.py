@@ -40,7 +40,7 @@ def labelled_batch(judgement: Judgement) -> BatchResult:
     if judgement.failure_file:
         # a failure that does not happen is no failing result
         table = table.filter(pc.not_equal(table["file"], judgement.failure_file))
-    paths = {request.log.name: request.log.path for request in judgement.batch.wanted}
+    paths = {request.log.name: request.log.path for request in judgement.batch.requests}
     episodes = {row.log: row for row in judgement.rows}
     rows = [episodes[paths[log]] for log in table["log"].to_pylist()]
     table = table.append_column(LABEL, pa.array([_WORDS[row.label] for row in rows], pa.string()))
