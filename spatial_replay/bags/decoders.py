@@ -107,14 +107,14 @@ def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
     return None
 
 
-def same_definition(one: Topic, other: Topic) -> bool:
+def same_definition(first: Topic, second: Topic) -> bool:
     """Return whether one decoder serves two topics of the same type; texts may differ in comments."""
-    if one.schema == other.schema or one.encoding == "json":
+    if first.schema == second.schema or first.encoding == "json":
         return True
-    if one.encoding not in ("ros1", "cdr"):
+    if first.encoding not in ("ros1", "cdr"):
         return False
     try:
-        definitions = [ros_definitions(topic.type, topic.encoding, topic.schema) for topic in (one, other)]
+        definitions = [ros_definitions(topic.type, topic.encoding, topic.schema) for topic in (first, second)]
     except LogError:
         return False
     return definitions[0] == definitions[1]
@@ -229,22 +229,22 @@ def channel_of(topic: Topic, distribution: str | None = None) -> Channel:
     return Channel(topic.name, topic.encoding, schema, topic.metadata)
 
 
-def _join(one: Topic, other: Topic) -> Topic:
-    has_counts = None not in (one.count, other.count)
+def _join(first: Topic, second: Topic) -> Topic:
+    has_counts = None not in (first.count, second.count)
     joined = replace(
-        one,
-        count=(one.count or 0) + (other.count or 0) if has_counts else None,
-        latched=one.latched or other.latched,
-        schema=one.schema or other.schema,
+        first,
+        count=(first.count or 0) + (second.count or 0) if has_counts else None,
+        latched=first.latched or second.latched,
+        schema=first.schema or second.schema,
     )
     for what in ("type", "encoding"):
-        if getattr(one, what) != getattr(other, what):
-            both = f"{getattr(one, what)!r} and {getattr(other, what)!r}"
+        if getattr(first, what) != getattr(second, what):
+            both = f"{getattr(first, what)!r} and {getattr(second, what)!r}"
             return replace(
-                joined, unreadable=f"topic {one.name!r} has messages of more than one {what}: {both}"
+                joined, unreadable=f"topic {first.name!r} has messages of more than one {what}: {both}"
             )
-    if None not in (one.schema, other.schema) and not same_definition(one, other):
+    if None not in (first.schema, second.schema) and not same_definition(first, second):
         return replace(
-            joined, unreadable=f"topic {one.name!r} has messages of {one.type!r} in two definitions"
+            joined, unreadable=f"topic {first.name!r} has messages of {first.type!r} in two definitions"
         )
     return joined

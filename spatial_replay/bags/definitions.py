@@ -120,7 +120,7 @@ def checked_type_name(name: str) -> str:
     return name
 
 
-def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
+def _iter_fields(body: str, owner: str, type_names: set[str]) -> Iterator[Field]:
     for number, line in enumerate(body.splitlines(), 1):
         # an annotation may stand on the line of its field; no encoding of ROS depends on it so far
         bare = _ANNOTATIONS.sub("", line.partition("#")[0])
@@ -135,11 +135,11 @@ def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
             continue
         limit, longest = field_match["limit"] or "", int(field_match["longest"] or 0)
         kind: Kind = "scalar" if not field_match["brackets"] else "array" if limit.isdigit() else "sequence"
-        type_name = _resolve(field_match["type"], owner, known)
+        type_name = _resolve(field_match["type"], owner, type_names)
         yield Field(field_match["name"], type_name, kind, int(limit.removeprefix("<=") or 0), longest)
 
 
-def _resolve(name: str, owner: str, known: set[str]) -> str:
+def _resolve(name: str, owner: str, type_names: set[str]) -> str:
     if name in BASE_BYTES or name in _NOT_READ:
         return name
     if name in _BUILT_IN:
@@ -147,7 +147,7 @@ def _resolve(name: str, owner: str, known: set[str]) -> str:
     if "/" in name:
         return full_type_name(name)
     neighbour = f"{owner.rpartition('/')[0]}/{name}"
-    return "std_msgs/msg/Header" if name == "Header" and neighbour not in known else neighbour
+    return "std_msgs/msg/Header" if name == "Header" and neighbour not in type_names else neighbour
 
 
 def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: int) -> Definitions:

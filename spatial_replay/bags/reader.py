@@ -392,10 +392,10 @@ class MessageReader(ABC):
         self._gather_parts()
         return self._faults.take()
 
-    def move_faults(self, other: FaultList) -> None:
+    def move_faults(self, target: FaultList) -> None:
         """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
         self._gather_parts()
-        self._faults.move_to(other)
+        self._faults.move_to(target)
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what is wrong since the last call without a loss on the topics that were read."""

@@ -197,9 +197,9 @@ def _from_idl(text: str, type_name: str) -> Definitions:
     }
 
 
-def _without_enum(field: Field, known: Definitions, enums: Collection[str]) -> Field:
+def _without_enum(field: Field, definitions: Definitions, enums: Collection[str]) -> Field:
     """Return a field with an enum as the integer of four bytes that CDR writes for it."""
-    is_enum = field.type not in known and field.type.rpartition("/")[2] in enums
+    is_enum = field.type not in definitions and field.type.rpartition("/")[2] in enums
     return replace(field, type="uint32") if is_enum else field
 
 
@@ -240,23 +240,23 @@ def _standard(store: str) -> Definitions:
     return _fields(get_typestore(Stores(store)).fielddefs)
 
 
-def _fields(described: Typesdict) -> dict[str, tuple[Field, ...]]:
+def _fields(types: Typesdict) -> dict[str, tuple[Field, ...]]:
     """Return types from the form that rosbags describes them in."""
     return {
         full_type_name(name): tuple(_field(field, description) for field, description in fields)
-        for name, (_, fields) in described.items()
+        for name, (_, fields) in types.items()
     }
 
 
 def _field(name: str, description: FieldDesc) -> Field:
     kind = _KINDS.get(int(description[0]))
     # rosbags nests its tuples in a way that its types do not say
-    item: Any = description
+    base: Any = description
     size = 0
     if kind:
-        item, size = item[1]
-    what = item[1]
-    type_name, longest = (what, 0) if isinstance(what, str) else what
+        base, size = base[1]
+    type_text = base[1]
+    type_name, longest = (type_text, 0) if isinstance(type_text, str) else type_text
     return Field(name, type_name, kind or "scalar", size, longest)
 
 
@@ -272,14 +272,14 @@ def _describe(definitions: Definitions, store: Typestore) -> Typesdict:
 def _description(field: Field) -> FieldDesc:
     from rosbags.interfaces import Nodetype
 
-    item: BaseDesc | NameDesc
+    base: BaseDesc | NameDesc
     if field.type in BASE_BYTES:
-        item = (Nodetype.BASE, (field.type, field.longest))  # type: ignore[assignment]
+        base = (Nodetype.BASE, (field.type, field.longest))  # type: ignore[assignment]
     else:
-        item = (Nodetype.NAME, field.type)
+        base = (Nodetype.NAME, field.type)
     if field.kind == "scalar":
-        return item
-    return (Nodetype.ARRAY if field.kind == "array" else Nodetype.SEQUENCE, (item, field.size))
+        return base
+    return (Nodetype.ARRAY if field.kind == "array" else Nodetype.SEQUENCE, (base, field.size))
 
 
 def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | None = None) -> Schema:

@@ -106,19 +106,19 @@ def _plain(text: str) -> Any:
         raise LogError(f"it is no YAML ({' '.join(str(error).split()):.200})") from None
 
 
-def _metadata_topic(each: object) -> tuple[str, str, int]:
-    if not isinstance(each, dict) or not isinstance(each.get("topic_metadata"), dict):
+def _metadata_topic(entry: object) -> tuple[str, str, int]:
+    if not isinstance(entry, dict) or not isinstance(entry.get("topic_metadata"), dict):
         raise LogError("a topic in it has no 'topic_metadata'")
-    about = cast("dict[str, object]", each["topic_metadata"])
-    name, count = _text(about.get("name"), "name"), each.get("message_count")
+    topic_metadata = cast("dict[str, object]", entry["topic_metadata"])
+    name, count = _text(topic_metadata.get("name"), "name"), entry.get("message_count")
     if not isinstance(count, int) or not 0 <= count < _MOST:
         raise LogError(f"the message_count of topic {name!r:.100} is {count!r:.100}; give a number")
-    return name, _text(about.get("type"), "type"), count
+    return name, _text(topic_metadata.get("type"), "type"), count
 
 
-def _compression(about: dict[str, object]) -> Compression:
-    mode = str(about.get("compression_mode") or "none").lower()
-    form = str(about.get("compression_format") or "")
+def _compression(topic_metadata: dict[str, object]) -> Compression:
+    mode = str(topic_metadata.get("compression_mode") or "none").lower()
+    form = str(topic_metadata.get("compression_format") or "")
     if mode == "none":
         return ""
     if mode not in ("file", "message") or form != "zstd":

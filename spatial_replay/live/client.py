@@ -74,7 +74,7 @@ class Disconnected(NamedTuple):
     arrived_s: float
 
 
-Item: TypeAlias = Received | Connected | Offered | Disconnected | Warned
+Arrival: TypeAlias = Received | Connected | Offered | Disconnected | Warned
 
 
 class Inbox:
@@ -85,44 +85,44 @@ class Inbox:
     """
 
     def __init__(self) -> None:
-        self._items: deque[Item] = deque()
+        self._items: deque[Arrival] = deque()
         self._messages = self._bytes = 0
-        self._others: list[Item] = []
+        self._others: list[Arrival] = []
         self._offered: Offered | None = None
         self._warnings = 0
         self.dropped = 0
         self.filled = asyncio.Event()
 
-    def put(self, item: Item) -> None:
+    def put(self, arrival: Arrival) -> None:
         """Add what came; the oldest messages make room."""
-        if isinstance(item, Received):
+        if isinstance(arrival, Received):
             self._messages += 1
-            self._bytes += len(item.payload)
+            self._bytes += len(arrival.payload)
             while self._messages > 1 and (self._messages > MOST_WAITING or self._bytes > MOST_WAITING_BYTES):
                 self._drop()
-        if isinstance(item, Offered):
+        if isinstance(arrival, Offered):
             # channels are a view: what waits already says all that is offered now
-            if self._offered is not None and self._offered.channels is item.channels:
+            if self._offered is not None and self._offered.channels is arrival.channels:
                 return
-            self._offered = item
-        if isinstance(item, Warned):
+            self._offered = arrival
+        if isinstance(arrival, Warned):
             self._warnings += 1
             if self._warnings == MOST_WARNINGS:
-                item = Warned("the server sends too many warnings; further ones are left out")
+                arrival = Warned("the server sends too many warnings; further ones are left out")
             elif self._warnings > MOST_WARNINGS:
                 return
-        self._items.append(item)
+        self._items.append(arrival)
         self.filled.set()
 
-    def take(self) -> list[Item]:
+    def take(self) -> list[Arrival]:
         """Return all that waits."""
-        items = [*self._others, *self._items]
+        arrivals = [*self._others, *self._items]
         self._items.clear()
         self._others.clear()
         self._offered = None
         self._messages = self._bytes = 0
         self.filled.clear()
-        return items
+        return arrivals
 
     def _drop(self) -> None:
         while not isinstance(oldest := self._items.popleft(), Received):

@@ -498,25 +498,25 @@ class LiveSession:
         """Take in what has come, and evaluate the samples that are complete."""
         messages: list[Message] = []
         arrived_s = math.inf
-        for item in inbox.take():
-            if isinstance(item, Received):
-                topic = item.channel.topic
+        for arrival in inbox.take():
+            if isinstance(arrival, Received):
+                topic = arrival.channel.topic
                 if self._assembler is None:
                     # what comes while further topics are waited for is evaluated afterwards
-                    self._early.put(item)
+                    self._early.put(arrival)
                     continue
                 if topic not in self._planned:
                     continue
                 self._messages += 1
-                arrived_s = min(arrived_s, item.arrived_s)
-                self._note_return(topic, item.arrived_s)
-                messages.append(Message(topic, item.time_ns, item.time_ns, 0, item.payload))
+                arrived_s = min(arrived_s, arrival.arrived_s)
+                self._note_return(topic, arrival.arrived_s)
+                messages.append(Message(topic, arrival.time_ns, arrival.time_ns, 0, arrival.payload))
                 continue
             # what came before is evaluated first: afterwards it may be unknown
             async for update in self._evaluate(self._add(messages), arrived_s):
                 yield update
             messages, arrived_s = [], math.inf
-            match item:
+            match arrival:
                 case Connected(server):
                     if self._server is not None:
                         self._notes.append(f"connected again to {self._address}")
@@ -688,9 +688,9 @@ class LiveSession:
                 f" frequent one: `sample: {{topic: {sampled}}}` in the mapping takes the same"
             )
         self._early, early = Inbox(), self._early
-        for item in early.take():
+        for arrival in early.take():
             # it has waited for the beginning, not for evaluation that falls behind
-            inbox.put(item._replace(arrived_s=now_s) if isinstance(item, Received) else item)
+            inbox.put(arrival._replace(arrived_s=now_s) if isinstance(arrival, Received) else arrival)
 
     def _sampled_by_default(self) -> str | None:
         """Return the topic that is sampled, if a recording of the same topics may be sampled at another."""

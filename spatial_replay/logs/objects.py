@@ -217,24 +217,24 @@ def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tup
     """
     groups: list[_Group] = []
     left: list[Integers] = []
-    tried = served = 0
+    layouts_tried = served = 0
     lengths = np.fromiter(map(len, pieces.payloads), np.int64, len(pieces.payloads))
     values, counts = np.unique(lengths, return_counts=True)
     for length in values[np.argsort(-counts, kind="stable")].tolist():
         places = np.flatnonzero(lengths == length)
-        if (tried - FIRST_LAYOUTS) * worth > served:
+        if (layouts_tried - FIRST_LAYOUTS) * worth > served:
             left.append(places)
             continue
         rows = rows_of(select(pieces, places).payloads)
-        while len(places) and (tried - FIRST_LAYOUTS) * worth <= served:
-            tried += 1
-            group, same = _first_group(select(pieces, places[:1]), rows, faults)
+        while len(places) and (layouts_tried - FIRST_LAYOUTS) * worth <= served:
+            layouts_tried += 1
+            group, is_same_layout = _first_group(select(pieces, places[:1]), rows, faults)
             if group is not None:
-                groups.append(replace(group, samples=pieces.samples[places[same]]))
-            served += int(np.count_nonzero(same))
-            if not same.all():
-                rows = rows[~same]
-            places = places[~same]
+                groups.append(replace(group, samples=pieces.samples[places[is_same_layout]]))
+            served += int(np.count_nonzero(is_same_layout))
+            if not is_same_layout.all():
+                rows = rows[~is_same_layout]
+            places = places[~is_same_layout]
         left.append(places)
     rest = np.concatenate([np.empty(0, np.int64), *left])
     return groups, select(pieces, np.sort(rest))
@@ -252,10 +252,10 @@ def _first_group(
     except (WrongMessageError, LayoutError) as error:
         faults[int(first.samples[0])] = str(error)
         return None, alone
-    same = template.matches(rows) if len(template) == rows.shape[1] else ~alone
-    if same[0]:
-        matching_rows = rows if same.all() else rows[same]
-        return _Group(first.samples, layout, _pad(template.words(matching_rows))), same
+    is_same_layout = template.matches(rows) if len(template) == rows.shape[1] else ~alone
+    if is_same_layout[0]:
+        matching_rows = rows if is_same_layout.all() else rows[is_same_layout]
+        return _Group(first.samples, layout, _pad(template.words(matching_rows))), is_same_layout
     # another encoder's order of fields: the library's own bytes mean the same
     row = rows_of([message.SerializeToString(deterministic=True)])
     return _Group(first.samples, layout, _pad(template.words(row))), alone
@@ -289,14 +289,14 @@ def _fields(payload: bytes) -> list[bytes] | None:
 
 
 def _wrong_times(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str]:
-    stated = np.zeros(len(times_ns), np.int64)
+    stated_ns = np.zeros(len(times_ns), np.int64)
     has_time = np.zeros(len(times_ns), np.bool_)
     for group in groups:
         if group.layout.time != UNKNOWN:
-            stated[group.samples] = _whole(group, group.layout.time)
+            stated_ns[group.samples] = _whole(group, group.layout.time)
             has_time[group.samples] = True
-    wrong = np.flatnonzero(has_time & (stated != times_ns)).tolist()
-    faults = {index: f"time_ns is {stated[index]}, not the log time of the message" for index in wrong}
+    wrong = np.flatnonzero(has_time & (stated_ns != times_ns)).tolist()
+    faults = {index: f"time_ns is {stated_ns[index]}, not the log time of the message" for index in wrong}
     return faults | dict.fromkeys(np.flatnonzero(~has_time).tolist(), "the message has no time_ns")
 
 
@@ -385,8 +385,8 @@ def _report_times(groups: Sequence[_Group], times_ns: Integers) -> Integers | No
     columns = [np.empty(0, np.int64)]
     for group in groups:
         slots = group.layout.reported
-        stated = np.ascontiguousarray(group.numbers[:, slots]).view(np.int64)
-        columns.append(np.where(slots == UNKNOWN, times_ns[group.samples, None], stated).ravel())
+        stated_ns = np.ascontiguousarray(group.numbers[:, slots]).view(np.int64)
+        columns.append(np.where(slots == UNKNOWN, times_ns[group.samples, None], stated_ns).ravel())
     return np.concatenate(columns)
 
 

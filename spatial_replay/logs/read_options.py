@@ -98,14 +98,14 @@ class ReadOptions:
             if field.name != "concave" and getattr(self, field.name) != field.default
         }
 
-    def refuse_except(self, taken: frozenset[str], kind: str, log: str) -> None:
+    def refuse_except(self, accepted: frozenset[str], kind: str, log: str) -> None:
         """Refuse options that mean nothing to a format.
 
         Raises:
-            UsageError: an option was given that is not in `taken`.
+            UsageError: an option was given that is not in `accepted`.
         """
         for name, value in self.non_defaults().items():
-            if name not in taken:
+            if name not in accepted:
                 text = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
                 raise UsageError(
                     f"{_option(name, text)} does not apply to {log} ({kind}): {_REASONS[name]}; leave it out"
@@ -210,12 +210,12 @@ class FaultList:
         if self._count <= MOST_FAULTS:
             self._waiting.append(fault)
 
-    def move_to(self, other: FaultList) -> None:
+    def move_to(self, target: FaultList) -> None:
         """Move the faults not taken yet to another list, with the count of those beyond the limit."""
         for fault in self.take():
-            other.add(fault)
+            target.add(fault)
         beyond = max(0, self._count - MOST_FAULTS)
-        other._count += beyond - self._moved
+        target._count += beyond - self._moved
         self._moved = beyond
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:

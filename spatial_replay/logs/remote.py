@@ -464,13 +464,13 @@ class RemoteFile(PathLike[str]):
         self.fetch([(max(0, version.size - _TAIL_BYTES), version.size)])
         return version
 
-    def _range(self, wanted: Range) -> bytes:
+    def _range(self, requested: Range) -> bytes:
         """Read a range of the version that is known."""
         version_before = self._version
         # a weak tag never fits; then the answer's own tag is compared
         strong = {"if_match": version_before.tag} if version_before and version_before.is_exact else {}
-        version, _, data = self._part({"range": wanted, **strong})
-        if version != version_before or len(data) != wanted[1] - wanted[0]:
+        version, _, data = self._part({"range": requested, **strong})
+        if version != version_before or len(data) != requested[1] - requested[0]:
             raise self._replacement_error()
         return data
 
@@ -547,7 +547,7 @@ def open_store(scheme: str, bucket: str) -> Any:
     Raises:
         RemoteError: it cannot be one.
     """
-    settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(_SETTINGS)))
+    settings = tuple(sorted(setting for setting in os.environ.items() if setting[0].startswith(_SETTINGS)))
     return _store(scheme, bucket, settings)
 
 
@@ -568,35 +568,35 @@ def _store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> A
 _EMPTY_PART: Final = "cannot be read: // or a leading / in its key; copy it to a key without an empty part"
 
 
-def _refuse_empty_parts(shown: str, key: str) -> None:
+def _refuse_empty_parts(address: str, key: str) -> None:
     """Refuse a key that the library cannot read, or reads as another one.
 
     Raises:
         UsageError: the key has an empty part.
     """
     if key.startswith("/") or "//" in key:
-        raise UsageError(f"{shown} {_EMPTY_PART}")
+        raise UsageError(f"{address} {_EMPTY_PART}")
 
 
-def store_failure(shown: str, scheme: str, error: Exception, done: str = "read") -> SpatialReplayError:
+def store_failure(address: str, scheme: str, error: Exception, action: str = "read") -> SpatialReplayError:
     """Return the error for an address that cannot be read or written, with what helps."""
     exceptions = obstore_library().exceptions
     if isinstance(error, FileNotFoundError):
-        return MissingFileError(f"{shown}: there is no such file; check the address")
+        return MissingFileError(f"{address}: there is no such file; check the address")
     if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)):
-        return MissingFileError(f"{shown}: access denied; {_CREDENTIALS[scheme]}")
+        return MissingFileError(f"{address}: access denied; {_CREDENTIALS[scheme]}")
     text = str(error).partition("\n")[0].strip()
     if "empty path segment" in text:
         key = text.partition('"')[2].rpartition('"')[0]
-        return RemoteError(f"{shown}: the object {key!r} {_EMPTY_PART}, or name a folder without it")
+        return RemoteError(f"{address}: the object {key!r} {_EMPTY_PART}, or name a folder without it")
     if "404 " in text:
-        return MissingFileError(f"{shown}: there is no such bucket; check the address")
+        return MissingFileError(f"{address}: there is no such bucket; check the address")
     if "416 " in text:
-        return RemoteError(f"{shown} is empty; give a log with at least one sample")
+        return RemoteError(f"{address} is empty; give a log with at least one sample")
     reason = fspath(text).rpartition(" - ")[2].partition(": <")[0].rstrip(":")
     reason = _REASONS.get(reason.rpartition("HTTP error: ")[2], reason)
     remedy = "the address" if scheme in WEB_SCHEMES else f"the credentials: {_CREDENTIALS[scheme]}"
-    return RemoteError(f"{shown} cannot be {done}: {reason}; check the network and {remedy}")
+    return RemoteError(f"{address} cannot be {action}: {reason}; check the network and {remedy}")
 
 
 _LOG: Final = logging.getLogger("spatial_replay")
@@ -650,11 +650,11 @@ def download(file: RemoteFile, reason: str = "") -> Path:
     return download_files([file], str(file), reason) / _name(file)
 
 
-def download_files(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
-    """Return the folder that holds copies of remote files; see `downloaded`.
+def download_files(files: Sequence[RemoteFile], address: str, reason: str, below: str = "") -> Path:
+    """Return the folder that holds copies of remote files; see `download`.
 
     Args:
-        shown: the address of the folder, for messages.
+        address: of the folder, for messages.
         below: the name of the folder, if it matters.
     """
     versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
@@ -670,11 +670,11 @@ def download_files(files: Sequence[RemoteFile], shown: str, reason: str, below: 
         return folder / below
     if size > limit:
         raise LogError(
-            f"{shown} has {size / _GIGABYTE:.2f} GB, and downloads may have {limit / _GIGABYTE:g} GB;"
+            f"{address} has {size / _GIGABYTE:.2f} GB, and downloads may have {limit / _GIGABYTE:g} GB;"
             f" set {_LIMIT} to more gigabytes, or copy the log to this machine"
         )
     if reason:
-        _LOG.warning("%s: downloading %.1f MB once, to %s: %s", shown, size / 1e6, parent, reason)
+        _LOG.warning("%s: downloading %.1f MB once, to %s: %s", address, size / 1e6, parent, reason)
     show = _shows.get()
     try:
         parent.mkdir(parents=True, exist_ok=True)

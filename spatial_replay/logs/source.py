@@ -53,8 +53,8 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
         pause = pauses.remark("samples", self.max_gap_ns)
         remarks = [*([] if pause is None else [pause]), *reports.remarks()]
         if remarks:
-            said = tuple(Sentence(f"{self.name}: ", remark) for remark in remarks)
-            yield Block(Trace.empty(), remarks=said)
+            sentences = tuple(Sentence(f"{self.name}: ", remark) for remark in remarks)
+            yield Block(Trace.empty(), remarks=sentences)
 
     return wrapper
 

@@ -197,10 +197,10 @@ def protobuf_channel(topic: str, message: type[Message]) -> Channel:
     return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", data))
 
 
-def _with_dependencies(file: Any, found: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
+def _with_dependencies(file: Any, files: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
     """Return a file of message types and all that it imports, each behind its own imports."""
     for dependency in file.dependencies:
-        if dependency.name not in found:
-            _with_dependencies(dependency, found)
-    found[file.name] = file
-    return found.values()
+        if dependency.name not in files:
+            _with_dependencies(dependency, files)
+    files[file.name] = file
+    return files.values()

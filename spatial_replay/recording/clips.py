@@ -247,9 +247,9 @@ class _Open:
         self._last_ns: dict[int, int] = {}
         self._sample_ns = -1
 
-    def put(self, item: _Held) -> None:
-        self.waiting.append(item)
-        self.waiting_bytes += item.size
+    def put(self, entry: _Held) -> None:
+        self.waiting.append(entry)
+        self.waiting_bytes += entry.size
         self.last_s = time.monotonic()
 
     def write(self, most_bytes: float = _SLICE_BYTES) -> None:
@@ -259,16 +259,16 @@ class _Open:
         events: list[RunEvent] = []
         size = 0
         while self.waiting and size < most_bytes:
-            item = self.waiting.popleft()
-            size += item.size
-            self.first_ns = item.time_ns if self.first_ns is None else min(self.first_ns, item.time_ns)
-            if isinstance(item.content, Row):
-                messages.append(item.content._replace(log_time_ns=item.time_ns))
-            elif isinstance(item.content, RunEvent):
-                events.append(item.content)
-            elif item.time_ns > self._sample_ns:
-                samples.append(item.content)
-                self._sample_ns = item.time_ns
+            entry = self.waiting.popleft()
+            size += entry.size
+            self.first_ns = entry.time_ns if self.first_ns is None else min(self.first_ns, entry.time_ns)
+            if isinstance(entry.content, Row):
+                messages.append(entry.content._replace(log_time_ns=entry.time_ns))
+            elif isinstance(entry.content, RunEvent):
+                events.append(entry.content)
+            elif entry.time_ns > self._sample_ns:
+                samples.append(entry.content)
+                self._sample_ns = entry.time_ns
         self.waiting_bytes -= size
         if not (samples or messages or events):
             return
@@ -470,18 +470,18 @@ class ClipLog(RecorderLog):
                 self._static.append(held)
             yield held
 
-    def _hold(self, item: _Held) -> None:
-        kind: type = Sample if isinstance(item.content, Sample) else Row
-        (self._samples if kind is Sample else self._messages).append(item)
-        self.held_bytes += item.size
-        self._newest_ns = max(self._newest_ns, item.time_ns)
-        newest_ns = max(self._progress[kind][0], item.time_ns) if kind in self._progress else item.time_ns
+    def _hold(self, entry: _Held) -> None:
+        kind: type = Sample if isinstance(entry.content, Sample) else Row
+        (self._samples if kind is Sample else self._messages).append(entry)
+        self.held_bytes += entry.size
+        self._newest_ns = max(self._newest_ns, entry.time_ns)
+        newest_ns = max(self._progress[kind][0], entry.time_ns) if kind in self._progress else entry.time_ns
         self._progress[kind] = newest_ns, time.monotonic()
         self._evict()
         clip = self._open
-        if clip is not None and item.time_ns <= clip.until_ns:
+        if clip is not None and entry.time_ns <= clip.until_ns:
             clip.channels = self._channels
-            clip.put(item)
+            clip.put(entry)
 
     def _begin(self, reason: str, at_ns: int) -> None:
         """Open a clip around a time, or make the open one longer if it is not past, and has no hole then."""
@@ -507,8 +507,8 @@ class ClipLog(RecorderLog):
                 if held.time_ns < begin_ns:
                     clip.put(held._replace(time_ns=max(begin_ns, 0)))
             following = self._between(begin_ns, at_ns + self._after_ns)
-        for item in following:
-            clip.put(item)
+        for entry in following:
+            clip.put(entry)
         clip.until_ns = max(clip.until_ns, at_ns + self._after_ns)
 
     def _between(self, begin_ns: int, end_ns: int) -> list[_Held]:

@@ -162,8 +162,8 @@ class OwnMessages:
 class MessageCursor:
     """A position in a log's own messages, which moves forward."""
 
-    def __init__(self, own: OwnMessages, start_ns: int) -> None:
-        self._pieces = own.iter_from(start_ns)
+    def __init__(self, own_messages: OwnMessages, start_ns: int) -> None:
+        self._pieces = own_messages.iter_from(start_ns)
         self._waiting = Messages()
         self._taken = 0
         self._is_over = False
@@ -556,22 +556,22 @@ def _edit_file(file: Specification, values: Mapping[str, float | str]) -> Specif
     return parse_specification(file.source, filename=file.filename, profile=file.profile, constants=values)
 
 
-def _storable(edited: Specification, written: Specification, kept: Specification) -> Specification:
+def _storable(edited: Specification, written: Specification, stored: Specification) -> Specification:
     """Return an edited specification as a log stores it: its text says the new values.
 
     Messages refer to nodes by their place in the text. If a log stores a canonical text of the written one,
     that of the edited one is parsed to get the places.
 
     Args:
-        kept: the written specification as a log stores it.
+        stored: the written specification as a log stores it.
     """
-    if kept.source == written.source:
-        return replace(edited, filename=kept.filename)
+    if stored.source == written.source:
+        return replace(edited, filename=stored.filename)
     with suppress(SpecificationError):
         read_back = parse_specification(format_specification(edited), filename=edited.filename)
         if read_back == edited:
-            return replace(read_back, filename=kept.filename)
-    return replace(edited, filename=kept.filename)
+            return replace(read_back, filename=stored.filename)
+    return replace(edited, filename=stored.filename)
 
 
 _LOOK_BACK_NS: Final = 2_000_000_000

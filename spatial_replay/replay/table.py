@@ -163,10 +163,10 @@ def _result_title(result: _Result) -> str:
     return result[0] if result[1] is None else f"{result[0]}({result[1]})"
 
 
-def _claim_title(title: str, other: str, used_titles: set[str]) -> str:
+def _claim_title(title: str, fallback: str, used_titles: set[str]) -> str:
     """Return the first of a title and its alternatives that no column has, and take it."""
     choices = chain(
-        [title, f"{title} #{other.rpartition('#')[2]}", other], (f"{other} ({n})" for n in count(2))
+        [title, f"{title} #{fallback.rpartition('#')[2]}", fallback], (f"{fallback} ({n})" for n in count(2))
     )
     free_title = next(choice for choice in choices if choice not in used_titles)
     used_titles.add(free_title)

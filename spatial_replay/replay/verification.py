@@ -203,20 +203,20 @@ class FirstDifferences:
 
 
 def explain_differences(
-    recorded: Mapping[str, str], computed: Mapping[str, str], found: Mapping[str, Sentence]
+    recorded: Mapping[str, str], computed: Mapping[str, str], differences: Mapping[str, Sentence]
 ) -> list[Sentence]:
     """Return for each part of a certificate whether it is the same, and where it differs first.
 
     Args:
-        found: the first difference of each topic, in a clause; see `FirstDifferences`.
+        differences: the first difference of each topic, in a clause; see `FirstDifferences`.
     """
-    beside = {topic: what for topic, what in found.items() if topic not in DERIVED and topic != OBJECTS}
+    beside = {topic: what for topic, what in differences.items() if topic not in DERIVED and topic != OBJECTS}
     first = next((Sentence(f"on {topic}, ", what) for topic, what in sorted(beside.items())), None)
     parts = (
-        ("samples", found.get(OBJECTS)),
-        ("messages", first or found.get(OBJECTS)),
-        ("specification", found.get(SPECIFICATION)),
-        ("results", found.get(ROBUSTNESS)),
+        ("samples", differences.get(OBJECTS)),
+        ("messages", first or differences.get(OBJECTS)),
+        ("specification", differences.get(SPECIFICATION)),
+        ("results", differences.get(ROBUSTNESS)),
     )
     lines = []
     for name, where in parts:

@@ -98,7 +98,7 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
     measurements = [part for part in parts if isinstance(part, Measurement) and part.needs_orientation]
     compared = [term for measurement in measurements for term in measurement.terms]
     tracked = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared]
-    present_yaws = [thing.yaw for thing in tracked if thing is not None and thing.yaw is not None]
+    present_yaws = [present.yaw for present in tracked if present is not None and present.yaw is not None]
     yaws: list[float] = []
     for yaw in (*present_yaws, *(turn * math.pi / 2 + yaw for yaw in present_yaws[:1] for turn in (1, 2, 3))):
         if all(abs(math.remainder(yaw - before, math.tau)) > _SAME_YAW for before in yaws):

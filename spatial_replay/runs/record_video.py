@@ -106,14 +106,14 @@ def encode_video(time_ns: int, data: bytes, frame: str) -> bytes:
     return message.SerializeToString(deterministic=True)
 
 
-def encode_annotations(seen: View, sample: Sample, colours: Mapping[str, Colour]) -> bytes:
+def encode_annotations(view: View, sample: Sample, colours: Mapping[str, Colour]) -> bytes:
     """Return the outlines and names of the objects, and the outlines and numbers of all tags, in a view."""
     message = ImageAnnotations()
-    time_ns = seen.frame.time_ns
-    for detection in seen.detections:
+    time_ns = view.frame.time_ns
+    for detection in view.detections:
         _outline(message, time_ns, detection.corners, NEUTRAL, 1.0)
         _text(message, time_ns, str(detection.id), detection.corners.mean(axis=0), NEUTRAL, 0.7 * _LETTERS)
-    if seen.plane is None:
+    if view.plane is None:
         return message.SerializeToString(deterministic=True)
     for name, tracked_object in sample.objects.items():
         colour = colours.get(name, NEUTRAL)
@@ -123,7 +123,7 @@ def encode_annotations(seen: View, sample: Sample, colours: Mapping[str, Colour]
         for part in tracked_object.footprint.parts:
             ring = _ring(part.vertices, part.radius)
             places = np.concatenate([ring, np.full((len(ring), 1), z)], axis=1)
-            pixels = seen.plane.pixels(places)
+            pixels = view.plane.pixels(places)
             if not np.isfinite(pixels).all():
                 continue
             _outline(message, time_ns, pixels, colour, _THICKNESS)
@@ -340,15 +340,15 @@ def record_cameras(
             _Picture(number, camera, mode)
             for number, (camera, mode) in enumerate(zip(cameras, keep_modes, strict=True), 1)
         ]
-        for seen in chain([begun], (observer.observe(*frames) for frames in coming)):
-            samples, last_ns = samples + 1, seen.sample.time_ns
-            log.write(seen.sample)
-            updates: list[Update] = [monitor.update(seen.sample) for monitor in monitors]
-            coloured = asked_colours(requirements, seen.sample, updates)
-            for picture, view, camera_tags in zip(pictures, seen.views, of_cameras, strict=True):
+        for observation in chain([begun], (observer.observe(*frames) for frames in coming)):
+            samples, last_ns = samples + 1, observation.sample.time_ns
+            log.write(observation.sample)
+            updates: list[Update] = [monitor.update(observation.sample) for monitor in monitors]
+            coloured = asked_colours(requirements, observation.sample, updates)
+            for picture, view, camera_tags in zip(pictures, observation.views, of_cameras, strict=True):
                 if view is not None:
-                    picture.write(log, view, seen.sample, coloured, camera_tags.camera)
-            alone.count(seen)
+                    picture.write(log, view, observation.sample, coloured, camera_tags.camera)
+            alone.count(observation)
             for change in changes.after(updates):
                 show(change)
             advance(1)
@@ -369,13 +369,13 @@ class _Alone:
         self._samples = self._together = 0
         self._last_of = [-1] * len(names)
 
-    def count(self, seen: Observation) -> None:
+    def count(self, observation: Observation) -> None:
         """Take in a sample."""
         self._samples += 1
-        places_seen = [place for place, view in enumerate(seen.views) if view is not None]
+        places_seen = [place for place, view in enumerate(observation.views) if view is not None]
         self._together += len(places_seen) > 1
         for place in places_seen:
-            self._last[place], self._last_of[place] = self._samples, seen.sample.time_ns
+            self._last[place], self._last_of[place] = self._samples, observation.sample.time_ns
 
     def remarks(self, first_ns: int, last_ns: int) -> Iterator[str]:
         """Yield which cameras ended before the others, or that their times have nothing in common."""
@@ -399,12 +399,12 @@ class _Alone:
 class _Picture:
     """Messages of one camera in the log: picture, annotations, calibration, pose, as `/camera2/video`."""
 
-    def __init__(self, number: int, camera: FrameSource, kept: KeepVideo) -> None:
+    def __init__(self, number: int, camera: FrameSource, keep_mode: KeepVideo) -> None:
         self._frame = "camera" if number == 1 else f"camera{number}"
         self._video = protobuf_channel(topic_of_camera(CAMERA_VIDEO, number), CompressedVideo)
         self._annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
         self._calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
-        self._kept, self._copied = kept, camera.channel
+        self._kept, self._copied = keep_mode, camera.channel
         if self._copied is not None and self._copied.topic.startswith(OWN_PREFIX):
             self._kept = "none"
         self._encoder: H264Encoder | None = None

@@ -592,12 +592,12 @@ class PlaybackThinning:
             sent, payloads=[payloads.get(place, messages.payloads[place]) for place in places.tolist()]
         )
 
-    def _take(self, topic: str, wanted: int) -> int:
+    def _take(self, topic: str, count: int) -> int:
         """Return how many messages of a topic that is drawn may be sent, at least the last one."""
         left, at_s = self._left.get(topic, (float(_MOST_AT_ONCE), self._passed_s))
         left = min(left + MOST_DRAWN_A_SECOND * (self._passed_s - at_s), _MOST_AT_ONCE)
         most = max(1, math.floor(left))
-        self._left[topic] = left - min(wanted, most), self._passed_s
+        self._left[topic] = left - min(count, most), self._passed_s
         return most
 
 
@@ -607,12 +607,12 @@ def _is_drawn(channel: Channel) -> bool:
     return channel.topic in _DRAWN or (is_image_type(schema) and not schema.endswith("Video"))
 
 
-def _with_deletions(payloads: Sequence[bytes], own: Integers, kept: Booleans) -> dict[int, bytes]:
+def _with_deletions(payloads: Sequence[bytes], places: Integers, is_kept: Booleans) -> dict[int, bytes]:
     """Return scenes that are kept, each with what is deleted by those left out before it."""
     with_more = {}
     missed = SceneUpdate()
-    for place in own.tolist():
-        if not kept[place]:
+    for place in places.tolist():
+        if not is_kept[place]:
             missed.deletions.extend(SceneUpdate.FromString(payloads[place]).deletions)
         elif missed.deletions:
             # a viewer deletes before it draws

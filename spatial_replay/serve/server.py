@@ -464,8 +464,8 @@ class LiveServer(PublishingServer, protocol.ServerListener):
         response: Mapping[str, Any],
         answer: Callable[[LiveServer, Mapping[str, Any]], Mapping[str, Any]],
     ) -> Service:
-        def handle(given: ServiceRequest) -> bytes:
-            answered = answer(self, _request(name, given.payload, request))
+        def handle(call: ServiceRequest) -> bytes:
+            answered = answer(self, _request(name, call.payload, request))
             return json.dumps(answered, ensure_ascii=False, allow_nan=False).encode()
 
         return _json_service(name, request, response, handle)
@@ -603,7 +603,7 @@ def _json_service(
     handle: Callable[[ServiceRequest], bytes],
 ) -> Service:
     """Return a service whose request and response are JSON, by their schemas."""
-    asked, answered = (
+    request_schema, response_schema = (
         foxglove.MessageSchema(
             encoding="json",
             schema=foxglove.Schema(
@@ -613,14 +613,16 @@ def _json_service(
         for schema in (request, response)
     )
 
-    def respond(given: ServiceRequest) -> bytes:
+    def respond(call: ServiceRequest) -> bytes:
         try:
-            return handle(given)
+            return handle(call)
         except SpatialReplayError as error:
             raise _FailureError(str(error)) from None
 
     return Service(
-        name, schema=foxglove.ServiceSchema(name, request=asked, response=answered), handler=respond
+        name,
+        schema=foxglove.ServiceSchema(name, request=request_schema, response=response_schema),
+        handler=respond,
     )
 
 

@@ -314,7 +314,7 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
 
 
 def downloaded_bag(metadata: RemoteFile) -> Path:
-    """Return the folder with a copy of the ROS 2 bag at an address; see `downloaded`."""
+    """Return the folder with a copy of the ROS 2 bag at an address; see `download`."""
     address = str(metadata).removesuffix(BAG_METADATA)
     name = address.rstrip("/").rpartition("/")[2].strip(".") or "bag"
     reason = "the files of a ROS 2 bag are read together"

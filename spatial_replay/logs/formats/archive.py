@@ -72,13 +72,13 @@ class Group:
 
     def group(self, path: str) -> Group | None:
         """Return the group at a path; None if there is none."""
-        item = self._item(path)
-        return Group(item, self._top) if hasattr(item, "keys") else None
+        node = self._node(path)
+        return Group(node, self._top) if hasattr(node, "keys") else None
 
     def array(self, path: str) -> Any | None:
         """Return the array with a shape at a path, without its numbers; None if there is none."""
-        item = self._item(path)
-        return item if getattr(item, "shape", None) else None
+        node = self._node(path)
+        return node if getattr(node, "shape", None) else None
 
     def episode(self, path: str, place: str) -> Group:
         """Return the group of an episode, which soft links do not leave.
@@ -86,10 +86,10 @@ class Group:
         Raises:
             LogError: there is none.
         """
-        item = self._item(path)
-        if not hasattr(item, "keys"):
+        node = self._node(path)
+        if not hasattr(node, "keys"):
             raise LogError(f"{place}: {path.strip('/')} holds no episode")
-        return Group(item)
+        return Group(node)
 
     def arrays(self) -> Iterator[tuple[str, Any]]:
         """Yield the arrays below the group with their paths; links that are not followed are left out."""
@@ -100,21 +100,21 @@ class Group:
         def arrays(group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
             for name in Group(group).names:
                 try:
-                    item = Group(group, self._top)._item(name)
+                    node = Group(group, self._top)._node(name)
                 except LogError:
                     continue
-                if isinstance(item, h5py.Dataset):
-                    yield f"{prefix}{name}", item
-                elif isinstance(item, h5py.Group) and depth < _DEEPEST:
+                if isinstance(node, h5py.Dataset):
+                    yield f"{prefix}{name}", node
+                elif isinstance(node, h5py.Group) and depth < _DEEPEST:
                     # hard links may make circles
-                    address = h5py.h5o.get_info(item.id).addr
+                    address = h5py.h5o.get_info(node.id).addr
                     if address not in visited:
                         visited.add(address)
-                        yield from arrays(item, f"{prefix}{name}/", depth + 1)
+                        yield from arrays(node, f"{prefix}{name}/", depth + 1)
 
         return arrays(self._group, "", 0)
 
-    def _item(self, path: str, depth: int = 0) -> Any | None:
+    def _node(self, path: str, depth: int = 0) -> Any | None:
         import h5py
 
         group = self._group
@@ -134,7 +134,7 @@ class Group:
             absolute = target if target.startswith("/") else f"{group.name.rstrip('/')}/{target}"
             if home == "/" or not absolute.startswith(home):
                 raise LogError(f"{place} is a link out of {self._top.name}, which is not followed; {_COPY}")
-            group = Group(self._top)._item(absolute.removeprefix(home), depth + 1)
+            group = Group(self._top)._node(absolute.removeprefix(home), depth + 1)
         return group
 
     def attribute(self, name: str) -> Any | None:

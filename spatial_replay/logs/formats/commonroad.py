@@ -101,9 +101,9 @@ def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
 class _Collector:
     """Builds elements from the events of a parser."""
 
-    def __init__(self, name: str, wanted: frozenset[str]) -> None:
+    def __init__(self, name: str, element_names: frozenset[str]) -> None:
         self.name = name
-        self._wanted = wanted
+        self._wanted = element_names
         self._open: list[Element] = []
         self._depth = self._inside = 0
         self._finished: list[Element] = []
@@ -502,23 +502,25 @@ def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
     """Return a state from position and orientation, each exact or somewhere in a region or interval."""
     position = _required_child(element, "position")
     point = position.child("point")
-    away = 0.0
+    place_uncertainty = 0.0
     if point is not None:
         x, y = _point(point)
     elif position.child("lanelet") is not None:
         # somewhere on a lane; roads are not read
         return UNKNOWN
     else:
-        x, y, away = _around(_parts_of(position))
+        x, y, place_uncertainty = _around(_parts_of(position))
     low, high = _angle(element, "orientation", (-pi, pi))
     hitch_low, hitch_high = _angle(element, "hitchAngle", (0.0, 0.0))
     hitch_angle = (hitch_low + hitch_high) / 2
     trailers = [part for part in outline if part.hitch_x is not None]
-    turned = _turned_away([part.turn(hitch_angle) for part in outline], high - low)
-    turned += _turned_away([trailer.vertices for trailer in trailers], hitch_high - hitch_low)
-    if not all(map(isfinite, (x, y, low, high, away, hitch_angle))):
+    turn_uncertainty = _turned_away([part.turn(hitch_angle) for part in outline], high - low)
+    turn_uncertainty += _turned_away([trailer.vertices for trailer in trailers], hitch_high - hitch_low)
+    if not all(map(isfinite, (x, y, low, high, place_uncertainty, hitch_angle))):
         return UNKNOWN
-    return ObstacleState(x, y, (low + high) / 2, hitch_angle, low == high, uncertainty=away + turned)
+    return ObstacleState(
+        x, y, (low + high) / 2, hitch_angle, low == high, uncertainty=place_uncertainty + turn_uncertainty
+    )
 
 
 def _turned_away(outlines: Sequence[Points], angle: float) -> float:

@@ -304,9 +304,9 @@ def _list(value: Any, what: str) -> list[Any]:
     return value
 
 
-def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
-    if not entry.keys() <= known:
-        unknown, allowed = ", ".join(map(repr, sorted(entry.keys() - known))), ", ".join(sorted(known))
+def _check_keys(entry: dict[str, Any], keys: set[str], what: str) -> None:
+    if not entry.keys() <= keys:
+        unknown, allowed = ", ".join(map(repr, sorted(entry.keys() - keys))), ", ".join(sorted(keys))
         raise _NoSampleError(f"{what} has the unknown key {cut(unknown, 60)}; known are {allowed}")
 
 
