@@ -187,6 +187,7 @@ def _walk(content: NDArray[np.uint8], table: NDArray[np.int64]) -> tuple[int, in
 
 
 _STRIDE = 2**20
+# the field op of a chunk's head, with its length: http://wiki.ros.org/Bags/Format/2.0
 _CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
 _BEFORE_MARK = (4, 17, 23, 24, 36, 37)
 """Where a chunk's head may begin before its opcode: its length, then its other fields in any order."""

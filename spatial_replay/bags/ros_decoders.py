@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 RosEncoding = Literal["ros1", "cdr"]
 
 _DISTRIBUTIONS = ("jazzy", "kilted", "lyrical", "iron", "humble", "galactic", "foxy", "eloquent", "dashing")
+# representations of plain CDR, little and big endian, of the OMG's DDSI-RTPS (section 10); messages with
+# parameter lists or of XCDR 2 have other numbers, and another layout
 _PLAIN = (b"\x00\x01", b"\x00\x00")
 _MOST_AROUND = 7
 """Bytes of a message that hold no field: four before them, and up to three that fill it up."""

@@ -261,6 +261,7 @@ _MOST_TOPICS = 100_000
 _STEPS = 10_000
 """Steps of SQLite's virtual machine between two looks at how many it has taken."""
 _STEPS_A_BYTE = 20
+"""Steps that a sound file may take for each of its bytes; a damaged one may lead in circles."""
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
 _MOST_PROBES = 10_000
@@ -268,6 +269,7 @@ _MOST_PROBES = 10_000
 
 Row = tuple[int, int, Any, Any]
 """Id, topic, time and content of a message."""
+# SQLite stores any type in any column, so a damaged row may hold a text where an id belongs
 _TYPES = (int, int, int, bytes)
 RowHead = tuple[int, int, int]
 """Id, topic and time of a message."""

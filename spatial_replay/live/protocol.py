@@ -26,6 +26,7 @@ _SCHEMA_ENCODINGS: Final = {
 """The encoding of schemas where a server does not name it."""
 
 _BINARY_SCHEMAS: Final = frozenset({"protobuf", "flatbuffer"})
+# a binary frame with a message: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 _MESSAGE: Final = 1
 _HEAD: Final = struct.Struct("<IQ")
 _LONGEST_TEXT: Final = 200

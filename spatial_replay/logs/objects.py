@@ -144,7 +144,9 @@ def layout_of(message: ObjectStates) -> SlotLayout:
 SAMPLES_PER_LAYOUT = 32
 """Setting up a layout costs about as much as reading this many messages piece by piece."""
 FIRST_LAYOUTS = 16
+"""Layouts that are set up before it counts how few messages each serves."""
 
+# the number of a field times 8, and how it is encoded: https://protobuf.dev/programming-guides/encoding
 _TIME_TAG, _OBJECT_TAG, _SIGNAL_TAG = 0x09, 0x12, 0x1A
 
 

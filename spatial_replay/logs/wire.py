@@ -23,6 +23,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers, combined_
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.uint64]
 
+# fields of one width for every number, so that a message keeps its length with other numbers in them
 _WIDE = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64)
 _NARROW = FieldDescriptor.TYPE_ENUM
 

@@ -32,6 +32,7 @@ def uninterrupted() -> Iterator[None]:
     arrived: list[int] = []
     for number, handler in handlers.items():
         if callable(handler):
+            # an exception in the handler would leave a record half written
             signal.signal(number, lambda number, frame: arrived.append(number))
     try:
         yield

@@ -140,6 +140,7 @@ class MessageQueue:
                 row = self._queue.get_nowait()
                 rows.append(row)
                 size += len(row.payload)
+        # only this thread counts what leaves, and others, under the lock, what comes: it needs no lock
         self._bytes_out += size
         return Messages.from_rows(self._declared, rows)
 

@@ -99,6 +99,7 @@ _PATIENCE_S: Final = 10.0
 _MOST_TEXT: Final = 1 << 20
 """Bytes of a request that is read before it is passed on."""
 
+# bits and opcodes in the first byte of a frame: RFC 6455, section 5.2
 _FINAL: Final = 0x80
 _TEXT: Final = 1
 _BINARY: Final = 2

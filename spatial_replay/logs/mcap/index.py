@@ -127,10 +127,13 @@ _SIZE_BYTES = 8
 _MESSAGE_INDEX = struct.Struct("<H8x")
 """Only the channel matters here."""
 _LOOSE_BYTES = 2**22
+"""Messages outside of chunks are read together up to here: one by one, each would be a seek."""
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
+"""Bytes that a search for the next chunk reads at a time."""
 _MOST_GAPS = 1_000
 """Damaged stretches after which the rest of a file is not searched."""
+# a chunk has no mark of its own: a search looks for the name of its compression, behind its length
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _BEFORE_COMPRESSION = RECORD_HEAD.size + 28
 

@@ -77,6 +77,7 @@ _AHEAD_BYTES: Final = 2**24
 BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
+"""Later than every time of MCAP, whose times are unsigned integers of 64 bits."""
 _LEAST_BOUND: Final = 2**20
 """Bytes that a chunk may hold whatever the index says: some writers leave the size out."""
 _LONGEST_HEAD: Final = 80

@@ -63,8 +63,10 @@ _HEAD: Final = np.dtype(
     ]
 )
 _HEAD_BYTES: Final = _HEAD.itemsize
+# records MessageIndex and Chunk, field by field: https://mcap.dev/spec
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 _INDEX_ENTRY: Final = 16
+"""Bytes of an entry: log time and place in the chunk, of eight bytes each."""
 _ZSTD: Final = "zstd"
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
 
