@@ -492,10 +492,11 @@ def _deciding_boxes(
                 letters[places[place], side] = len(missing_words(name.name))
             blocked[places, side] = boxes_of[places, side]
     ends = found.points[messages]
-    blocked[:, 2] = np.stack([ends.min(axis=1), ends.max(axis=1)], axis=1)
+    # reductions over two ends are slow
+    blocked[:, 2, 0] = np.minimum(ends[:, 0], ends[:, 1])
+    blocked[:, 2, 1] = np.maximum(ends[:, 0], ends[:, 1])
     # an object that is gone has its name at the arrow
-    at_end = np.stack([ends, ends], axis=2)
-    boxes_of = np.where(np.isnan(boxes_of), at_end, boxes_of)
+    boxes_of = np.where(np.isnan(boxes_of), ends[:, :, None], boxes_of)
     return _DecidingBoxes(boxes_of[:, :, 0], boxes_of[:, :, 1], letters, blocked)
 
 
