@@ -520,7 +520,8 @@ def _layout(
         plots, tab_panels = _tabs("Tab!curves", [(_tab_title(plot), plot) for plot in curves])
         panels += [*tab_panels, states]
         # curves have at least 140 pixels on a screen of 1280 × 720
-        right += [(plots, 4.5), (states.identifier, 2.0)]
+        # a strip has about 50 pixels
+        right += [(plots, 4.5), (states.identifier, min(len(states.config["paths"]), 2) + 1.0)]
     if details:
         tabs, tab_panels = _tabs("Tab!details", details)
         panels += tab_panels
