@@ -16,7 +16,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.html import Html, element
-from spatial_replay.report.panels import signed, unpack_array
+from spatial_replay.report.panels import unpack_array, with_signs
 from spatial_replay.text import number_text, with_unit
 
 MOST_CURVES: Final = 60
@@ -107,7 +107,7 @@ def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
         element("text", f"{number_text(end)} s", x=f"{_WIDTH:.0f}", y=bottom, **{"text-anchor": "end"}),
     ]
     if low < 0.0:
-        parts.append(element("text", signed(with_unit(low, unit)), x="0", y=f"{_HEIGHT - 3:.0f}"))
+        parts.append(element("text", with_signs(with_unit(low, unit)), x="0", y=f"{_HEIGHT - 3:.0f}"))
     view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
     return element(
         "svg", *parts, viewBox=view, role="group", **{"aria-label": "Robustness over time", "class": "curves"}

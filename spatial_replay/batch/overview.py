@@ -31,7 +31,7 @@ from spatial_replay.batch.run_table import (
 )
 from spatial_replay.html import Html, element
 from spatial_replay.report.page import asset, html_page, text
-from spatial_replay.report.panels import sentence_parts, signed
+from spatial_replay.report.panels import sentence_parts, with_signs
 from spatial_replay.text import first_lines, plural, with_unit
 from spatial_replay.version import __version__
 
@@ -195,13 +195,13 @@ def _histogram(numbers: Floats, unit: str) -> Html:
         side = "bad" if number < below else "good"
         place = {"x": number * step + 0.5, "y": _HEIGHT - height, "width": step - 1.0, "height": height}
         # what is read is the text beside the drawing, so the tip of a bar says its count
-        tip = element("title", signed(f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}"))
+        tip = element("title", with_signs(f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}"))
         attributes = {name: f"{value:.2f}" for name, value in place.items()}
         bars.append(element("rect", tip, **attributes, **{"class": side}))
     zero = f"{below * step:.2f}"
     axis = element("line", x1=zero, x2=zero, y1="0", y2=f"{_HEIGHT + 3:.0f}")
     labels = [
-        element("text", signed(with_unit(low, unit)), x="0", y=f"{_HEIGHT + 12:.0f}"),
+        element("text", with_signs(with_unit(low, unit)), x="0", y=f"{_HEIGHT + 12:.0f}"),
         element(
             "text",
             with_unit(high, unit),
@@ -210,7 +210,7 @@ def _histogram(numbers: Floats, unit: str) -> Html:
             **{"text-anchor": "end"},
         ),
     ]
-    name = signed(f"Distribution of robustness from {low:.4g} to {high:.4g}")
+    name = with_signs(f"Distribution of robustness from {low:.4g} to {high:.4g}")
     view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
     return element("svg", *bars, axis, *labels, viewBox=view, role="img", **{"aria-label": name})
 
@@ -307,7 +307,7 @@ def _cell(row: Values | None) -> Html:
         ]
     )
     words = f"{words}{damage_word(row)}{before}"
-    return element("td", signed(words), title=signed(tip), **{"class": kind, "data-value": value})
+    return element("td", with_signs(words), title=with_signs(tip), **{"class": kind, "data-value": value})
 
 
 def _sortable(title: str, kind: str, about: str = "") -> Html:
@@ -321,7 +321,7 @@ def _tip(about: str) -> dict[str, str]:
 
 
 def _number(tag: str, words: str) -> Html:
-    return element(tag, signed(words), **{"class": "number"})
+    return element(tag, with_signs(words), **{"class": "number"})
 
 
 def _log_link(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:

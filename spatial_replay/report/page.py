@@ -21,7 +21,7 @@ from spatial_replay.monitor.sentences import settled_time
 from spatial_replay.monitor.verdict import Verdict, counts_text
 from spatial_replay.palette import SIGNS
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
-from spatial_replay.report.panels import final_text, json_text, sentence_parts, signed
+from spatial_replay.report.panels import final_text, json_text, sentence_parts, with_signs
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import declared_unit, units_of, units_text
 from spatial_replay.text import CALENDAR_NS, Instant, Sentence, plural, printable, time_text
@@ -202,7 +202,7 @@ def _summary(reported: ReportedResult, first_ns: int) -> Html:
         chip(result.verdict, is_sound=_is_sound(result)),
         *marks,
         *_requirement(result.spec.id, result.title, result.spec.title),
-        element("span", text(signed(", ".join(numbers))), **{"class": "numbers"}),
+        element("span", text(with_signs(", ".join(numbers))), **{"class": "numbers"}),
         **{"class": "summary"},
     )
 
@@ -244,7 +244,7 @@ def _specs(reported: ReportedResult, first_ns: int) -> Html:
         numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
         if settled_ns is not None:
             numbers += f", violated since {Instant(settled_ns, first_ns)}"
-        line = element("span", text(signed(numbers)), **{"class": "numbers"})
+        line = element("span", text(with_signs(numbers)), **{"class": "numbers"})
         rows.append(
             element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
         )

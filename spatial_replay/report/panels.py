@@ -157,7 +157,7 @@ def sentence_parts(sentence: str) -> list[str]:
     sign.
     """
     parts = _CODE.split(sentence)
-    parts[::2] = map(signed, parts[::2])
+    parts[::2] = map(with_signs, parts[::2])
     return parts
 
 
@@ -165,7 +165,7 @@ _MINUS: Final = re.compile(r"(?<![\w.\]-])-(?=\.?\d|inf\b)")
 _INFINITE: Final = re.compile(r"(?<![\w.-])[+]?inf(?![\w-])")
 
 
-def signed(words: str) -> str:
+def with_signs(words: str) -> str:
     """Return a text whose numbers are written as on pages: "−0.05", "−∞"; names such as run-1 stay."""
     return _INFINITE.sub("∞", _MINUS.sub("\N{MINUS SIGN}", words))
 
