@@ -299,10 +299,12 @@ class Lookout:
             clear_ways = self._clear_ways(sample, name, _ways_aside(start, timing.step))
             # another motion has to begin first
             afresh = timing._replace(rest=timing.approach)
-            ways = [_places(way, afresh, 1.0, numbers, skill) for way in clear_ways]
-            for way, prospect in zip(clear_ways, self._prospects(*about, ways), strict=True):
+            ways = [_places(clear_way, afresh, 1.0, numbers, skill) for clear_way in clear_ways]
+            for aside_way, prospect in zip(clear_ways, self._prospects(*about, ways), strict=True):
                 if prospect > best:
-                    aside = Target(name, *way[-1], 0.0, tracked.yaw, tuple(way), target.robustness)
+                    aside = Target(
+                        name, *aside_way[-1], 0.0, tracked.yaw, tuple(aside_way), target.robustness
+                    )
                     best = prospect
         return Evasion(aside, f"{' and '.join(sorted(others))} may come too near") if best > going else None
 
@@ -478,7 +480,7 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequenc
     now = Trace.from_samples([sample])
     count = max(len(course.places) for course in courses.values())
     footprints, rows = now.footprints, np.repeat(now.rows, count, axis=0)
-    columns = {"yaw": [now.yaw], "uncertainty": [now.uncertainty], "class_code": [now.class_code]}
+    yaws, uncertainties, class_codes = [now.yaw], [now.uncertainty], [now.class_code]
     for name, course in courses.items():
         tracked, column, length = sample.objects[name], now.names.index(name), len(course.places)
         rows[:, column] = len(footprints) + np.arange(count) % length
@@ -490,20 +492,19 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequenc
             footprints = with_poses(footprints, tracked, course.places, np.zeros(1))
         row = now.rows[0, column]
         uncertainty = np.zeros(length) if course.uncertainty is None else course.uncertainty
-        for key, values in (
-            ("yaw", now.yaw[row] + turns),
-            ("uncertainty", uncertainty),
-            ("class_code", np.full(length, now.class_code[row])),
-        ):
-            columns[key].append(values)
+        yaws.append(now.yaw[row] + turns)
+        uncertainties.append(uncertainty)
+        class_codes.append(np.full(length, now.class_code[row]))
     return Trace(
         times_ns=np.arange(count, dtype=np.int64),
         names=now.names,
         rows=rows,
         footprints=footprints,
+        yaw=np.concatenate(yaws),
+        uncertainty=np.concatenate(uncertainties),
+        class_code=np.concatenate(class_codes),
         classes=now.classes,
         signals={signal: np.repeat(values, count) for signal, values in now.signals.items()},
-        **{key: np.concatenate(values) for key, values in columns.items()},
     )
 
 
