@@ -869,9 +869,9 @@ def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
     enough = f"{will_do:,} of {plural(drawn.values.size, 'cell')} will do"
     if not higher:
         return f"{enough}, and none has a higher robustness than the target."
-    motions = len(decision.considered[owner.edge].motions)
-    if motions > 1:
-        rule = f"the places of {motions} motions are chosen together"
+    edge = decision.considered[owner.edge]
+    if edge.joint and len(edge.motions) > 1:
+        rule = f"the places of {len(edge.motions)} motions are chosen together"
     elif is_pushed:
         rule = "a robot that pushes takes the nearest"
     else:

@@ -176,3 +176,38 @@ def test_the_only_map_of_a_decisions_time_is_the_chosen_one() -> None:
     assert [each["chosen"] for each in reported["maps"]] == [True]
     (reported,) = value_of(decision(5, target=target), grid(5), grid(5))["decisions"]
     assert [each["chosen"] for each in reported["maps"]] == [False, False]
+
+
+@pytest.mark.parametrize(
+    ("is_joint", "robustness", "why"),
+    [
+        (
+            False,
+            1.0,
+            "6 of 6 cells will do, 5 with a higher robustness than the target: a robot that pushes "
+            "takes the nearest.",
+        ),
+        (
+            True,
+            1.0,
+            "6 of 6 cells will do, 5 with a higher robustness than the target: the places of 2 "
+            "motions are chosen together.",
+        ),
+    ],
+)
+def test_a_target_says_by_which_rule_it_was_chosen(is_joint: bool, robustness: float, why: str) -> None:
+    cells = grid(value=2.0)
+    cells.data = np.array([1.0, 2.0, 2.0, 2.0, 2.0, 2.0], "<f4").tobytes()
+    planned = several(0, 0, 0)
+    planned.margin = 0.5
+    edge = planned.considered[0]
+    edge.joint = is_joint
+    edge.motions.extend(PlanTarget(object=name) for name in ("cup0", "jug"))
+    target = PlanTarget(object="cup0", x=0.1, y=0.1, robustness=robustness)
+    edge.candidates[0].target.CopyFrom(target)
+    planned.target.CopyFrom(target)
+    maker = ReportedDecisions(is_pushed=True)
+    maker.add_decision(planned.SerializeToString())
+    maker.add_map(0, cells.SerializeToString())
+    (reported,) = decisions_value(maker, ReportedDecisions(), 0, Packing())["decisions"]
+    assert reported["maps"][0]["why"] == why
