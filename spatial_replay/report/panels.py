@@ -865,7 +865,9 @@ def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
     at_target = _value_at(drawn, owner.target)
     if at_target is None:
         return ""
-    will_do, higher = int((drawn.values >= decision.margin).sum()), int((drawn.values > at_target).sum())
+    # a refined target may be better than the middle of its cell
+    best = max(at_target, owner.target.robustness)
+    will_do, higher = int((drawn.values >= decision.margin).sum()), int((drawn.values > best).sum())
     enough = f"{will_do:,} of {plural(drawn.values.size, 'cell')} will do"
     if not higher:
         return f"{enough}, and none has a higher robustness than the target."

@@ -193,6 +193,8 @@ def test_the_only_map_of_a_decisions_time_is_the_chosen_one() -> None:
             "6 of 6 cells will do, 5 with a higher robustness than the target: the places of 2 "
             "motions are chosen together.",
         ),
+        # refined between the middles of cells
+        (False, 2.5, "6 of 6 cells will do, and none has a higher robustness than the target."),
     ],
 )
 def test_a_target_says_by_which_rule_it_was_chosen(is_joint: bool, robustness: float, why: str) -> None:
