@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from spatial_replay.annotate.robustness import curved_nodes
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_template import FRAMES, SceneBounds
-from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
+from spatial_replay.annotate.specification import FOOTPRINT_UNITS, MIXED, ReportedTree, unit_of, unit_words
 from spatial_replay.annotate.standing import FinalStanding, part_title
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
@@ -543,8 +543,12 @@ def _layout(
 
 
 def _tab_title(plot: Panel) -> str:
-    """Return the title of a plot in short: "results [m]"."""
-    return str(plot.config["foxglovePanelTitle"]).removeprefix("Robustness of ")
+    """Return the title of a plot in short: "results [m]".
+
+    A tab is too narrow for footprint units; the plot's own title has them.
+    """
+    title = str(plot.config["foxglovePanelTitle"]).removeprefix("Robustness of ")
+    return title.removesuffix(f" [{unit_words(FOOTPRINT_UNITS)}]")
 
 
 def _tabs(identifier: str, titled: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:

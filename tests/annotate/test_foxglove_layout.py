@@ -95,7 +95,7 @@ def test_the_scene_has_half_of_the_window_and_details_are_in_tabs(tmp_path):
     below = layout["layout"]["second"]
     assert (below["first"], below["splitPercentage"]) == ("3D!scene", 50)
     tabs = {name: layout["configById"][name]["tabs"] for name in ("Tab!curves", "Tab!details")}
-    assert [tab["title"] for tab in tabs["Tab!curves"]] == ["results [footprint units]", "results [no unit]"]
+    assert [tab["title"] for tab in tabs["Tab!curves"]] == ["results", "results [no unit]"]
     assert [tab["title"] for tab in tabs["Tab!details"]] == [
         "violated",
         "events",
