@@ -505,7 +505,8 @@ def test_a_crowd_has_labels_only_where_something_is_said_or_wrong():
     }
     text = 'group crowd = class "crowd"\nspec s = G a closeto[2] b\n'
     text += "spec t = G forall o in crowd: o dist a >= 1"
-    [message] = pointed(text, {**many, "a": box_at(0.0), "b": box_at(1.0)})
+    few = dict(list(many.items())[:18])
+    [message] = pointed(text, {**few, "a": box_at(0.0), "b": box_at(1.0)})
     labelled = {each.id for each in message.entities if each.texts and each.id.startswith("object/")}
     assert labelled == {"object/a", "object/b"}
     named = " and ".join(f"o{index} dist a >= 0" for index in range(40))

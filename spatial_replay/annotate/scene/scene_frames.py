@@ -67,7 +67,7 @@ def labelled_objects(
     return np.asarray(np.where(is_crowded[:, None], is_chosen, True))
 
 
-_CROWD: Final = 40
+_CROWD: Final = 20
 _MOST_LABELS: Final = 20
 """From so many objects on, not all have labels; the most that then have."""
 
