@@ -436,13 +436,11 @@ class LeafCode:
     def _quantifier(self, formula: Quantified, bindings: Bindings) -> int:
         is_forall = formula.quantifier == "forall"
         group: Any = substitute_term(formula.group, bindings)
-        if (closest := number_of_closest(replace(formula, group=group))) is not None:
+        if (pair_and_number := number_of_closest(replace(formula, group=group))) is not None:
             if (count := len(self._groups.candidates(group))) > MAX_CLOSEST:
-                what = f"{formula.quantifier} {', '.join(formula.variables)} looks for the closest two"
-                raise UsageError(
-                    f"{what} of {count} objects; {MAX_CLOSEST} is the limit: use a smaller group"
-                )
-            return self._row(HOLDS, self._expression(closest[1], bindings))
+                use = f"{formula.quantifier} {', '.join(formula.variables)} looks for the closest two"
+                raise UsageError(f"{use} of {count} objects; {MAX_CLOSEST} is the limit: use a smaller group")
+            return self._row(HOLDS, self._expression(pair_and_number[1], bindings))
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER
@@ -450,11 +448,11 @@ class LeafCode:
         if self._groups.may_be_unknown(group):
             row = self._row(op, row, row, self._member(group, ()))
         # permutations: different variables stand for different members
-        for candidates in permutations(range(len(names)), len(formula.variables)):
-            members = [TrackedName(names[n]) for n in candidates]
-            inner = {**bindings, **dict(zip(formula.variables, members, strict=True))}
-            body = self._add(formula.judged, inner)
-            row = self._row(op, row, body, self._member(group, candidates))
+        for indices in permutations(range(len(names)), len(formula.variables)):
+            members = [TrackedName(names[n]) for n in indices]
+            member_bindings = {**bindings, **dict(zip(formula.variables, members, strict=True))}
+            body = self._add(formula.judged, member_bindings)
+            row = self._row(op, row, body, self._member(group, indices))
         return row
 
     def _member(self, group: Group | Earlier, candidates: tuple[int, ...]) -> int:

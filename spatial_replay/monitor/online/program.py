@@ -375,22 +375,22 @@ class PartRows:
             return self._ending(formula.operands[0], not positive)
         if not isinstance(formula, Temporal):
             # W expands to `U or G`
-            sides = [self._ending(operand, positive) for operand in operands_of(formula)]
-            return reduce(partial(self._join, is_both=not positive), sides)
+            rows = [self._ending(operand, positive) for operand in operands_of(formula)]
+            return reduce(partial(self._join, is_both=not positive), rows)
         operands = [self._add(operand, positive) for operand in formula.operands]
-        left, body, bound = _as_until(formula.operator, operands, formula.bound)
+        left, right, bound = _as_until(formula.operator, operands, formula.bound)
         unit, low, high = window_of(bound)
         is_until = (formula.operator != "G") == positive
         sign = -1 if is_until else 1
         if low > 0:
-            body = self._join(body, self._infinity_after(unit, low, -sign), is_both=is_until)
+            right = self._join(right, self._infinity_after(unit, low, -sign), is_both=is_until)
         if high is not None:
-            end = self._infinity_after(unit, high, sign)
-            left = end if left == NOTHING else self._join(left, end, is_both=is_until)
+            after_end = self._infinity_after(unit, high, sign)
+            left = after_end if left == NOTHING else self._join(left, after_end, is_both=is_until)
             if high < LAST:
-                body = self._join(body, self._infinity_after(unit, high + 1, sign), is_both=is_until)
+                right = self._join(right, self._infinity_after(unit, high + 1, sign), is_both=is_until)
         code = codes.UNTIL if is_until else codes.RELEASE
-        return self.row(code, left, body, int(not is_until), variable=True)
+        return self.row(code, left, right, int(not is_until), variable=True)
 
     def _infinity_after(self, unit: int, distance: int, sign: int) -> int:
         """Return the row of an infinity that changes its sign a distance from the first sample on."""

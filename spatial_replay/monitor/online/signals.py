@@ -65,17 +65,17 @@ def _slide(
     begin: int, count: int,
 ) -> None:  # fmt: skip
     """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it."""
-    a, unit = rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_UNIT]
+    operand, unit = rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_UNIT]
     near, far = rows[row, codes.SIGNAL_LOW], rows[row, codes.SIGNAL_HIGH]
     sign = 1.0 if rows[row, codes.SIGNAL_CODE] == codes.WINDOW_MAX else -1.0
     ring, size = 1 + 4 * rows[row, codes.SIGNAL_WINDOW] + channel, times.shape[1] - RING
     head, tail, entering = times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING]
     for place in range(begin, begin + count):
         while entering <= offset + place and _distance(times, unit, entering - offset, place) >= near:
-            number = sign * history[channel, a, entering - offset]
+            number = sign * history[channel, operand, entering - offset]
             while tail > head:
                 newest = times[ring, RING + (tail - 1) % size] - offset
-                if sign * history[channel, a, newest] > number:
+                if sign * history[channel, operand, newest] > number:
                     break
                 tail -= 1
             times[ring, RING + tail % size] = entering
@@ -88,7 +88,7 @@ def _slide(
             if oldest >= 0 and _distance(times, unit, oldest, place) <= far:
                 break
             head += 1
-        history[channel, target, place] = history[channel, a, oldest] if tail > head else -sign * np.inf
+        history[channel, target, place] = history[channel, operand, oldest] if tail > head else -sign * np.inf
     times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING] = head, tail, entering
 
 
