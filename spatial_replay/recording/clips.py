@@ -519,8 +519,8 @@ class ClipLog(RecorderLog):
     def _evict(self) -> None:
         """Let go of what is too old and of what is too much, the oldest first."""
         # samples may come behind messages, and one of them may fire
-        reached_ns, came_s = self._progress.get(Sample, (self._newest_ns, 0.0))
-        if time.monotonic() - came_s > _LATE_S:
+        reached_ns, arrived_s = self._progress.get(Sample, (self._newest_ns, 0.0))
+        if time.monotonic() - arrived_s > _LATE_S:
             reached_ns = self._newest_ns
         oldest_ns = reached_ns - self._before_ns - _LATE_NS
         while self._samples or self._messages:
@@ -536,10 +536,10 @@ class ClipLog(RecorderLog):
             if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
                 self._has_overflowed = True
                 held_s = max(0.0, (reached_ns - dropped.time_ns) / 1e9)
-                needed = self._trigger.most_bytes * self._trigger.before_s / max(held_s, 1e-3)
+                needed_bytes = self._trigger.most_bytes * self._trigger.before_s / max(held_s, 1e-3)
                 self._remarks.put(
-                    f"the ring of {_megabytes(self._trigger.most_bytes)} holds {held_s:.1f} s, not the"
-                    f" {self._trigger.before_s:g} s asked for; about {_megabytes(needed * 1.1)} would do"
+                    f"the ring of {_megabytes(self._trigger.most_bytes)} holds {held_s:.1f} s, not the "
+                    f"{self._trigger.before_s:g} s asked for; about {_megabytes(needed_bytes * 1.1)} would do"
                 )
 
     def _finish(self, *, is_interrupted: bool) -> None:
