@@ -142,12 +142,12 @@ def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndar
     yield "blocked_by", (layers.blocked_by[turn] + 1).astype("<u2")
     yield "clearance", _singles(gradient.clearance[turn])
     yield "room", _singles(gradient.made_of.now.room(room_from)[turn])
-    varying = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
-    places = sorted(range(len(varying)), key=lambda place: not varying[place])[:MOST_LAYERS]
-    for place in sorted(places):
+    varies = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
+    numbers = sorted(range(len(varies)), key=lambda number: not varies[number])[:MOST_LAYERS]
+    for number in sorted(numbers):
         # a number in front, so that no conjunct is named like another field
-        name = f"{place + 1}: {layers.conjuncts[place]}"
-        yield name, _singles(layers.robustness[place, turn])
+        name = f"{number + 1}: {layers.conjuncts[number]}"
+        yield name, _singles(layers.robustness[number, turn])
 
 
 def _singles(values: np.ndarray) -> np.ndarray:
@@ -616,7 +616,7 @@ def joint_suffix(edge: PlanEdge) -> str:
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
 
 
-def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
+def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
     """Yield lines about an edge; `said` has the blocks of edges before, which are not repeated."""
     path = " -> ".join(map(str, edge.path)) + (edge.order and f"; {edge.order}")
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
@@ -626,10 +626,10 @@ def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: boo
     for candidate in edge.candidates:
         rows = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
         # maps have numbers of their own, and may say the same
-        name = f"{edge.source} -> {edge.target}"
-        before = said.setdefault((candidate.object, candidate.rejected, *rows), name)
-        if candidate.rejected and before != name:
-            yield f"    {candidate.object}{_maps(candidate)}: rejected as for {before}"
+        edge_name = f"{edge.source} -> {edge.target}"
+        first_edge = blocks.setdefault((candidate.object, candidate.rejected, *rows), edge_name)
+        if candidate.rejected and first_edge != edge_name:
+            yield f"    {candidate.object}{_maps(candidate)}: rejected as for {first_edge}"
             continue
         yield f"    {_candidate_text(candidate)}"
         yield from rows

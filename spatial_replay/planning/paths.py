@@ -97,7 +97,7 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
     diagonal = np.zeros(rows * columns, np.int64)
     parent = np.full(rows * columns, -1, np.int64)
     closed = np.zeros(rows * columns, np.bool_)
-    ways = np.zeros((8, 2), np.int64)
+    directions = np.zeros((8, 2), np.int64)
     first = start_row * columns + start_column
     straight[first] = 0
     queue = [(_at_least(start_row, start_column, box), np.int64(first))]
@@ -114,14 +114,14 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
             for down in range(-1, 2):
                 for right in range(-1, 2):
                     if down != 0 or right != 0:
-                        ways[count, 0], ways[count, 1] = down, right
+                        directions[count, 0], directions[count, 1] = down, right
                         count += 1
         else:
             down = _sign(row - parent[current] // columns)
             right = _sign(column - parent[current] % columns)
-            count = _directions(free, row, column, down, right, ways)
-        for way in range(count):
-            down, right = ways[way, 0], ways[way, 1]
+            count = _directions(free, row, column, down, right, directions)
+        for number in range(count):
+            down, right = directions[number, 0], directions[number, 1]
             is_diagonal = down != 0 and right != 0
             if is_diagonal:
                 steps = _jump_diagonal(free, goals, row, column, down, right)
@@ -138,8 +138,8 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
                 continue
             straight[cell], diagonal[cell] = new_straight, new_diagonal
             parent[cell] = current
-            ahead = _at_least(row + steps * down, column + steps * right, box)
-            heapq.heappush(queue, (length + ahead, np.int64(cell)))
+            least_ahead = _at_least(row + steps * down, column + steps * right, box)
+            heapq.heappush(queue, (length + least_ahead, np.int64(cell)))
     return np.zeros((0, 2), np.int64)
 
 

@@ -579,9 +579,9 @@ class Planner:
 
     def _unknown(self) -> str:
         """Return the labels of the propositions that the newest sample leaves unknown, and why it does."""
-        unknown = [place for place, value in enumerate(self._symbol) if value is None]
-        labels = ", ".join(self._words.propositions[place].label for place in unknown)
-        formulas = [self._formulas[place] for place in unknown]
+        numbers = [number for number, value in enumerate(self._symbol) if value is None]
+        labels = ", ".join(self._words.propositions[number].label for number in numbers)
+        formulas = [self._formulas[number] for number in numbers]
         reasons = unknown_reasons(formulas, self._newest(), self._seen, self._regions)
         return f"{labels} unknown: {'; '.join(reasons)}" if reasons else f"{labels} unknown"
 

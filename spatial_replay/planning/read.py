@@ -277,16 +277,16 @@ def why_not_there(
         f"({effort_text(steps[number].message)})"
     )
     layers = map_layers(gradient, settings, candidate.failed)
-    for which in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
-        value = float(layers.robustness[(which, *cell)])
-        how = f"fails by {-value:.4g}" if value < 0.0 else f"holds by {value:.4g}"
-        less = ", less than the margin" if 0.0 <= value < settings.margin else ""
-        yield f"  {layers.conjuncts[which]} {how}{less}"
+    for layer in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
+        value = float(layers.robustness[(layer, *cell)])
+        judgement = f"fails by {-value:.4g}" if value < 0.0 else f"holds by {value:.4g}"
+        note = ", less than the margin" if 0.0 <= value < settings.margin else ""
+        yield f"  {layers.conjuncts[layer]} {judgement}{note}"
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
     yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, settings))
     if target is not None:
-        how = "chosen" if candidate.is_chosen else "possible"
-        yield f"  {how} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
+        judgement = "chosen" if candidate.is_chosen else "possible"
+        yield f"  {judgement} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
 
 
 def _blocking_texts(

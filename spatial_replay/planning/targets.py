@@ -109,14 +109,14 @@ def target_in(
     failures: Sequence[Target] = (),
 ) -> Target | str:
     """Return the target for an object at one pose (x, y, turn) of a map, or why it cannot get there."""
-    place = gradient.cell_of(*pose)
-    if gradient.blocked[place] != FREE:
-        return REASONS[gradient.blocked[place]]
-    only = np.zeros(gradient.blocked.shape, np.bool_)
-    only[place] = True
+    cell = gradient.cell_of(*pose)
+    if gradient.blocked[cell] != FREE:
+        return REASONS[gradient.blocked[cell]]
+    goal = np.zeros(gradient.blocked.shape, np.bool_)
+    goal[cell] = True
     if settings.skill == "place":
-        return _target(gradient, tracked, place, (centre_of(tracked.footprint), pose[:2]))
-    return _nearest_cell(gradient, only, tracked, settings, failures)
+        return _target(gradient, tracked, cell, (centre_of(tracked.footprint), pose[:2]))
+    return _nearest_cell(gradient, goal, tracked, settings, failures)
 
 
 def nearest_target(
@@ -447,12 +447,12 @@ def refine_target(
     return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
 
 
-def tried_poses(gradient: GradientMap, failures: Sequence[Target], apart: float) -> Booleans:
+def tried_poses(gradient: GradientMap, failures: Sequence[Target], radius: float) -> Booleans:
     """Return (A, rows, columns): which poses of a map are some targets, but for a distance."""
     same = np.zeros(gradient.blocked.shape, np.bool_)
     centres = gradient.grid.centres().reshape(*gradient.grid.shape, 2)
     for failure in failures:
-        near = np.hypot(centres[..., 0] - failure.x, centres[..., 1] - failure.y) <= apart
+        near = np.hypot(centres[..., 0] - failure.x, centres[..., 1] - failure.y) <= radius
         same |= (np.abs(gradient.turns - failure.turn) <= _SAME_TURN)[:, None, None] & near
     return same
 
@@ -462,9 +462,9 @@ def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) 
     return _is_near(target, failures, _SAME * _cell(settings))
 
 
-def _is_near(target: Target, failures: Sequence[Target], apart: float) -> bool:
+def _is_near(target: Target, failures: Sequence[Target], radius: float) -> bool:
     return any(
-        math.dist((target.x, target.y), (failure.x, failure.y)) <= apart
+        math.dist((target.x, target.y), (failure.x, failure.y)) <= radius
         and abs(target.turn - failure.turn) <= _SAME_TURN
         for failure in failures
     )
