@@ -282,9 +282,9 @@ def page_data(report: RunReport) -> PageData:
     curves = [
         NodeSeries(result.times_ns, result.series[list(named_nodes(result.formula))]) for result in results
     ]
-    room = _room(reported_results, len(times_ns))
-    shown_ns = _shown_times(report, times_ns, room // 2)
-    page_ns = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
+    most_samples = _room(reported_results, len(times_ns))
+    shown_ns = _shown_times(report, times_ns, most_samples // 2)
+    page_ns = np.union1d(times_ns[choose_samples(times_ns, curves, most_samples - len(shown_ns))], shown_ns)
     decisions = decisions_value(report.decisions, report.redone, first_ns, packing)
     facts = {
         "settles": report.replayed.semantics == "ltlf",

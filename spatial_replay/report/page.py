@@ -420,9 +420,9 @@ def _script(name: str) -> str:
 def _policy(scripts: Sequence[str], style: str, has_pictures: bool) -> str:
     """Return the policy: the browser loads nothing, and runs only the scripts of the page."""
     pictures = "img-src data:; " if has_pictures else ""
-    allowed = " ".join(map(_digest, scripts))
+    script_sources = " ".join(map(_digest, scripts))
     return (
-        f"default-src 'none'; script-src {allowed}; style-src {_digest(style)}; {pictures}"
+        f"default-src 'none'; script-src {script_sources}; style-src {_digest(style)}; {pictures}"
         "base-uri 'none'; form-action 'none'"
     )
 

@@ -466,8 +466,8 @@ class ReportedScene:
         """Add what the next messages show."""
         # no others have a place
         frame_numbers = np.arange(-self._count % self.stride, len(frames.times_ns), self.stride)
-        is_again = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
-        frames = replace(frames, chosen=np.union1d(frame_numbers, [0]) if is_again else frame_numbers)
+        repeats_last = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
+        frames = replace(frames, chosen=np.union1d(frame_numbers, [0]) if repeats_last else frame_numbers)
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             self.add_frame(time_ns, partial(frames.frame, index))
 
@@ -617,7 +617,7 @@ def _join_points(points: Sequence[Floats]) -> Floats:
 def _entity_value(
     identifier: str,
     entities: Mapping[int, DrawnEntity],
-    frames: int,
+    frame_count: int,
     results: Sequence[int],
     box: _Box,
     packing: Packing,
@@ -628,10 +628,10 @@ def _entity_value(
         results: those of the page, which it has shades for in this order.
     """
     forms: dict[tuple[tuple[int, ...], bool], int] = {}
-    of_frame = np.full(frames, _ABSENT, np.int64)
+    form_of_frame = np.full(frame_count, _ABSENT, np.int64)
     for frame, entity in entities.items():
         form = tuple(len(ring) for ring in entity.rings), entity.is_last
-        of_frame[frame] = forms.setdefault(form, len(forms))
+        form_of_frame[frame] = forms.setdefault(form, len(forms))
     kind, _, name = identifier.partition("/")
     rings = [ring for entity in entities.values() for ring in entity.rings]
     has_shades = all(entity.shades for entity in entities.values())
@@ -643,8 +643,8 @@ def _entity_value(
         "name": name,
         "forms": [rings for rings, _ in forms],
         # a missing object leaves its last outline
-        "last": [number for (_, is_last), number in forms.items() if is_last],
-        "form": packing.add(of_frame, "u2"),
+        "last": [form_number for (_, is_last), form_number in forms.items() if is_last],
+        "form": packing.add(form_of_frame, "u2"),
         "points": packing.add(box.steps(_join_points(rings)), "u2"),
         "colours": packing.add(np.array([entity.colour for entity in entities.values()]), "u1"),
         "shades": packing.add(np.array(shades), "u1") if has_shades else None,
@@ -846,13 +846,13 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
     if owner is None:
         return value
     candidate = owner.candidate
-    turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
+    turn_text = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
     value |= _layer_values(drawn, owner, packing)
     return value | {
         "edge": owner.edge,
         "candidate": owner.place,
         "object": candidate.object,
-        "title": f"{candidate.object}{turned}",
+        "title": f"{candidate.object}{turn_text}",
         "target": None if owner.target is None else _target_value(owner.target),
     }
 
@@ -883,13 +883,15 @@ def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
 
 def _value_at(drawn: _Drawn, target: PlanTarget) -> float | None:
     """Return the robustness in the cell of a target; None outside of the map."""
-    shares = [
+    fractions = [
         (number - low) / (high - low)
         for number, low, high in zip((target.y, target.x), drawn.low[::-1], drawn.high[::-1], strict=True)
     ]
-    if not all(0.0 <= share < 1.0 for share in shares):
+    if not all(0.0 <= fraction < 1.0 for fraction in fractions):
         return None
-    row, column = (int(share * count) for share, count in zip(shares, drawn.values.shape, strict=True))
+    row, column = (
+        int(fraction * count) for fraction, count in zip(fractions, drawn.values.shape, strict=True)
+    )
     return float(drawn.values[row, column])
 
 
