@@ -276,14 +276,14 @@ def object_names(specification: Specification) -> tuple[str, ...]:
 
 def group_classes(specification: Specification) -> tuple[str, ...]:
     """Return the classes of open groups, in the order of the text; `ANY_CLASS` for all objects."""
-    groups: list[Term] = []
+    terms: list[Term] = []
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
             if isinstance(formula, Quantified):
-                groups.append(formula.group)
+                terms.append(formula.group)
             elif isinstance(formula, Atom):
-                groups += terms_of(formula.expression)
-    bases = [base for term in groups if isinstance(base := base_of(term), Group)]
+                terms += terms_of(formula.expression)
+    bases = [base for term in terms if isinstance(base := base_of(term), Group)]
     return tuple(dict.fromkeys(name for base in bases if (name := base.class_name)))
 
 

@@ -320,34 +320,38 @@ def _place(module: str) -> str:
 
 
 @cache
-def load_plugin(place: str) -> Plugin:
+def load_plugin(location: str) -> Plugin:
     """Import a plug-in.
 
     Args:
-        place: its file, or the name to import it by.
+        location: its file, or the name to import it by.
 
     Raises:
         UsageError: it cannot be imported, or holds no relations and signals.
     """
     try:
-        if place.endswith(".py"):
-            name = Path(place).stem
-            module_spec = spec_from_file_location(name, place)
+        if location.endswith(".py"):
+            name = Path(location).stem
+            module_spec = spec_from_file_location(name, location)
             assert module_spec is not None and module_spec.loader is not None
             module = module_from_spec(module_spec)
             module_spec.loader.exec_module(module)
         else:
-            name, module = place, import_module(place)
+            name, module = location, import_module(location)
         content = Path(module.__file__ or "").read_bytes()
     except Exception as error:
-        raise UsageError(f"the plug-in {place} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise UsageError(
+            f"the plug-in {location} cannot be loaded: {type(error).__name__}: {error}"
+        ) from error
     relations, signals = getattr(module, "RELATIONS", {}), getattr(module, "SIGNALS", {})
     for title, functions in (("RELATIONS", relations), ("SIGNALS", signals)):
         if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
-            raise UsageError(f"the plug-in {place} has a {title} that is no dictionary of functions by name")
+            raise UsageError(
+                f"the plug-in {location} has a {title} that is no dictionary of functions by name"
+            )
     if not relations and not signals:
-        raise UsageError(f"the plug-in {place} has no relations and signals; define RELATIONS or SIGNALS")
-    return Plugin(name, place, hashlib.sha256(content).hexdigest(), dict(relations), dict(signals))
+        raise UsageError(f"the plug-in {location} has no relations and signals; define RELATIONS or SIGNALS")
+    return Plugin(name, location, hashlib.sha256(content).hexdigest(), dict(relations), dict(signals))
 
 
 def computed_signal(signal: ComputedSignal, sample: Any) -> float:

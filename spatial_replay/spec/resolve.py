@@ -235,7 +235,7 @@ class Namespace:
             self.faults.add(name.span, message, "give each definition a name of its own")
 
     def _add_scale(self, statement: ScaleStatement) -> None:
-        name, before = statement.name, self.faults.count
+        name, fault_count = statement.name, self.faults.count
         signal = None if name.text == LENGTHS and not name.is_quoted else name.text
         divisor = self.plain_number(statement.value)
         defined = self.definitions.get(name.text)
@@ -244,7 +244,7 @@ class Namespace:
             self.faults.add(name.span, f"{name.text!r} is {kind_of(defined)}", hint)
         elif any(scale.signal == signal for scale in self.scales):
             self.faults.add(name.span, f"{name.text!r} is scaled twice", "leave one out")
-        elif self.faults.count == before and divisor <= 0.0:
+        elif self.faults.count == fault_count and divisor <= 0.0:
             message = f"a scale of {format_number(divisor)}"
             hint = "write what counts as much as 1 of the others, above 0"
             self.faults.add(statement.value.span, message, hint)
