@@ -287,7 +287,7 @@ def _write_rows(files: ResultFiles, table: pa.Table) -> str:
 
 
 class ResultsFolder:
-    """A folder of results, opened; only the process that has it `locked` writes to it."""
+    """A folder of results; only the process that holds its `lock` writes to it."""
 
     def __init__(self, files: ResultFiles) -> None:
         self._files = files

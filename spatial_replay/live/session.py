@@ -147,7 +147,7 @@ class SessionStatus:
         dropped: samples that were dropped because evaluation fell behind.
         messages_dropped: messages that were dropped before they made samples.
         late: messages that came after the samples of their time.
-        overdue: observations whose transforms did not come within `max_delay`.
+        overdue: observations whose transforms did not come within `max_delay_s`.
         delay_s: of the newest sample, from the arrival of its message to its verdict; NaN before.
         time_ns: of the newest sample; None before the first.
     """

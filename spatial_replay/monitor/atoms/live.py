@@ -649,7 +649,7 @@ class Row(NamedTuple):
 
 
 class PlanRows:
-    """Rows for what terms are about, numbered as they are asked for (see `plan_kernel`)."""
+    """Rows of a plan for the objects and regions of terms, numbered in the order of requests."""
 
     def __init__(self, frame: PlanContext, members: frozenset[Member]) -> None:
         self._frame = frame
