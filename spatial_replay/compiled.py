@@ -273,8 +273,8 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
     kernels that are not loaded are interpreted until a thread has loaded it.
 
     Args:
-        task: the one of `spatial-replay warmup` that compiles all kernels of the trial.
-        wait: compile in this process instead, before this returns.
+        task: the name of the task of `spatial-replay warmup` that compiles all kernels of the trial.
+        wait: whether to compile in this process, and return when all kernels are compiled.
     """
     # once: garbage of a program that starts many monitors is still collected
     collections = _no_collection() if _process.interprets else nullcontext()

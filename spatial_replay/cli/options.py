@@ -544,8 +544,8 @@ def refuse_options(context: click.Context, names: Collection[str], why: str) -> 
     """Refuse options that do not apply, if they stand on the command line.
 
     Args:
-        names: of the parameters.
-        why: follows the name of the option.
+        names: the parameters' names in Python, such as "max_gap".
+        why: the rest of the message, after the name of the option.
 
     Raises:
         UsageError: one is given.

@@ -475,7 +475,7 @@ class Descents:
 def expected_costs(
     points: NDArray[np.float64], costs: NDArray[np.float64], others: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return which costs are to be expected elsewhere, (M,), less their mean: those of a Gaussian process.
+    """Return the costs (M,), less their mean, that a Gaussian process predicts at other points.
 
     Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1, with a squared exponential
     kernel whose length has the greatest likelihood.

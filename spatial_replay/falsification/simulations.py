@@ -49,9 +49,9 @@ class Parameter:
 
     Attributes:
         low, high: its range; `high` is infinite until the first run has ended, of times in a run.
-        digits: decimals of its values, so that a value that is written is the same when it is read.
-        rest: its value in a run in which nothing is varied; None if it is left out there.
-        group: those of one group are brought to rest together.
+        digits: decimals to which values are rounded, so that a written value is read back exactly.
+        rest: its value in the unvaried run; None if that run lacks it.
+        group: a search sets all parameters of a group back to rest together.
         unit: "m", "rad", "s", or "".
         is_drawn: whether its values have no order, as seeds: they are drawn, not optimised.
     """

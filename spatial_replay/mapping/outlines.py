@@ -124,9 +124,9 @@ def features_in(message: object) -> dict[str, object]:
 
 
 def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
-    """Return the path of what holds the rings that a path leads to; None if it leads to corners.
+    """Return the path of the object that holds the rings at a path; None if the path leads to corners.
 
-    Fields beside the path say whether there are rings: `type` by `coordinates`, `inner` by `outer`.
+    A neighbouring field shows whether there are rings: `type` next to `coordinates`, `inner` next to `outer`.
     """
     for length, step in enumerate(path.steps):
         owner_path = FieldPath(path.text, path.steps[:length])

@@ -249,7 +249,7 @@ class RunEnds:
                 yield span
 
     def _open_since_ns(self) -> int:
-        """Return since when a needed topic cannot be judged, if that may be the end of the log."""
+        """Return the first time at which a needed topic may have ended with the log; FOREVER if none has."""
         return min((self._since_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
 
     def _release(self, before_ns: int) -> list[Trace]:

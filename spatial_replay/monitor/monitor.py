@@ -704,7 +704,7 @@ class Settled:
         return None
 
     def _begins(self) -> Iterator[int]:
-        """Iterate over the samples to evaluate from, as if the log began there."""
+        """Yield the samples at which to begin the evaluation, the latest first: few are often enough."""
         count = len(self.samples)
         if self.is_whole and count - self.start <= _AT_ONCE:
             yield self.start

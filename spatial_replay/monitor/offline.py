@@ -269,7 +269,7 @@ class OfflineNodes:
         return self.columns[low, node], self.columns[high, node]
 
     def judged_ends(self, operand: int) -> tuple[Floats, Floats]:
-        """Return the ends (T,) of an operand as its temporal operator reads it, with uncertainty."""
+        """Return the ends (T,) of an operand; they are neutral in samples that its operator leaves out."""
         low, high = self.ends(operand)
         condition = self.conditions.get(operand)
         if condition is None:

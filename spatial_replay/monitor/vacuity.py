@@ -415,8 +415,8 @@ def _empty_windows(
     """Find the operators whose windows are empty in all samples at which they count.
 
     Args:
-        scopes: the samples at which the number depends on a node.
-        active: the samples at which the verdict does, where conditions hold.
+        scopes: for each node, the samples at which the robustness depends on it.
+        active: for each node, the samples at which the verdict depends on it, because conditions hold.
     """
     for identifier, (node, scope, active_scope) in enumerate(zip(nodes, scopes, active, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():

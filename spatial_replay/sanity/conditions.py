@@ -534,7 +534,7 @@ def _texts(
 
 
 def _exact_texts(weights: Weights, threshold: Fraction, side: Literal[">=", "<="]) -> tuple[str, str] | None:
-    """Return the sentences of a comparison that is meant to the letter; None for a sum of several numbers."""
+    """Return an exact comparison and its negation in words; None for a sum of several numbers."""
     return _compared_texts(weights, threshold, (side, "<" if side == ">=" else ">"))
 
 

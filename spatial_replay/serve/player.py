@@ -127,7 +127,7 @@ class Transport:
         return PlaybackState(status, time_ns, self._speed)
 
     def play(self, now: float) -> None:
-        """Play from the present time; at the end, that is over at once."""
+        """Play from the present time; at the end of the run, playing ends at once."""
         self.move_to(self.time_ns(now), now)
         self._is_playing = True
 

@@ -296,7 +296,7 @@ class Observed:
 
         Args:
             direction: 0 for the quantity, 1 for its negative.
-            surely: whether its lower end is to be, rather than its upper end.
+            surely: whether the lower end is compared with the limit, instead of the upper end.
         """
         values = measure_both_ways(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
         holds = values >= limit if surely else values > limit

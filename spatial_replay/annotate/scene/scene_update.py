@@ -547,10 +547,10 @@ def _label_places(
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:
-    """Return how small some objects are: one level for each time that the size is halved."""
+    """Return a level for each size: half the size is one level higher. An unknown size has level 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         levels = np.round(LEVELS / 2.0 - np.log2(sizes / scale))
-    # of what has no size known, as NaN, 0
+    # fmax takes the 0 where the level is NaN
     return np.fmin(np.fmax(levels, 0.0), LEVELS).astype(np.int64)
 
 

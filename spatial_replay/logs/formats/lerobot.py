@@ -82,7 +82,7 @@ class _LeRobot(DataSet):
             end: file for file in self._files for end in (file.name, f"{file.parent.name}/{file.name}")
         }
         self._rows: dict[Path, Mapping[int, _Rows]] = {}
-        # copies with the metadata of both versions have the files of neither
+        # some third-party copies have metadata of versions 2 and 3, and files named as in neither
         is_third_party = version.startswith("v3") and (path / "meta" / "episodes.jsonl").exists()
         lost = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
         if lost and not is_third_party:

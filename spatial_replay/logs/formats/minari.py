@@ -112,7 +112,10 @@ def _count_steps(run: Run) -> int:
 
 
 def _second_run(arrays: Mapping[str, Floats], steps: int, count: int) -> str:
-    """Return why an episode is not judged: updating a data set appends a run to an episode of its number."""
+    """Return why an episode cannot be judged: it holds two runs; "" if it holds one.
+
+    Minari appends a run to an existing episode of the same number when a data set is updated.
+    """
     for name in _ENDS:
         ends = np.flatnonzero(arrays.get(name, np.empty(0))[:-1] > 0)
         if len(ends):
