@@ -267,8 +267,13 @@ def why_not_there(
         raise UsageError(f"decision {number} did not consider {name!r}; it considered: {considered}")
     edge, candidate = edges[0]
     gradient, target = candidate.map, candidate.target
-    if not gradient.grid.contains(np.array(place)):
-        raise UsageError(f"({place[0]:g}, {place[1]:g}) is outside the map of {name}")
+    grid = gradient.grid
+    if not grid.contains(np.array(place)):
+        low, high = grid.centre(0, 0), grid.centre(grid.rows - 1, grid.columns - 1)
+        raise UsageError(
+            f"({place[0]:g}, {place[1]:g}) is outside the map of {name}; the middles of its cells are from "
+            f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
+        )
     cell = gradient.cell_of(*place, 0.0 if target is None else target.turn)
     settings = planner_of(open_source(log)).settings
     yield (
