@@ -601,7 +601,7 @@ def effort_text(decision: PlanDecision) -> str:
 def _rival_text(candidate: PlanCandidate) -> str:
     if candidate.rejected:
         return f"{candidate.object}: {candidate.rejected}"
-    return f"{candidate.object}: {place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
+    return f"{place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
 
 
 def _outcome_text(decision: PlanDecision) -> str:

@@ -134,6 +134,7 @@ def test_one_decision_is_shown_in_five_lines(tmp_path):
     assert len(lines) == 5
     assert lines[0].startswith(f"step 0 at {steps[0].time_ns / 1e9:.3f} s") and steps[0].reason in lines[0]
     assert [line.split()[0] for line in lines[1:]] == ["wanted", "chosen", "instead", "done"]
+    assert lines[3].startswith("  instead  blue to (")
     with pytest.raises(sr.UsageError, match="has no decision 9; it has 0 to"):
         call("info", tmp_path / "run.mcap", "--decisions", 9)
     with pytest.raises(sr.UsageError, match="takes the number of a decision"):
@@ -151,7 +152,7 @@ def test_a_place_that_was_not_chosen_is_explained_by_the_demands_that_fail_there
     assert last.startswith("  possible instead: (")
     for arguments, error in {
         ("--object", "pink", "--at", "0.6,0.15"): "did not consider 'pink'; it considered: blue, green, red",
-        ("--object", "red", "--at", "9,9"): "outside the map of red",
+        ("--object", "red", "--at", "9,9"): r"outside the map of red; the middles of its cells are from \(",
         ("--object", "red", "--at", "here"): "give two numbers",
         ("--object", "red"): "give --step N, --object NAME and --at X,Y",
     }.items():
