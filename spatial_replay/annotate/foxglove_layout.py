@@ -23,9 +23,11 @@ from spatial_replay.logs.topics import (
     CURVES_TOPIC,
     GRADIENT_MAP,
     LAYOUT,
+    MAP_DRAWING,
     PLAN_DECISION,
     PLAN_PATH,
     RECENT_EVENTS,
+    REDONE_DRAWING,
     REDONE_MAP,
     REDONE_PATH,
     SCENE,
@@ -84,8 +86,10 @@ def scene_panel(
     displays: dict[str, Config] = {
         SCENE: {},
         GRADIENT_MAP: {"colorMode": "rgba-fields"},
+        MAP_DRAWING: {},
         PLAN_PATH: {},
         REDONE_MAP: {"colorMode": "rgba-fields", "visible": False},
+        REDONE_DRAWING: {"visible": False},
         REDONE_PATH: {"visible": False},
     }
     config = {
@@ -417,7 +421,11 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     details = _details(contents)
     if contents.trees:
         summary = {"topicPath": f"{CURVES_TOPIC}.summary"}
-        details.insert(0, ("whole log", _title_panel("RawMessages!summary", "The whole log", summary)))
+        # the decisions of a planner come first
+        details.insert(
+            1 if contents.planned else 0,
+            ("whole log", _title_panel("RawMessages!summary", "The whole log", summary)),
+        )
     title = "Playback and constants of the specification"
     constants = _title_panel("Parameters!constants", title, {"title": title})
     curves = whole_curves(contents.trees, contents.units)

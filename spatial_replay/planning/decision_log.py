@@ -12,18 +12,16 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.annotate.scene.scene_frames import cell_colours
-from spatial_replay.annotate.scene.scene_template import FRAME, outlines_of
+from spatial_replay.annotate.scene.scene_template import FRAME
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object
+from spatial_replay.geometry.footprint import TrackedObject, centre_of
 from spatial_replay.logs.messages import Messages, merge, messages_of
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
@@ -40,8 +38,14 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanTarget,
     PrunedEdge,
 )
-from spatial_replay.logs.topics import EVENT_LOG, GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
-from spatial_replay.palette import NEUTRAL, POSITIVE
+from spatial_replay.logs.topics import (
+    EVENT_LOG,
+    GRADIENT_MAP,
+    MAP_DRAWING,
+    PLAN_DECISION,
+    PLAN_PATH,
+    protobuf_channel,
+)
 from spatial_replay.planning.decisions import (
     Candidate,
     Consideration,
@@ -53,6 +57,7 @@ from spatial_replay.planning.decisions import (
     either,
     wait_outcome,
 )
+from spatial_replay.planning.map_drawing import DEPTH, MapFrame, map_drawing, map_frame, path_message
 from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
@@ -71,8 +76,6 @@ _FIELD_TYPES: Final[Mapping[str, PackedElementField.NumericType.ValueType]] = Ma
     }
 )
 """Types of the fields of a cell, by those of numpy."""
-_DEPTH: Final = 0.1
-"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
 
 
 class TurnedMap(NamedTuple):
@@ -125,7 +128,7 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessa
     )
     message.timestamp.FromNanoseconds(time_ns)
     message.pose.position.x, message.pose.position.y = grid.xmin, grid.ymin
-    message.pose.position.z = -_DEPTH * grid.cell_size
+    message.pose.position.z = -DEPTH * grid.cell_size
     message.pose.orientation.w = 1.0
     message.cell_size.x = message.cell_size.y = grid.cell_size
     offset = 0
@@ -201,12 +204,9 @@ _LONGEST: Final = 400
 _DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
 _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
 _PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
+_DRAWINGS: Final = protobuf_channel(MAP_DRAWING, SceneUpdate)
 _TIMINGS: Final = protobuf_channel(EVENT_LOG, Log)
-_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS, _TIMINGS)
-
-_PATH, _TRAVELLED = "plan/way", "plan/travelled"
-_PIXELS = 3.0
-"""Width of lines on the screen."""
+_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS, _DRAWINGS, _TIMINGS)
 
 
 class BlackBox:
@@ -241,6 +241,7 @@ class BlackBox:
         self._decision = PlanDecision()
         self._tracked: TrackedObject | None = None
         self._travelled: list[tuple[float, float]] = []
+        self._frame: MapFrame | None = None
 
     def observe(self, sample: Sample) -> None:
         """Take the next sample.
@@ -275,13 +276,17 @@ class BlackBox:
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
         layers = _layers_of(step, self.planner)
         self._decision = explained_decision(step, self.planner, self._written[_MAPS], layers)
+        turned_maps = maps_of(step)
         maps = [
-            map_message(turned_map, step.time_ns, layers[turned_map.candidate])
-            for turned_map in maps_of(step)
+            map_message(turned_map, step.time_ns, layers[turned_map.candidate]) for turned_map in turned_maps
         ]
         path = path_message(step.target, self._tracked, step.time_ns)
+        if turned_maps:
+            gradient, turn = turned_maps[-1].candidate.map, turned_maps[-1].turn
+            self._frame = map_frame(gradient, turn, self.planner.settings.margin)
+        drawing = map_drawing(self._frame, step.target, self._tracked, step.time_ns)
         timings = [[_timing(step, took_s)]] if self._times else []
-        messages = self._messages(step.time_ns, [*ended, self._decision], maps, [path], *timings)
+        messages = self._messages(step.time_ns, [*ended, self._decision], maps, [path], [drawing], *timings)
         self.planning_s += time.perf_counter() - began
         self._write(messages)
         return step
@@ -476,50 +481,6 @@ def target_message(target: Target) -> PlanTarget:
         waypoints=[coordinate for point in target.waypoints for coordinate in point],
         robustness=target.robustness,
     )
-
-
-def path_message(
-    target: Target | None,
-    tracked: TrackedObject | None,
-    time_ns: int,
-    travelled: Sequence[tuple[float, float]] = (),
-) -> SceneUpdate:
-    """Return the path to a target, the object's outline there and the path travelled, as a message.
-
-    Without a target, the message deletes what was drawn before.
-    """
-    message = SceneUpdate()
-    lines: dict[str, list[LinePrimitive]] = {}
-    if target is not None and tracked is not None:
-        height = 0.0 if tracked.height is None else tracked.height[1]
-        at_target = moved_object(tracked, target.x, target.y, target.turn)
-        rings = [ring.tolist() for ring in outlines_of(at_target.footprint)]
-        lines[_PATH] = [_line(target.waypoints, height, POSITIVE)]
-        lines[_PATH] += [_line(ring, height, POSITIVE, LinePrimitive.LINE_LOOP) for ring in rings]
-        if travelled:
-            lines[_TRAVELLED] = [_line(travelled, height, NEUTRAL)]
-    for identifier in (_PATH, _TRAVELLED):
-        if identifier in lines:
-            entity = message.entities.add(id=identifier, frame_id=FRAME, lines=lines[identifier])
-            entity.timestamp.FromNanoseconds(time_ns)
-        else:
-            deletion = message.deletions.add(type=SceneEntityDeletion.MATCHING_ID, id=identifier)
-            deletion.timestamp.FromNanoseconds(time_ns)
-    return message
-
-
-def _line(
-    points: Iterable[Sequence[float]],
-    height: float,
-    colour: tuple[float, float, float],
-    kind: LinePrimitive.Type.ValueType = LinePrimitive.LINE_STRIP,
-) -> LinePrimitive:
-    line = LinePrimitive(type=kind, thickness=_PIXELS, scale_invariant=True)
-    line.pose.position.z, line.pose.orientation.w = height, 1.0
-    for x, y in points:
-        line.points.add(x=x, y=y)
-    line.color.r, line.color.g, line.color.b, line.color.a = *colour, 1.0
-    return line
 
 
 # ------------------------------------------------------------------------------------------------------- text

@@ -23,12 +23,14 @@ from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import (
     ENDING,
     GRADIENT_MAP,
+    MAP_DRAWING,
     METADATA,
     PLAN_DECISION,
     PLAN_METADATA,
     PLAN_PATH,
     RECORDED_PREFIX,
     REDONE_DECISION,
+    REDONE_DRAWING,
     REDONE_MAP,
     REDONE_PATH,
 )
@@ -610,7 +612,12 @@ def _value(texts: Mapping[str, str], key: str, default: object) -> object:
 # --------------------------------------------------------------------------------------------- other settings
 
 _REDONE: Final = MappingProxyType(
-    {PLAN_DECISION: REDONE_DECISION, GRADIENT_MAP: REDONE_MAP, PLAN_PATH: REDONE_PATH}
+    {
+        PLAN_DECISION: REDONE_DECISION,
+        GRADIENT_MAP: REDONE_MAP,
+        PLAN_PATH: REDONE_PATH,
+        MAP_DRAWING: REDONE_DRAWING,
+    }
 )
 
 

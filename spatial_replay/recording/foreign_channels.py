@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Channel, Schema
-from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
+from spatial_replay.logs.topics import GRADIENT_MAP, MAP_DRAWING, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.text import listing
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ _SELF_DESCRIBING: Final = frozenset({"json", "cbor", "msgpack"})
 _OTHER_SCHEMAS: Final = {"cdr": ("ros2idl", "omgidl")}
 """Further encodings of schemas."""
 
-_OURS: Final = frozenset({PLAN_DECISION, GRADIENT_MAP, PLAN_PATH})
+_OURS: Final = frozenset({PLAN_DECISION, GRADIENT_MAP, PLAN_PATH, MAP_DRAWING})
 
 
 def message_channel(

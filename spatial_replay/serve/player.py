@@ -27,9 +27,11 @@ from spatial_replay.logs.topics import (
     EVENT_LOG,
     EVENTS,
     GRADIENT_MAP,
+    MAP_DRAWING,
     PLAN_DECISION,
     PLAN_PATH,
     RECENT_EVENTS,
+    REDONE_DRAWING,
     REDONE_MAP,
     REDONE_PATH,
     SCENE,
@@ -544,8 +546,10 @@ _DRAWN: Final = (
     PLAN_DECISION,
     GRADIENT_MAP,
     PLAN_PATH,
+    MAP_DRAWING,
     REDONE_MAP,
     REDONE_PATH,
+    REDONE_DRAWING,
     CAMERA_ANNOTATIONS,
 )
 

@@ -187,7 +187,7 @@ def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
         writer.start()
         channels = {
             topic: writer.register_channel(topic, "json", 0)
-            for topic in ("/plan/decision", "/plan/gradient_map", "/plan/path")
+            for topic in ("/plan/decision", "/plan/gradient_map", "/plan/map_drawing", "/plan/path")
         }
         for channel in channels.values():
             writer.add_message(channel, 0, b"{}", 0)
@@ -203,7 +203,7 @@ def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
     run_replay(open_source(planned), files, output=layer, layer=True)
     layout = layout_of(annotated)
     shown = layout["configById"]["3D!scene"]["topics"]
-    assert set(shown) == {"/spatial/scene", "/plan/gradient_map", "/plan/path"}
+    assert set(shown) == {"/spatial/scene", "/plan/gradient_map", "/plan/map_drawing", "/plan/path"}
     assert shown["/plan/gradient_map"]["colorMode"] == "rgba-fields"
     assert layout["configById"]["RawMessages!decision"]["topicPath"] == "/plan/decision.reason"
     assert panels(layout) == set(layout["configById"])

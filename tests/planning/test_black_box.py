@@ -17,7 +17,7 @@ from planning.plans import PUSH, record_plan_of, write_usual_run
 from spatial_replay import LogError, Settings, UsageError, load_specification
 from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
+from spatial_replay.logs.topics import GRADIENT_MAP, MAP_DRAWING, PLAN_METADATA, PLAN_PATH
 from spatial_replay.planning import Grid, Reason, Workspace, read_decisions, recompute_decisions
 from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.planning.read import planner_of
@@ -283,6 +283,51 @@ def test_the_planned_path_is_drawn_first_and_then_the_travelled_one(tmp_path):
     assert len(planned.entities) == 1
     assert len(travelled.entities) == 2
     assert [each.id for each in last.deletions] == ["plan/way", "plan/travelled"]
+
+
+def test_the_drawing_of_a_map_has_the_contour_axes_scale_and_way(tmp_path):
+    first, *_ = write_usual_run(tmp_path / "run.mcap")
+    (frame,) = payloads(tmp_path / "run.mcap", MAP_DRAWING, SceneUpdate)[0].entities
+    maps = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
+    *_, drawn = (each for each in maps if each.timestamp.ToNanoseconds() == first.time_ns)
+    values, size = values_of(drawn), drawn.cell_size.x
+    contour, _, *_, way, outline = frame.lines
+    ends = [(point.x, point.y) for point in contour.points]
+    sides = {(1, 0): 0, (0, 1): 0}
+    for (x0, y0), (x1, y1) in zip(ends[::2], ends[1::2], strict=True):
+        across = (1, 0) if abs(x1 - x0) < size / 2 else (0, 1)
+        count = round((abs(x1 - x0) + abs(y1 - y0)) / size)
+        sides[across] += count
+        for place in (np.arange(count) + 0.5) * size:
+            x, y = (x0, min(y0, y1) + place) if across == (1, 0) else (min(x0, x1) + place, y0)
+            dx, dy = (size / 2 * side for side in across)
+            both = value_at(drawn, x - dx, y - dy), value_at(drawn, x + dx, y + dy)
+            assert min(both) < PUSH.margin <= max(both)
+    for axis, across in ((1, (1, 0)), (0, (0, 1))):
+        reach, is_free = values >= np.float32(PUSH.margin), np.isfinite(values)
+        one, two = (np.take(reach, range(k, reach.shape[axis] - 1 + k), axis) for k in (0, 1))
+        free = [np.take(is_free, range(k, reach.shape[axis] - 1 + k), axis) for k in (0, 1)]
+        assert sides[across] == ((one != two) & free[0] & free[1]).sum() > 0
+    assert [(point.x, point.y) for point in way.points] == list(first.target.waypoints)
+    assert len(outline.points) == 4
+    (bar,) = frame.triangles
+    middle = bar.colors[len(bar.colors) // 2]
+    assert middle.r == middle.b, "white at 0"
+    texts = {text.text: (text.pose.position.x, text.pose.position.y) for text in frame.texts}
+    scale = np.nanmax(np.abs(values))
+    assert texts["0"][1] == pytest.approx(0.0, abs=1e-9), "the middle of a grid from -0.225 to 0.225"
+    assert texts[f"{scale:.4g}"][1] > 0.2 > -0.2 > texts[f"-{scale:.4g}"][1]
+    assert texts["0.4"][0] == pytest.approx(0.4)
+    assert texts["0.4"][1] < -0.225
+
+
+def test_a_decision_without_a_target_keeps_the_map_and_draws_no_way(tmp_path):
+    write_usual_run(tmp_path / "run.mcap")
+    drawings = payloads(tmp_path / "run.mcap", MAP_DRAWING, SceneUpdate)
+    assert len(drawings) == len(read_decisions(tmp_path / "run.mcap").decisions)
+    before, last = (drawing.entities[0] for drawing in drawings[-2:])
+    assert [*before.texts] == [*last.texts]
+    assert before.lines[:-2] == last.lines[:]
 
 
 def test_all_messages_of_a_decision_have_the_time_of_its_sample(tmp_path):

@@ -1,0 +1,241 @@
+"""A planner's map and path as a scene: contour at the margin, axes, colour bar, target and path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from spatial_replay.annotate.scene.scene_frames import cell_colours
+from spatial_replay.annotate.scene.scene_template import FRAME, outlines_of
+from spatial_replay.geometry.arrays import Booleans, Floats
+from spatial_replay.geometry.footprint import TrackedObject, moved_object
+from spatial_replay.palette import LABEL, NEUTRAL, POSITIVE
+from spatial_replay.planning.decisions import Target
+from spatial_replay.planning.maps import GradientMap
+from spatial_replay.text import number_text
+
+_MAP, _PATH, _TRAVELLED = "plan/map", "plan/way", "plan/travelled"
+
+DEPTH: Final = 0.1
+"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
+_FRAME_DEPTH: Final = 0.5 * DEPTH
+"""Depth of lines on a map, in cells."""
+
+_PIXELS: Final = 3.0
+_CASING_PIXELS: Final = 6.0
+_THIN_PIXELS: Final = 1.5
+"""Widths of lines on the screen."""
+
+_INK: Final = (0.1, 0.1, 0.1)
+_WHITE: Final = (1.0, 1.0, 1.0)
+
+_FONT, _TICK, _GAP, _BAR = 0.028, 0.012, 0.03, 0.04
+"""Height of texts, lengths of ticks, distance of the colour bar and its width, by the size of a map."""
+
+_SHADES: Final = 17
+"""Steps of the colour bar."""
+_MOST_TICKS: Final = 6
+
+
+class MapFrame(NamedTuple):
+    """The lines, texts and faces that a viewer draws with a map, and their height in footprint units."""
+
+    entity: SceneEntity
+    height: float
+
+
+def map_frame(gradient: GradientMap, turn: int, margin: float) -> MapFrame:
+    """Return the contour of a map at the margin, axes, and a colour bar with numbers.
+
+    Args:
+        turn: index of the map's orientation.
+        margin: the robustness that a target needs.
+    """
+    grid, values = gradient.grid, gradient.values[turn]
+    low = grid.xmin, grid.ymin
+    high = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
+    entity, height = SceneEntity(id=_MAP, frame_id=FRAME), -_FRAME_DEPTH * grid.cell_size
+    contour = _contour(values, margin) * grid.cell_size + np.array(low)
+    if len(contour):
+        entity.lines.append(
+            _line(contour.tolist(), height, _INK, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS)
+        )
+    _add_axes(entity, low, high, height)
+    scale = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    if scale:
+        _add_scale(entity, low, high, height, scale, margin)
+    return MapFrame(entity, height)
+
+
+def map_drawing(
+    frame: MapFrame | None, target: Target | None, tracked: TrackedObject | None, time_ns: int
+) -> SceneUpdate:
+    """Return what a viewer draws with the newest map, if there is any, as a complete message.
+
+    A white line below the path and the outline at the target makes these visible on blue cells.
+    """
+    message = SceneUpdate()
+    if frame is not None:
+        entity = message.entities.add()
+        entity.CopyFrom(frame.entity)
+        entity.timestamp.FromNanoseconds(time_ns)
+        if target is not None and tracked is not None:
+            entity.lines.extend(_path_lines(target, tracked, frame.height, _WHITE, _CASING_PIXELS))
+    return message
+
+
+def _contour(values: Floats, margin: float) -> Floats:
+    """Return the edges between cells that reach a margin and free ones that do not, (2 N, 2) in cells."""
+    across = _run_ends(values[:-1], values[1:], margin) + np.array([1.0, 0.0])
+    along = _run_ends(values[:, :-1].T, values[:, 1:].T, margin) + np.array([1.0, 0.0])
+    return np.concatenate([across[:, ::-1], along])
+
+
+def _run_ends(before: Floats, after: Floats, margin: float) -> Floats:
+    """Return (2 N, 2): row and ends of each run of cells of which one of two rows reaches the margin."""
+    parted: Booleans = np.isfinite(before) & np.isfinite(after) & ((before >= margin) != (after >= margin))
+    changes = np.diff(np.pad(parted, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    return np.argwhere(changes).astype(np.float64)
+
+
+def _add_axes(
+    entity: SceneEntity, low: tuple[float, float], high: tuple[float, float], height: float
+) -> None:
+    """Add a frame, with ticks and their coordinates below and on the left."""
+    size = max(high[0] - low[0], high[1] - low[1])
+    corners = [low, (high[0], low[1]), high, (low[0], high[1])]
+    entity.lines.append(_line(corners, height, NEUTRAL, LinePrimitive.LINE_LOOP, pixels=_THIN_PIXELS))
+    ticks: list[tuple[float, float]] = []
+    for x in _round_numbers(low[0], high[0]):
+        ticks += [(x, low[1]), (x, low[1] - _TICK * size)]
+        _add_text(entity, number_text(x), (x, low[1] - (_TICK + _FONT) * size), height, _FONT * size)
+    for y in _round_numbers(low[1], high[1]):
+        ticks += [(low[0], y), (low[0] - _TICK * size, y)]
+        text = number_text(y)
+        left = low[0] - (2.0 * _TICK + _half_width(text)) * size
+        _add_text(entity, text, (left, y), height, _FONT * size)
+    entity.lines.append(_line(ticks, height, NEUTRAL, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS))
+
+
+def _add_scale(
+    entity: SceneEntity,
+    low: tuple[float, float],
+    high: tuple[float, float],
+    height: float,
+    scale: float,
+    margin: float,
+) -> None:
+    """Add the colour bar on the right, with numbers at its ends, at 0 and at the margin."""
+    size = max(high[0] - low[0], high[1] - low[1])
+    left, right = high[0] + _GAP * size, high[0] + (_GAP + _BAR) * size
+    numbers = np.linspace(-scale, scale, _SHADES)
+    levels = np.linspace(low[1], high[1], _SHADES)
+    bar = entity.triangles.add()
+    bar.pose.position.z, bar.pose.orientation.w = height, 1.0
+    for level, colour in zip(levels.tolist(), (cell_colours(numbers) / 255.0).tolist(), strict=True):
+        for x in (left, right):
+            bar.points.add(x=x, y=level)
+            bar.colors.add(r=colour[0], g=colour[1], b=colour[2], a=colour[3])
+    for first in range(0, 2 * (_SHADES - 1), 2):
+        bar.indices.extend((first, first + 1, first + 2, first + 1, first + 3, first + 2))
+    ticks: list[tuple[float, float]] = []
+    levels_of_texts: list[float] = []
+    for number in dict.fromkeys((0.0, scale, -scale, margin)):
+        level = (low[1] + high[1]) / 2.0 + number / scale * (high[1] - low[1]) / 2.0
+        if abs(number) > scale:
+            continue
+        ticks += [(left, level), (right + _TICK * size, level)]
+        if all(abs(level - before) >= _FONT * size for before in levels_of_texts):
+            levels_of_texts.append(level)
+            text = number_text(number)
+            x = right + (2.0 * _TICK + _half_width(text)) * size
+            _add_text(entity, text, (x, level), height, _FONT * size)
+    entity.lines.append(_line(ticks, height, NEUTRAL, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS))
+
+
+def _half_width(text: str) -> float:
+    """Return half the width of a number, by the size of a map; digits are half as wide as high."""
+    return 0.25 * _FONT * (len(text) + 1)
+
+
+def _round_numbers(low: float, high: float) -> Iterator[float]:
+    """Yield the multiples of a round number in an interval, at most `_MOST_TICKS`."""
+    least = (high - low) / (_MOST_TICKS - 1)
+    power = 10.0 ** math.floor(math.log10(least))
+    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))
+    for place in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
+        yield place * step
+
+
+def _add_text(
+    entity: SceneEntity, text: str, place: tuple[float, float], height: float, font_size: float
+) -> None:
+    """Add a text that is as large as the map is, however far away a viewer looks from."""
+    label = entity.texts.add(billboard=True, font_size=font_size, text=text)
+    label.pose.position.x, label.pose.position.y, label.pose.position.z = *place, height
+    label.pose.orientation.w = 1.0
+    label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
+
+
+def path_message(
+    target: Target | None,
+    tracked: TrackedObject | None,
+    time_ns: int,
+    travelled: Sequence[tuple[float, float]] = (),
+) -> SceneUpdate:
+    """Return the path to a target, the object's outline there and the path travelled, as a message.
+
+    Without a target, the message deletes what was drawn before.
+    """
+    lines: dict[str, list[LinePrimitive]] = {_PATH: [], _TRAVELLED: []}
+    if target is not None and tracked is not None:
+        height = 0.0 if tracked.height is None else tracked.height[1]
+        lines[_PATH] = _path_lines(target, tracked, height, POSITIVE)
+        if travelled:
+            lines[_TRAVELLED] = [_line(travelled, height, NEUTRAL)]
+    message = SceneUpdate()
+    for identifier, lines_of_entity in lines.items():
+        if lines_of_entity:
+            entity = message.entities.add(id=identifier, frame_id=FRAME, lines=lines_of_entity)
+            entity.timestamp.FromNanoseconds(time_ns)
+        else:
+            deletion = message.deletions.add(type=SceneEntityDeletion.MATCHING_ID, id=identifier)
+            deletion.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def _path_lines(
+    target: Target,
+    tracked: TrackedObject,
+    height: float,
+    colour: tuple[float, float, float],
+    pixels: float = _PIXELS,
+) -> list[LinePrimitive]:
+    """Return the path to a target, then the object's outlines there."""
+    at_target = moved_object(tracked, target.x, target.y, target.turn)
+    rings = [ring.tolist() for ring in outlines_of(at_target.footprint)]
+    outlines = [_line(ring, height, colour, LinePrimitive.LINE_LOOP, pixels=pixels) for ring in rings]
+    return [_line(target.waypoints, height, colour, pixels=pixels), *outlines]
+
+
+def _line(
+    points: Iterable[Sequence[float]],
+    height: float,
+    colour: tuple[float, float, float],
+    kind: LinePrimitive.Type.ValueType = LinePrimitive.LINE_STRIP,
+    *,
+    pixels: float = _PIXELS,
+) -> LinePrimitive:
+    line = LinePrimitive(type=kind, thickness=pixels, scale_invariant=True)
+    line.pose.position.z, line.pose.orientation.w = height, 1.0
+    for x, y in points:
+        line.points.add(x=x, y=y)
+    line.color.r, line.color.g, line.color.b, line.color.a = *colour, 1.0
+    return line
