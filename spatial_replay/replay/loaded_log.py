@@ -34,7 +34,13 @@ from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import idle_templates
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.replay.engine import Replayed, dropped_samples, replayed_specs, with_stretches
+from spatial_replay.replay.engine import (
+    Replayed,
+    dropped_samples,
+    planned_result,
+    replayed_specs,
+    with_stretches,
+)
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     KEEP_ALL,
@@ -240,6 +246,7 @@ class LoadedLog:
         doubts: assumptions that the log contradicts.
         missing: a warning for each name in the specifications that the log never has.
         dropped: the samples that its recorder had no time for.
+        planned: the name of the result that a planner worked for; "" without any.
     """
 
     def __init__(
@@ -288,6 +295,7 @@ class LoadedLog:
             raise selection.nothing_to_evaluate(self.faults)
         self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
+        self.planned = planned_result(source)
         self.first_ns = log_zero_ns(source, options.window, ends)
         self.doubts = distinct_doubts(doubts, self.first_ns)
         self._needs, self._has_spans = ends.needs, ends.has_spans
@@ -516,7 +524,8 @@ class Evaluated:
         contents = self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics)
         order = worst_first(self.replayed.results)
         zero = TextZero(self.loaded.first_ns, int(self.loaded.inside.times_ns[0]), "this playback")
-        return layout_attachment(contents._replace(order=order, zero=zero), live=True)
+        contents = contents._replace(order=order, zero=zero, planned=self.loaded.planned)
+        return layout_attachment(contents, live=True)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Return samples `begin` to before `end` of those in the window, with their evaluation."""

@@ -268,6 +268,9 @@ def test_every_path_of_the_layout_is_in_the_messages(name: str, tmp_path: Path) 
     layout = json.loads(evaluated.layout.data)
     assert panels(layout) == set(layout["configById"])
     assert {"Plot!whole", "Parameters!constants"} <= set(layout["configById"])
+    tabs = layout["configById"]["Tab!details"]
+    is_planned = tabs["tabs"][tabs["activeTabIdx"]]["layout"] == "RawMessages!decision"
+    assert is_planned == (name == "push.mcap")
     paths = paths_of(layout["configById"])
     assert any(path.startswith(CURVES_TOPIC) for path in paths)
     for path in paths:
