@@ -469,7 +469,7 @@ _Details = list[tuple[str, Panel]]
 
 
 def _details(contents: LayoutContents) -> _Details:
-    """Return the panels that are in tabs, those of violations first."""
+    """Return the panels that are in tabs, that of violations first; in a log without any, that of events."""
     trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
     # the seconds in both tables are not those of the axes
     clock = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
@@ -477,7 +477,9 @@ def _details(contents: LayoutContents) -> _Details:
     if trees:
         rows.append(("violated", "Table!violated", f"Violated results{clock}", f"{STANDING}.violated"))
     if trees and RECENT_EVENTS in contents.topics:
-        rows.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
+        events = ("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events")
+        is_empty = contents.outcomes and all(outcome.standing != VIOLATED for outcome in contents.outcomes)
+        rows.insert(0 if is_empty else 1, events)
     if trees:
         # a list of texts is shown centred, one text is not
         which = "0" if all(tree.file == 0 for tree in trees) else ":"

@@ -102,6 +102,8 @@ def test_the_scene_has_half_of_the_window_and_details_are_in_tabs(tmp_path):
         "specification",
         "automaton",
     ]
+    held = layout_of(run(tmp_path, "spec apart = G a farfrom[0] b"))
+    assert held["configById"]["Tab!details"]["tabs"][0]["title"] == "events"
 
 
 def test_curves_have_their_values_and_140_pixels_on_a_small_screen(tmp_path):
