@@ -731,11 +731,10 @@ def test_a_printed_page_has_the_specification_open(open_page: Open) -> None:
 
 def test_what_uncertainty_leaves_open_is_shown_as_open(open_page: Open) -> None:
     page = open_page("unsure")
-    between = "between -0.2 and 0.4"
+    between = f"between {MINUS}0.2 and 0.4"
     expect(page.locator(".verdict")).to_contain_text(f"a dist ghost >= 0.5 lies {between} at 0.400 s")
     expect(page.locator(".caption")).to_have_text(
-        "the grey arrow, what leaves the verdict open: a dist ghost >= 0.5 of ghosts lies "
-        + between.replace("-", MINUS)
+        "the grey arrow, what leaves the verdict open: a dist ghost >= 0.5 of ghosts lies " + between
     )
     expect(page.locator(".tree .row.decides .mark")).to_have_text(["?", "?"])
     page.keyboard.press("Home")

@@ -86,7 +86,8 @@ def test_intervals_are_said_by_every_command_as_by_replay(capsys: pytest.Capture
         out = said(capsys, *command)[1]
         assert "nan" not in out.split(), command
         assert interval in out or "the same 300 samples" in out, command
-    assert interval in Path("page/index.html").read_text()
+    page = Path("page/index.html").read_text(encoding="utf-8")
+    assert interval.replace("inf", "∞").replace("-", "\N{MINUS SIGN}") in page
 
 
 @pytest.mark.usefixtures("folder")

@@ -280,7 +280,7 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
     assert "with `turtle1 dist turtle2 <= 1.514` instead of `turtle1 ovlp turtle2`." in said
     run(["report", "annotated.mcap", "-o", "run.html"])
     page = (folder / "run.html").read_text(encoding="utf-8")
-    assert "robustness -1.514 m" in page
+    assert "robustness \N{MINUS SIGN}1.514 m" in page
     facts = re.search(r'id="facts">(.*?)</script>', page)
     assert facts is not None
     assert {node["unit"] for each in json.loads(facts[1])["results"] for node in each["nodes"]} == {"m"}
