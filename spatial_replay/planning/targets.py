@@ -174,7 +174,10 @@ def _nearest_cell(
     if cells[0] == cell and len(cells) > 1:
         first = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
     turns = [gradient.grid.centre(*corner) for corner in cells[first:]]
-    way = _without_corners((start, *turns), gradient, free, settings)
+    way = (start, *turns)
+    # after a push that failed, a straight leg would begin too nearly in the same direction
+    if not failures:
+        way = _without_corners(way, gradient, free, settings)
     return _target(gradient, tracked, (turned, *cells[-1]), way)
 
 
