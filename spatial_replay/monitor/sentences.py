@@ -638,7 +638,8 @@ def _flip(
     elif threshold.verdict is Verdict.UNKNOWN:
         would = "It would not have been violated then"
     if _is_overlap(deciding, threshold):
-        return f"No distance {_place(deciding, threshold)} makes it {threshold.verdict}: the objects overlap."
+        place = _place(deciding, threshold)
+        return f"No distance {place} makes it {threshold.verdict}: the objects touch or overlap."
     if threshold.is_written:
         is_idle = deciding is witness.deciding and witness.missed is not None and witness.missed.is_condition
         reason = ", as the condition would not hold there" if is_idle else ""

@@ -221,6 +221,9 @@ ANY = re.compile(
 )
 REPLACED = re.compile(r"It would be (satisfied|violated) with `(.*)` instead of `.*`\.")
 MARGIN = re.compile(r"It would be (satisfied|violated) in a log in which `.*` holds by (\S+) (more|less)\.")
+NO_DISTANCE = re.compile(
+    r"No distance (?:for `(\w+)`|in `.*`) makes it (satisfied|violated): the objects touch or overlap\."
+)
 
 
 @examples(80)
@@ -241,14 +244,24 @@ def test_advice_of_an_explanation_leads_to_the_verdict_that_it_claims(
     for node, witness in witnesses.items():
         explained = result.explain(first_ns=0)
         said = " ".join(each for each in sentences_of(witness, first_ns=0) if each in explained)
-        written, beyond, replaced, margin = (
-            advice.search(said) for advice in (WRITTEN, ANY, REPLACED, MARGIN)
+        written, beyond, replaced, margin, no_distance = (
+            advice.search(said) for advice in (WRITTEN, ANY, REPLACED, MARGIN, NO_DISTANCE)
         )
         threshold = witness.closest_threshold or witness.threshold
-        assert bool(written or beyond or replaced or margin) == (threshold is not None)
+        advice_of_any_kind = written or beyond or replaced or margin or no_distance
+        assert bool(advice_of_any_kind) == (threshold is not None)
         if threshold is None:
             continue
         atom = (witness.closest[0] if witness.closest_threshold else witness.deciding).atom
+        if no_distance:
+            constant, claimed = no_distance.groups()
+            for distance in ("0", "0.001", "1000000"):
+                if constant:
+                    edited = parse_specification(text, constants={constant: float(distance)})
+                else:
+                    edited = with_number(specification, atom, repr(threshold.value), distance)
+                assert evaluate(edited, trace).result().nodes[node].verdict != claimed
+            continue
         if written or beyond:
             if written:
                 claimed, new, old, constant = written.groups()

@@ -114,7 +114,7 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "What decides is `red dist vase >= 0.1`, which fails by 0.34 at 4.000 s (its least within `safe`): "
         "red and vase overlap by 0.24.",
         "It was violated first at 3.000 s, by 0.03.",
-        "No distance in `red dist vase >= 0.1` makes it satisfied: the objects overlap.",
+        "No distance in `red dist vase >= 0.1` makes it satisfied: the objects touch or overlap.",
         "It is violated from 3.000 s to 4.000 s.",
         "`charged` is permanently violated from 4.000 s on.",
         "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "
