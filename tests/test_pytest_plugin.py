@@ -122,6 +122,7 @@ def test_a_run_without_suites_loads_nothing_of_the_package(pytester: pytest.Pyte
         "spatial_replay.errors",
         "spatial_replay.lazy",
         "spatial_replay.pytest_plugin",
+        "spatial_replay.version",
     ]
     assert done.stdout.split("]")[0] + "]" == str(wanted)
     assert done.stdout.endswith("False False\n")
