@@ -555,10 +555,11 @@ def _layout(
 def _tab_title(plot: Panel) -> str:
     """Return the title of a plot in short: "results [m]".
 
-    A tab is too narrow for footprint units; the plot's own title has them.
+    A tab is too narrow for more than 17 letters; the plot's own title has the rest.
     """
     title = str(plot.config["foxglovePanelTitle"]).removeprefix("Robustness of ")
-    return title.removesuffix(f" [{unit_words(FOOTPRINT_UNITS)}]")
+    title = title.removesuffix(f" [{unit_words(FOOTPRINT_UNITS)}]").removeprefix("named ")
+    return title.replace(" units]", "]")
 
 
 def _tabs(identifier: str, titled: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:
