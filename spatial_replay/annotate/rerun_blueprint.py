@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.errors import importing
 from spatial_replay.logs.schemas.Robustness_pb2 import Standing, StandingUpdate
-from spatial_replay.logs.topics import EVENT_LOG, STANDING
+from spatial_replay.logs.topics import EVENT_LOG, SCENE, STANDING
 from spatial_replay.palette import CURVES, hexadecimal
 
 _SOURCE: Final = f"{StandingUpdate.DESCRIPTOR.full_name}:message"
 """Name that Rerun gives to the messages of the topic."""
 _TIMELINE: Final = "message_log_time"
 _MOST_LANES: Final = 12
+_Strip: TypeAlias = tuple[list[tuple[float, float, float]], int]
 
 
 class BlueprintRow(NamedTuple):
@@ -48,11 +55,13 @@ def state_words() -> Iterator[tuple[str, str, str]]:
         yield Standing.Name(code), words, hexadecimal(colour)
 
 
-def write_blueprint(rows: Sequence[BlueprintRow], application: str, path: Path) -> None:
+def write_blueprint(
+    rows: Sequence[BlueprintRow], log: Path, path: Path, scenes: Iterable[SceneUpdate] = ()
+) -> None:
     """Write a blueprint: curves of each unit, a lane for each result, and the sentences of the log.
 
-    Args:
-        application: name of the log without its suffix, by which Rerun knows whose blueprint it is.
+    Rerun finds the blueprint of a log by its name without the suffix. A file with the suffix .rrd also has
+    the log and outlines of its scenes, because Rerun shows each file as a recording with its own time.
 
     Raises:
         UsageError: Rerun is not installed.
@@ -70,12 +79,52 @@ def write_blueprint(rows: Sequence[BlueprintRow], application: str, path: Path) 
     view = blueprint.Vertical(
         blueprint.Tabs(*curves), lanes, blueprint.TextLogView(origin=EVENT_LOG, name="Events")
     )
+    is_recording = path.suffix == ".rrd"
+    if is_recording:
+        view = blueprint.Horizontal(blueprint.Spatial3DView(origin=SCENE, name="Scene"), view)
     panels = [
         blueprint.TimePanel(state="expanded", timeline=_TIMELINE),
         blueprint.SelectionPanel(state="hidden"),
         blueprint.BlueprintPanel(state="hidden"),
     ]
-    blueprint.Blueprint(view, *panels).save(application, path)
+    layout = blueprint.Blueprint(view, *panels)
+    if is_recording:
+        _write_recording(log, path, layout, scenes)
+    else:
+        layout.save(log.stem, path)
+
+
+def _write_recording(log: Path, path: Path, layout: Any, scenes: Iterable[SceneUpdate]) -> None:
+    import rerun
+
+    times, moments = list[int](), defaultdict[str, dict[int, list[_Strip]]](dict)
+    for scene in scenes:
+        stamps = [entity.timestamp for entity in scene.entities] or [
+            deletion.timestamp for deletion in scene.deletions
+        ]
+        times += [stamp.ToNanoseconds() for stamp in stamps[:1]]
+        for entity in scene.entities:
+            strips = [strip for line in entity.lines for strip in _strips(line)]
+            if strips:
+                moments[entity.id][len(times) - 1] = strips
+    index = rerun.TimeColumn(_TIMELINE, timestamp=np.array(times, "datetime64[ns]"))
+    with rerun.RecordingStream(log.stem, recording_id=log.stem) as stream:
+        stream.save(path, default_blueprint=layout)
+        stream.log_file_from_path(log)
+        for name, rows in moments.items():
+            corners, colours = zip(*chain(*rows.values()), strict=True)
+            columns = rerun.LineStrips3D.columns(strips=corners, colors=colours)
+            counts = [len(rows.get(number, ())) for number in range(len(times))]
+            stream.send_columns(f"{SCENE}/{name}", [index], columns.partition(counts))
+
+
+def _strips(line: LinePrimitive) -> list[_Strip]:
+    """Return a line as strips; a list of segments is one for each of them."""
+    corners = [(point.x, point.y, line.pose.position.z) for point in line.points]
+    colour = _number(hexadecimal((line.color.r, line.color.g, line.color.b)))
+    step = 2 if line.type == LinePrimitive.LINE_LIST else max(len(corners), 1)
+    end = corners[: line.type == LinePrimitive.LINE_LOOP]
+    return [(corners[start : start + step] + end, colour) for start in range(0, len(corners), step)]
 
 
 def _curves(unit: str, rows: Sequence[BlueprintRow]) -> Any:

@@ -66,7 +66,11 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
 @click.option("--panels", is_flag=True, help="With --layout: one with the panels of the extension.")
-@click.option("--blueprint", is_flag=True, help="Write a blueprint for Rerun instead, to the file of -o.")
+@click.option(
+    "--blueprint",
+    is_flag=True,
+    help="Write a blueprint for Rerun instead, to the file of -o; as .rrd with the log and its scene.",
+)
 @click.option(
     "--panel",
     is_flag=True,
@@ -110,6 +114,7 @@ def info(
       spatial-replay info annotated.mcap --layout -o layout.json
       spatial-replay info annotated.mcap --layout --panels -o layout.json
       spatial-replay info annotated.mcap --blueprint -o run.rbl
+      spatial-replay info annotated.mcap --blueprint -o run.rrd
       spatial-replay info --panel
     """
     contents = {
@@ -285,23 +290,34 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
 
 def _write_blueprint(log: LogFile, output: Path | None) -> int:
     """Write which panels show an annotated log in Rerun."""
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
     from spatial_replay.annotate.rerun_blueprint import blueprint_rows, write_blueprint
     from spatial_replay.logs.mcap.read import McapSource
     from spatial_replay.logs.output_file import refuse_inputs
+    from spatial_replay.logs.remote import is_address
     from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
-    from spatial_replay.logs.topics import STANDING
+    from spatial_replay.logs.topics import SCENE, STANDING
     from spatial_replay.sources.open_log import open_source
 
     if output is None:
         raise UsageError("--blueprint writes a file that is no text; name it with -o run.rbl")
     refuse_inputs(output, [Path(str(log))])
     source = open_source(log)
-    batches = source.iter_payloads(STANDING) if isinstance(source, McapSource) else ()
-    payload = next((payload for batch, _ in batches for payload in batch), None)
-    if payload is None:
+    payload = None
+    if isinstance(source, McapSource):
+        payload = next((payload for batch, _ in source.iter_payloads(STANDING) for payload in batch), None)
+    if not isinstance(source, McapSource) or payload is None:
         raise UsageError(f"{source.name} has no results to show; replay -o writes a log that has them")
+    if output.suffix == ".rrd" and is_address(str(log)):
+        raise UsageError(
+            f"Rerun reads files; download {source.name}, or write a blueprint alone with -o run.rbl"
+        )
     rows = blueprint_rows(StandingUpdate.FromString(payload))
-    write_blueprint(rows, Path(source.name).stem, output)
+    scenes = (
+        SceneUpdate.FromString(payload) for batch, _ in source.iter_payloads(SCENE) for payload in batch
+    )
+    write_blueprint(rows, Path(str(log)), output, scenes)
     show(f"wrote {output}")
     return ExitCode.SATISFIED
 

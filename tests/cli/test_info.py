@@ -365,7 +365,17 @@ def test_a_blueprint_for_rerun_names_the_results_and_its_library(
         assert code == 2
         assert "a blueprint needs rerun, which is not installed" in capsys.readouterr().err
     else:
+        from rerun.chunk import RrdReader
+
         assert code == 0 and (tmp_path / "run.rbl").stat().st_size
+        recording = tmp_path / "run.rrd"
+        assert run(["info", str(annotated), "--blueprint", "-o", str(recording)]) == 0
+        chunks = {chunk.entity_path: chunk for chunk in RrdReader(recording).stream() if not chunk.is_static}
+        assert STANDING in chunks
+        batch = chunks["/spatial/scene/object/fork"].to_record_batch()
+        corners = batch.column(batch.schema.names.index("LineStrips3D:strips"))[0][0].as_py()
+        assert corners[0] == corners[-1] and len(corners) > 3
+        assert len(RrdReader(recording).blueprints()) == 1
 
 
 def test_for_a_log_without_a_layout_the_error_says_how_to_get_one(
