@@ -657,7 +657,9 @@ def best_robustness(candidate: PlanCandidate) -> float:
 def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
     """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
     for conjunct in limiting_conjuncts(candidate)[:MOST_LISTED]:
-        at_target = f", {conjunct.at_target:.4g} at the target" if conjunct.HasField("at_target") else ""
+        at_target = (
+            f", {conjunct.at_target:.4g} in the target's cell" if conjunct.HasField("at_target") else ""
+        )
         yield "limited by", f"{conjunct.text} in {plural(conjunct.limits, 'cell')}{at_target}"
     for cause in candidate.causes[:MOST_LISTED]:
         yield "blocked by", f"{cause_text(cause)} in {plural(cause.cells, 'cell')}"

@@ -869,8 +869,14 @@ def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
     best = max(at_target, owner.target.robustness)
     will_do, higher = int((drawn.values >= decision.margin).sum()), int((drawn.values > best).sum())
     enough = f"{will_do:,} of {plural(drawn.values.size, 'cell')} will do"
+    in_cell, robustness = f"{at_target:.4g}", f"{owner.target.robustness:.4g}"
+    between = (
+        f" The target lies between cells and has {robustness}; demands are those in the middle of its cell, "
+        f"which has {in_cell}."
+    )
+    between *= in_cell != robustness
     if not higher:
-        return f"{enough}, and none has a higher robustness than the target."
+        return f"{enough}, and none has a higher robustness than the target.{between}"
     edge = decision.considered[owner.edge]
     if edge.joint and len(edge.motions) > 1:
         rule = f"the places of {len(edge.motions)} motions are chosen together"
@@ -878,7 +884,7 @@ def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
         rule = "a robot that pushes takes the nearest"
     else:
         rule = "cells with enough room come first" if owner.candidate.HasField("room") else ""
-    return f"{enough}, {higher:,} with a higher robustness than the target{rule and f': {rule}'}."
+    return f"{enough}, {higher:,} with a higher robustness than the target{rule and f': {rule}'}.{between}"
 
 
 def _value_at(drawn: _Drawn, target: PlanTarget) -> float | None:

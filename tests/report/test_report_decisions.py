@@ -194,7 +194,12 @@ def test_the_only_map_of_a_decisions_time_is_the_chosen_one() -> None:
             "motions are chosen together.",
         ),
         # refined between the middles of cells
-        (False, 2.5, "6 of 6 cells will do, and none has a higher robustness than the target."),
+        (
+            False,
+            2.5,
+            "6 of 6 cells will do, and none has a higher robustness than the target. The target lies between "
+            "cells and has 2.5; demands are those in the middle of its cell, which has 1.",
+        ),
     ],
 )
 def test_a_target_says_by_which_rule_it_was_chosen(is_joint: bool, robustness: float, why: str) -> None:
