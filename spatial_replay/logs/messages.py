@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from spatial_replay.geometry.arrays import Integers, concatenate_tables, equal_p
 from spatial_replay.trace.doubts import Doubt
 from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import LATEST_NS, Trace
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from functools import wraps
 from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from spatial_replay.text import Sentence, encodable
 from spatial_replay.trace.trace import Pauses, ReportsBack, Sample, Trace, within
 from spatial_replay.trace.track_evidence import TrackEvidence
 from spatial_replay.trace.units import OUR_AXES, Axes
-
-if TYPE_CHECKING:
-    pass
 
 BLOCK_SAMPLES = 12_288
 """A block holds at most this many samples, so that memory stays bounded whatever the log's length."""

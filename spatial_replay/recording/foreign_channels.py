@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from reprlib import repr as shortened
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
@@ -15,10 +15,6 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.logs.topics import GRADIENT_MAP, MAP_DRAWING, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.text import listing
-
-if TYPE_CHECKING:
-    pass
-
 
 SchemaLike: TypeAlias = Mapping[str, Any] | str | bytes | type[Message] | None
 """A JSON schema, as a dict or its text; a protobuf class; a definition, as its text or bytes; or none."""

@@ -11,17 +11,13 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from reprlib import repr as shortened
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.logs.messages import Channel, Messages, Row
 from spatial_replay.recording.foreign_channels import MessageData, payload_encoder
 from spatial_replay.text import times_apart
 from spatial_replay.trace.trace import LATEST_NS
-
-if TYPE_CHECKING:
-    pass
-
 
 MOST_WAITING_BYTES: Final = 64 * 2**20
 """The most bytes of messages that wait to be written; one message that is larger waits alone."""

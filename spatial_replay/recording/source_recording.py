@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.errors import LogError, OutputError, UsageError
@@ -24,9 +24,6 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted_from
 from spatial_replay.trace.doubts import Doubt, distinct_doubts, metadata_from_doubts
 from spatial_replay.trace.trace import Trace, checked_units
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True)
