@@ -119,7 +119,7 @@ def _write_recording(log: Path, path: Path, layout: Any, scenes: Iterable[SceneU
 
 
 def _strips(line: LinePrimitive) -> list[_Strip]:
-    """Return a line as strips; a list of segments is one for each of them."""
+    """Return the strips of a line; a list of segments has a strip for each segment."""
     corners = [(point.x, point.y, line.pose.position.z) for point in line.points]
     colour = _number(hexadecimal((line.color.r, line.color.g, line.color.b)))
     step = 2 if line.type == LinePrimitive.LINE_LIST else max(len(corners), 1)

@@ -157,7 +157,7 @@ class StandingEncoder:
     def encode_changes(
         self, blocks: Sequence[SeriesBlock], over: Sequence[str], most: int
     ) -> tuple[Integers, Sequence[bytes]]:
-        """Take in the next samples; return times and contents of a message for each of the last changes.
+        """Take the next samples; return the time and the content of one message for each of the last changes.
 
         A change is the first sample, or one in which an entry stands otherwise than in the sample before.
 

@@ -543,7 +543,7 @@ def digraph_text(automaton: Automaton, legend: Sequence[str] = ()) -> str:
 
 
 def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
-    """Return for each state that is shown, the moves from it to others that are."""
+    """Return the transitions from each drawn state to other drawn states."""
     shown_states = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
     ends = [
         (state, target)

@@ -173,7 +173,7 @@ def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[in
 
 
 def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
-    """Return for each state the longest way there, in transitions that do not lead back."""
+    """Return the length of the longest path to each state, without transitions that lead back."""
     ended: list[int] = []
     on_way: set[int] = set()
     back: set[tuple[int, int]] = set()

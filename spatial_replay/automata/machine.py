@@ -225,7 +225,7 @@ def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterab
 
 
 def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
-    """Return for each place the rows that lead to it at once, and ~q if the moves of state q begin there."""
+    """Return what leads to each place at once: numbers of rows, and ~q if state q begins there."""
     above: dict[int, list[int]] = {}
     for number, (_, low, high) in enumerate(rows):
         above.setdefault(low, []).append(number)

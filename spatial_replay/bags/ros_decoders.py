@@ -208,7 +208,7 @@ def _without_enum(field: Field, definitions: Definitions, enums: Collection[str]
 def _check_idl(text: str, type_name: str) -> None:
     """Check that a text in IDL can be parsed in seconds.
 
-    The parser tries nested parentheses in ever more ways, and takes milliseconds for each annotation.
+    The parser's time grows fast with the depth of parentheses. It needs milliseconds for each annotation.
     """
     bare = _IDL_ASIDE.sub(" ", text) if len(text) <= _LONGEST_IDL else ""
     what = None

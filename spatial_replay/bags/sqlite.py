@@ -261,7 +261,7 @@ _MOST_TOPICS = 100_000
 _STEPS = 10_000
 """Steps of SQLite's virtual machine between two looks at how many it has taken."""
 _STEPS_A_BYTE = 20
-"""Steps that a sound file may take for each of its bytes; a damaged one may lead in circles."""
+"""The most steps for each byte of a file. The pages of a damaged file can form a cycle."""
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
 _MOST_PROBES = 10_000

@@ -547,7 +547,7 @@ def _label_places(
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:
-    """Return a level for each size: half the size is one level higher. An unknown size has level 0."""
+    """Return the level of each size: half the size has the next level. An unknown size has level 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         levels = np.round(LEVELS / 2.0 - np.log2(sizes / scale))
     # fmax takes the 0 where the level is NaN
