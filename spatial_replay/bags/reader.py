@@ -177,7 +177,7 @@ def _push_next(active: _Active, number: int, following: Columns) -> None:
 DISORDER_NS = 10**9
 """How far messages may be out of order by default: recorders write topics from several threads."""
 JUMP_REMEDY = (
-    "max_lateness='5s' (--max-lateness 5s) takes messages that come later, 'all' sorts the whole log;"
+    "max_lateness='5s' (--read max_lateness=5s) takes messages that come later, 'all' sorts the whole log;"
     " on_time_jump='split' (--read on_time_jump=split) ends it where its clock jumps"
 )
 

@@ -94,6 +94,8 @@ FAMILIES = {
 """Commands that share the module of another one."""
 
 FORMER_OPTIONS = {
+    "--max-gap": "write --read max_gap=T",
+    "--max-lateness": "write --read max_lateness=T",
     "--plugin": "allow the module in pyproject.toml: [tool.spatial-replay] plugins = [MODULE]",
     "--profile": "write `use spatial_spec` in the first line of the specification",
     "--result": "explain takes it: spatial-replay explain LOG --spec SPEC --result NAME",

@@ -15,7 +15,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
-    OTHER_READING,
+    READING_KEYS,
     JsonCommand,
     LogPath,
     constants_option,
@@ -249,7 +249,7 @@ class _Compared:
 def _refuse_log_options(reading: Reading, strict_names: bool) -> None:
     """Refuse options that say something about a log where there is none."""
     for name in [*reading, *(["strict_names"] if strict_names else [])]:
-        option = f"--read {name}" if name in OTHER_READING else f"--{name.replace('_', '-')}"
+        option = f"--read {name}" if name in READING_KEYS else f"--{name.replace('_', '-')}"
         raise UsageError(f"{option} applies to the log to compare with; add --log LOG")
 
 

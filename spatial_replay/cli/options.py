@@ -272,7 +272,9 @@ def add_options(options: Sequence[_Option], command: Callable[..., Any]) -> Call
     return command
 
 
-OTHER_READING = {
+READING_KEYS = {
+    "max_gap": "objects are unknown in longer pauses, such as 1s",
+    "max_lateness": "how late messages of an external log may be, such as 5s or all",
     "rate": "frames a second of drone annotations",
     "lost": "keep boxes of drone annotations that are marked as lost",
     "y_down": "y points down in tracks or annotations",
@@ -287,8 +289,8 @@ def _read_pairs(
     pairs: dict[str, object] = {}
     for text in texts:
         key, _, value = text.partition("=")
-        if key not in OTHER_READING or not value:
-            raise UsageError(f"--read {text!r:.100}: give KEY=VALUE with one of {', '.join(OTHER_READING)}")
+        if key not in READING_KEYS or not value:
+            raise UsageError(f"--read {text!r:.100}: give KEY=VALUE with one of {', '.join(READING_KEYS)}")
         try:
             pairs[key] = {"true": True, "false": False}.get(value) if key == "y_down" else float(value)
         except ValueError:
@@ -306,22 +308,12 @@ _READING = (
         help="Mapping file (YAML) of an external log: topics and their objects.",
     ),
     click.option(
-        "--max-lateness",
-        metavar="T|all",
-        help="By how much messages of an external log may be late.  [default: 1s]",
-    ),
-    click.option(
-        "--max-gap",
-        metavar="T",
-        help="Objects are unknown in longer pauses of the log or their topic.",
-    ),
-    click.option(
         "--read",
         metavar="KEY=VALUE",
         multiple=True,
         callback=_read_pairs,
-        help="Other options of reading: rate=29.97, lost=keep, y_down=true, concave=hull,"
-        " on_time_jump=split; repeat for several.",
+        help="How to read the log: max_gap=1s, max_lateness=5s, on_time_jump=split, rate=29.97, lost=keep,"
+        " y_down=true, concave=hull; repeat for several.",
     ),
 )
 
@@ -330,10 +322,8 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say how to read a log; the command takes the given ones as `reading`."""
 
     @wraps(command)
-    def gathering(*, read: dict[str, object], **arguments: Any) -> Any:
-        options = {name: arguments.pop(name) for name in ("mapping", "max_lateness", "max_gap")}
-        reading = {name: value for name, value in options.items() if value is not None} | read
-        return command(reading=reading, **arguments)
+    def gathering(*, read: dict[str, object], mapping: LogFile | None, **arguments: Any) -> Any:
+        return command(reading=read if mapping is None else {"mapping": mapping} | read, **arguments)
 
     return add_options(_READING, gathering)
 

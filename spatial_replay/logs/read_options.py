@@ -162,8 +162,8 @@ _REASONS = {
 
 def _option(name: str, value: object) -> str:
     """Return an option as given on the command line, and as an argument in Python."""
-    if name in ("mapping", "max_lateness", "max_gap"):
-        return f"--{name.replace('_', '-')} {value} ({name}={value!r})"
+    if name == "mapping":
+        return f"--mapping {value} (mapping={value!r})"
     return f"--read {name}={str(value).lower()} ({name}={value!r})"
 
 

@@ -356,7 +356,7 @@ def test_messages_may_be_as_late_as_is_said(tmp_path: Path, mapping: Path) -> No
     # a detector that takes three seconds
     late = [*sent[:20], *sent[24:90], *sent[20:24], *sent[90:]]
     log = write_ros1(tmp_path / "late.bag", late, chunk_bytes=10**6)
-    with pytest.raises(LogError, match=r"time jumps back.* at \d\.\d{3} s.*--max-lateness 5s"):
+    with pytest.raises(LogError, match=r"time jumps back.* at \d\.\d{3} s.*--read max_lateness=5s"):
         read_trace(log, mapping=mapping)
     assert read_trace(log, mapping=mapping, max_lateness="5s") == expected
     assert read_trace(log, mapping=mapping, max_lateness="all") == expected

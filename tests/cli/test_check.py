@@ -101,6 +101,11 @@ def test_names_are_compared_with_those_in_a_log(
     assert capsys.readouterr().out.endswith("all names, thresholds and windows fit\n")
 
 
+def test_a_former_option_of_reading_names_its_key(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", "drive.bag", "--max-lateness", "5s"]) == 2
+    assert "no option --max-lateness; write --read max_lateness=T" in capsys.readouterr().err
+
+
 def test_a_use_line_chooses_the_profile_instead_of_an_option(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

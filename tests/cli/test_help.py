@@ -11,7 +11,7 @@ from spatial_replay.cli.application import application
 
 COLUMNS = 100
 MOST_LINES = 50
-MOST_OPTIONS = 335
+MOST_OPTIONS = 320
 
 
 def commands(group: click.Group, path: str) -> Iterator[tuple[str, click.Command]]:

@@ -296,7 +296,7 @@ def test_stamps_may_be_as_late_as_is_said(batch: int) -> None:
         feed.add("/slow", at + 1, pose_stamped(tick, 5, time_ns=late))
     text = "clock: header\ntopics: {/quick: {}, /slow: {max_age: forever}}"
     with pytest.raises(
-        LogError, match=r"time jumps back by \d\.\d{3} s, from \d\.\d{3} s to .*--max-lateness 5s"
+        LogError, match=r"time jumps back by \d\.\d{3} s, from \d\.\d{3} s to .*--read max_lateness=5s"
     ):
         make(text, feed, batch=batch)
     for late_ns in (5 * SECOND, LATEST_NS):

@@ -296,7 +296,7 @@ def test_logs_keep_the_times_of_reports(
     capsys.readouterr()
     assert run(["replay", "clip.mcap", "--spec", "s.spatial"]) == 1
     assert "by 0.1 m/s" in capsys.readouterr().out
-    assert run(["replay", "run.mcap", "--spec", "s.spatial", "--max-gap", "40ms"]) == 4
+    assert run(["replay", "run.mcap", "--spec", "s.spatial", "--read", "max_gap=40ms"]) == 4
     assert read_trace("annotated.mcap") == Trace.from_samples(slow_reports())
 
 

@@ -82,9 +82,9 @@ def test_samples_that_only_fill_a_pause_do_not_count(
 ) -> None:
     spec = tmp_path / "far.spatial"
     spec.write_text("region wall = box(50, 0, 51, 1)\nspec far = G (cup dist wall >= 1 and cap ovlp cup)\n")
-    assert run(["check", str(spec), "--log", str(log), "--max-gap", "2s"]) == 0
+    assert run(["check", str(spec), "--log", str(log), "--read", "max_gap=2s"]) == 0
     assert "compared with 40 samples of run.jsonl" in capsys.readouterr().out
-    assert run(["explain", str(log), "--spec", str(spec), "--max-gap", "2s"]) == 4
+    assert run(["explain", str(log), "--spec", str(spec), "--read", "max_gap=2s"]) == 4
     assert "cap is missing in every sample" in capsys.readouterr().out
 
 
