@@ -289,7 +289,7 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("rat=30", "give KEY=VALUE with one of rate, lost, y_down, concave, on_time_jump"),
+        ("rat=30", "give KEY=VALUE with one of max_gap, max_lateness, rate, lost"),
         ("lost", "give KEY=VALUE"),
         ("y_down=perhaps", "give y_down=true or y_down=false"),
         ("rate=fast", "rate is 'fast'; give frames a second"),
