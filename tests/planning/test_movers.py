@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import islice, pairwise
+from itertools import islice, pairwise, product
 
 import numpy as np
 import pytest
 
 import spatial_replay as sr
+from examples import cases
 from planning.kinematics import block
 from spatial_replay import Planner, Settings
 from spatial_replay.geometry.measure import contact
@@ -102,7 +103,9 @@ def past_a_person(skill, speed, phase):
 
 
 @pytest.mark.parametrize("skill", ["place", "push"])
-@pytest.mark.parametrize(("speed", "phase"), [(0.1, 10), (0.3, 3), (0.3, 13)])
+@pytest.mark.parametrize(
+    ("speed", "phase"), cases([*product((0.1, 0.3), range(16))], quick=[(0.1, 10), (0.3, 3), (0.3, 13)])
+)
 def test_an_object_keeps_away_from_a_person_who_walks_to_and_fro(speed, phase, skill):
     assert act(*past_a_person(skill, speed, phase)) == ("hold", "satisfied")
 
@@ -156,7 +159,7 @@ def test_a_wait_for_others_is_logged_with_its_reason_and_counts_no_attempt(tmp_p
     assert recompute_decisions(open_source(path)).differences == ()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", cases(range(12), quick=range(5)))
 def test_two_pushed_boxes_change_places_without_a_stop(seed):
     random = np.random.default_rng(seed)
     (ax, ay), (bx, by) = random.uniform((0.2, 0.3), (0.45, 0.7)), random.uniform((0.75, 0.3), (1.0, 0.7))
