@@ -1,4 +1,4 @@
-"""Array types of the numerical rooms, and helpers for ragged rows.
+"""Array types, ragged rows, and tables as dataclasses of columns.
 
 Ragged rows keep rows of unequal length in one flat array: row r is `values[start[r] : start[r + 1]]`.
 """
@@ -25,24 +25,26 @@ Flags: TypeAlias = NDArray[np.int8]
 Booleans: TypeAlias = NDArray[np.bool_]
 
 Empty: TypeAlias = Callable[[tuple[int, ...]], Floats]
-"""Returns an array of some shape whose numbers are not set yet, as `numpy.empty` does."""
+"""Allocator of arrays by shape, like `numpy.empty`; the numbers are not set."""
 
 
 _Number = TypeVar("_Number", np.float64, np.int64)
 
 _LARGE_BYTES: Final = 2**24
-"""Arrays of this size and more lie in a file, if the disk has room."""
+"""Size from which arrays lie in a temporary file, bytes; a full disk leaves them in memory."""
 
 
 def roomy(shape: tuple[int, ...], dtype: type[_Number]) -> NDArray[_Number]:
-    """Return an array whose numbers are not set yet; a large one lies in a temporary file.
+    """Return an array whose numbers are not set; a large one is mapped from a temporary file.
 
-    Its pages can leave memory, unlike those of other arrays: a long log then needs room on a disk instead.
+    The system can write pages of a mapped file to disk, so that a long log needs disk instead of memory. For
+    a million samples and 30 parts, memory fell from 0.64 to 0.25 GB.
     """
     size = np.dtype(dtype).itemsize * math.prod(shape)
     if size >= _LARGE_BYTES:
         with suppress(OSError), tempfile.TemporaryFile() as file:
-            os.posix_fallocate(file.fileno(), 0, size)  # otherwise a full disk would end the process later
+            # without reserved blocks, a later write to a full disk would end the process by SIGBUS
+            os.posix_fallocate(file.fileno(), 0, size)
             return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
     return np.empty(shape, dtype)
 
@@ -71,7 +73,7 @@ def read_only_integers(values: ArrayLike) -> Integers:
 def writable(values: NDArray[_Number]) -> NDArray[_Number]:
     """Return a contiguous, writable view, or a copy where a view is not possible.
 
-    A kernel would be compiled once more for arrays that are read-only.
+    Read-only arrays have another type in Numba, so that a kernel would be compiled once more for them.
     """
     view = np.ascontiguousarray(values).view()
     try:
@@ -82,7 +84,7 @@ def writable(values: NDArray[_Number]) -> NDArray[_Number]:
 
 
 def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
-    """Return where each of n rows of the given lengths begins and the last one ends, (n + 1,)."""
+    """Return the starts of n rows of the given lengths, then the end of the last one, (n + 1,)."""
     start = np.zeros(len(counts) + 1, np.int64)
     np.add.accumulate(np.asarray(counts, np.int64), out=start[1:])
     return start
@@ -91,14 +93,14 @@ def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
 def flat_index(first: Integers, counts: Integers) -> Integers:
     """Return the flat indices of the elements of rows starting at `first` (n,) with lengths `counts` (n,)."""
     if len(counts) and (counts == counts[0]).all():
-        # as where all outlines have four corners
+        # the common case, such as boxes only
         return np.asarray((first[:, None] + np.arange(counts[0], dtype=np.int64)).reshape(-1))
     begins = starts_from_counts(counts)
     return np.asarray(np.repeat(first - begins[:-1], counts) + np.arange(begins[-1], dtype=np.int64))
 
 
 def count_in_rows(flags: Booleans, start: Integers) -> Integers:
-    """Count the flags set in each row; rows may be empty."""
+    """Return how many flags are set in each row; rows may be empty."""
     if not flags.any():
         return np.zeros(len(start) - 1, np.int64)
     total = starts_from_counts(flags.astype(np.int64))
@@ -106,10 +108,11 @@ def count_in_rows(flags: Booleans, start: Integers) -> Integers:
 
 
 _MOST: Final = 2**62
+"""Largest product of column widths, which keeps combined codes within int64."""
 
 
 def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
-    """Return (length,) a number that is equal exactly where all columns of whole numbers are."""
+    """Return codes (length,), equal exactly in rows whose numbers are equal in all columns of integers."""
     code, most = np.zeros(length, np.int64), 1
     for column in columns:
         if not length or (column == column[0]).all():
@@ -124,13 +127,13 @@ def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
 
 
 def _ranks(column: Integers) -> tuple[Integers, int]:
-    """Return the rank of each number among those that there are, and how many there are."""
+    """Return dense ranks of numbers and the count of distinct numbers."""
     kinds, ranks = np.unique(column, return_inverse=True)
     return ranks.astype(np.int64), len(kinds)
 
 
 def equal_places(code: Integers) -> Iterator[Integers]:
-    """Yield the places (K,) of each value, in their order."""
+    """Yield the indices (K,) of each distinct code, in ascending order of codes."""
     if len(code) and (code == code[0]).all():
         yield np.arange(len(code))
         return
@@ -143,9 +146,9 @@ _Table = TypeVar("_Table")
 
 
 def select(table: _Table, rows: Integers | slice) -> _Table:
-    """Return some rows of a dataclass of columns, in the order given.
+    """Return the given rows of a dataclass of columns, in the order given.
 
-    Its arrays and sequences have one element for each row; all rows share its mappings.
+    Arrays and sequences are columns with one element per row. Mappings are shared by all rows.
     """
     if isinstance(rows, slice):
         return _map_columns(table, lambda name: getattr(table, name)[rows])
@@ -161,7 +164,7 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
 
 
 def concatenate_tables(tables: Sequence[_Table]) -> _Table:
-    """Join dataclasses of columns, at least one, with the mappings of the last; see `select`."""
+    """Join one or more dataclasses of columns by rows; mappings come from the last (see `select`)."""
     if len(tables) == 1:
         return tables[0]
 

@@ -1,6 +1,6 @@
-"""Footprints: the shapes that objects and regions cover in the plane, alone or many in flat arrays.
+"""Footprints: the areas that objects and regions cover in the plane, singly or as ragged rows.
 
-Their centres, and footprints moved and turned, are here, too.
+The module also computes centres, and moves and turns footprints.
 """
 
 from __future__ import annotations
@@ -44,26 +44,27 @@ Concave: TypeAlias = Literal["decompose", "hull"]
 
 _pack_part: Final = Struct("=2d").pack
 _OF_VERTEX: Final = 16
-"""Bytes of a vertex, and of what comes before the first."""
+"""Size of a packed vertex, and of the header (vertex count, radius) before the first one, bytes."""
 _pack_object: Final = Struct("=5d").pack
 PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(5)
-"""The numbers of a packed object: how many parts it has, NaN for a height or a yaw that it does not have."""
+"""Indices of the numbers of a packed object; heights and yaw are NaN if missing."""
 _PLAIN: Final = _pack_object(1.0, math.nan, math.nan, math.nan, 0.0)
-"""Packed form that most objects share."""
+"""Packed object of one part without height, yaw and uncertainty, as most objects are."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class ConvexPart:
-    """A rounded convex polygon: the Minkowski sum of its hull with a disc.
+    """A rounded convex polygon: the Minkowski sum of a convex polygon and a disc.
 
-    Two parts are equal when their radii and their rings of vertices are, wherever the rings start.
+    Two parts are equal if their radii and their rings of vertices are equal. The ring's first vertex does
+    not matter.
 
     Attributes:
-        vertices: (n, 2) float64, read-only, counter-clockwise, no repeated or collinear ones; one
-            vertex is a point (with a radius: a disc), two are a segment (a capsule).
+        vertices: (n, 2) float64, read-only, counter-clockwise, none repeated or collinear. One vertex is a
+            point (with a radius: a disc), two are a segment (a capsule).
         radius: rounding radius in footprint units, at least 0.
-        packed: how many vertices there are, the radius, x and y of each vertex, as bytes of doubles: what a
-            monitor gives to its kernel. The vertices are a view of it, made when asked for.
+        packed: number of vertices, radius, and x and y of each vertex, as bytes of doubles. A monitor copies
+            them to its kernel. `vertices` is a view of these bytes, made on demand.
 
     Raises:
         GeometryError: no vertex, coordinates that are not finite, vertices that are not convex, a
@@ -104,7 +105,7 @@ class ConvexPart:
 
 
 def _fill(part: ConvexPart, corners: bytes, radius: float) -> None:
-    """Give a part its numbers, which are checked already."""
+    """Set the numbers of a part without checks."""
     object.__setattr__(part, "radius", radius)
     object.__setattr__(part, "packed", _pack_part(len(corners) // _OF_VERTEX, radius) + corners)
 
@@ -116,18 +117,20 @@ def _checked_part(corners: bytes, radius: float = 0.0) -> ConvexPart:
 
 
 def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[ConvexPart]:
-    """Return P parts, checked and corrected all at once.
+    """Return P parts, checked and corrected together.
 
     Args:
-        start: (P + 1,) where the vertices of each begin and end.
-        vertices: (V, 2), radius: (P,).
+        start: (P + 1,), starts of the parts in `vertices`, then the end of the last.
+        vertices: (V, 2), in footprint units.
+        radius: (P,), rounding radius of each part.
 
     Raises:
-        GeometryError: as `ConvexPart`.
+        GeometryError: a part is invalid; see `ConvexPart`.
     """
     outlines = normalise_polygons(start, vertices)
     if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
         parts = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
+        # one by one, so that the first faulty part raises its own error
         return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in parts]
     corners, ends = outlines.vertices.tobytes(), (_OF_VERTEX * outlines.vertex_start).tolist()
     return [
@@ -139,11 +142,11 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
 _SHAPES: Final[Mapping[str, str]] = MappingProxyType(
     {"circle": "disc(x, y, radius)", **dict.fromkeys(("rectangle", "rect"), "box(xmin, ymin, xmax, ymax)")}
 )
-"""Constructors of footprints by the names of their shapes elsewhere, also in the specification language."""
+"""Constructors of footprints by names of shapes in other libraries and in the specification language."""
 
 
 class _FootprintType(type):
-    # hidden from type checkers, to which every attribute would exist otherwise
+    # hidden from type checkers, which would otherwise accept every attribute
     if not TYPE_CHECKING:
 
         def __getattr__(cls, name: str) -> NoReturn:
@@ -153,7 +156,7 @@ class _FootprintType(type):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint(metaclass=_FootprintType):
-    """A union of rounded convex parts; equal when the sets of parts are.
+    """A union of rounded convex parts. Two footprints are equal if their sets of parts are equal.
 
     Raises:
         GeometryError: no part.
@@ -180,10 +183,10 @@ class Footprint(metaclass=_FootprintType):
     @classmethod
     @named_arguments
     def box(cls, xmin: float, ymin: float, xmax: float, ymax: float) -> Footprint:
-        """Return an axis-aligned box; equal limits make a segment or a point.
+        """Return an axis-aligned box, or a segment or a point if limits are equal.
 
         Raises:
-            GeometryError: coordinates that are not finite, a minimum above its maximum.
+            GeometryError: a coordinate is not finite, or a minimum is above its maximum.
         """
         if xmin > xmax or ymin > ymax:
             what = f"box({xmin}, {ymin}, {xmax}, {ymax}) has its least corner above its greatest"
@@ -193,7 +196,7 @@ class Footprint(metaclass=_FootprintType):
     @classmethod
     @named_arguments
     def disc(cls, x: float, y: float, radius: float) -> Footprint:
-        """Return the disc around (x, y); with radius 0, a point.
+        """Return the disc around (x, y), which is a point if the radius is 0.
 
         Raises:
             GeometryError: a value that is not finite, a negative radius.
@@ -216,8 +219,9 @@ class Footprint(metaclass=_FootprintType):
         """Return the polygon with the given corners (n, 2), in either order.
 
         Raises:
-            GeometryError: no corner, coordinates that are not finite; unless `concave="hull"`, a boundary
-                that crosses itself, or more than 2,000 corners that are not those of a convex polygon.
+            GeometryError: there is no corner, a coordinate is not finite, or a convex polygon has more than
+                10,000 corners. Unless `concave="hull"`, also a boundary that crosses itself, and a polygon of
+                more than 2,000 corners that is not convex.
         """
         if concave not in ("decompose", "hull"):
             raise GeometryError(f"concave={concave!r}; choose 'decompose' or 'hull'")
@@ -227,13 +231,13 @@ class Footprint(metaclass=_FootprintType):
         if concave == "hull":
             return cls((ConvexPart(convex_hull(corners)),))
         pieces = [ConvexPart(piece) for piece in convex_pieces(corners)]
-        # a piece thinner than coordinates resolve covers nothing beyond its neighbours
+        # a piece narrower than the resolution of coordinates has become a segment, which neighbours cover
         return cls(tuple(piece for piece in pieces if len(piece.vertices) > 2))
 
     @classmethod
     @named_arguments
     def union(cls, footprints: Iterable[Footprint]) -> Footprint:
-        """Join all parts of some footprints.
+        """Return the footprint with all parts of the given footprints.
 
         Raises:
             GeometryError: no footprint.
@@ -244,15 +248,15 @@ class Footprint(metaclass=_FootprintType):
 @named_arguments
 @dataclass(frozen=True, slots=True)
 class TrackedObject:
-    """An object at one time: its footprint and what else a log reports of it.
+    """An object at one time: its footprint and other reported properties.
 
     Attributes:
         footprint: the area it covers.
         class_name: its class, or None.
         yaw: its orientation in radians, counter-clockwise from the x axis, or None.
         height: (bottom, top) in footprint units, or None.
-        uncertainty: how far its true outline may differ, as a radius in footprint units.
-        packed: its other numbers as `ConvexPart.packed`, then that of each part.
+        uncertainty: radius in footprint units within which its true outline lies.
+        packed: part count, bottom, top, yaw and uncertainty as bytes of doubles, then each part's `packed`.
 
     Raises:
         GeometryError: a value that is not finite, bottom above top, a negative uncertainty.
@@ -297,7 +301,7 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
     """Return normalised vertices, and whether they are convex.
 
     Raises:
-        GeometryError: anything but one or more finite points.
+        GeometryError: the vertices are not one or more finite points, or a convex polygon has too many.
     """
     try:
         corners = np.array(vertices, dtype=np.float64, order="C")
@@ -341,7 +345,7 @@ def _vertices_text(vertices: Floats) -> str:
 
 
 def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
-    """Return the vertices from the least on, a form that equal rings share."""
+    """Return the vertices, starting at the least one, so that equal rings have one form."""
     corners = [(x, y) for x, y in vertices.tolist()]
     first = corners.index(min(corners))
     return tuple(corners[first:] + corners[:first])
@@ -354,10 +358,10 @@ def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
 class FootprintBatch:
     """R footprints made of P convex parts with V vertices in total, as ragged rows.
 
-    Footprint r has the parts part_start[r] up to part_start[r + 1]; part p has the vertices vertex_start[p]
-    up to vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without repeated or
-    collinear ones. One vertex is a point or disc, two are a segment or capsule. Raw outlines go through
-    `normalise_polygons` first.
+    The parts of footprint r are part_start[r] to before part_start[r + 1]. The vertices of part p are
+    vertex_start[p] to before vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without
+    repeated or collinear ones. One vertex is a point or disc, two are a segment or capsule. Raw outlines
+    have to pass `normalise_polygons` first.
 
     Attributes:
         part_start: (R + 1,) int64.
@@ -368,7 +372,7 @@ class FootprintBatch:
         All are contiguous and read-only.
 
     Raises:
-        GeometryError: arrays whose lengths do not fit together.
+        GeometryError: the lengths of the arrays do not fit together.
     """
 
     part_start: Integers
@@ -396,9 +400,9 @@ class FootprintBatch:
 
     @classmethod
     def without_checks(cls, **columns: Floats | Integers) -> FootprintBatch:
-        """Build rows of new, contiguous arrays that are known to fit together.
+        """Build a batch of new, contiguous arrays that fit together.
 
-        For a few rows, checking takes longer than making them.
+        For a few rows, checking takes longer than building them.
         """
         batch = object.__new__(cls)
         for name, array in columns.items():
@@ -410,7 +414,7 @@ class FootprintBatch:
         return len(self.part_start) - 1
 
     def slice(self, begin: int, end: int) -> FootprintBatch:
-        """Return the rows from one to before another, as views."""
+        """Return the rows from `begin` to before `end`, as views."""
         parts = slice(*self.part_start[[begin, end]].tolist())
         vertices = slice(*self.vertex_start[[parts.start, parts.stop]].tolist())
         return FootprintBatch.without_checks(
@@ -424,7 +428,7 @@ class FootprintBatch:
 
     @property
     def sizes(self) -> Floats:
-        """The diagonal of each footprint's box, (R,); of a disc its diameter."""
+        """Size of each footprint (R,): diagonal of its vertices' box plus twice the greatest radius."""
         start = self.vertex_start[self.part_start[:-1]]
         spans = [np.maximum.reduceat(x, start) - np.minimum.reduceat(x, start) for x in self.vertices.T]
         sizes: Floats = np.hypot(*spans) + 2.0 * np.maximum.reduceat(self.radius, self.part_start[:-1])
@@ -442,7 +446,7 @@ class FootprintBatch:
     ) -> FootprintBatch:
         """Build one row per footprint, with its height interval (bottom, top) if it has one."""
         packed = [part.packed for footprint in footprints for part in footprint.parts]
-        # a part's number of vertices and radius lie before its vertices
+        # the pair before a part's vertices is its header: number of vertices, radius
         numbers = np.frombuffer(b"".join(packed)).reshape(-1, 2)
         heads = starts_from_counts([len(part) for part in packed]) // numbers.strides[0]
         intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
@@ -457,7 +461,7 @@ class FootprintBatch:
 
     @classmethod
     def unknown(cls, count: int) -> FootprintBatch:
-        """Build rows of which nothing is known: one point each, at NaN."""
+        """Build rows of unknown footprints: one point at NaN each."""
         return cls.without_checks(
             part_start=np.arange(count + 1, dtype=np.int64),
             vertex_start=np.arange(count + 1, dtype=np.int64),
@@ -511,7 +515,7 @@ class FootprintBatch:
         """Return the footprints of some rows.
 
         Raises:
-            GeometryError: coordinates that are not those of convex parts.
+            GeometryError: the vertices of a part are not those of a convex polygon.
         """
         is_all = len(rows) == len(self) and list(rows) == list(range(len(self)))
         batch = self if is_all else self.select(np.array(rows, np.int64))
@@ -528,10 +532,10 @@ class FootprintBatch:
 
 
 def centre_of(footprint: Footprint) -> tuple[float, float]:
-    """Return the centre (x, y) of an object: the centroid of its parts' areas.
+    """Return the centre (x, y) of a footprint: the mean of its parts' centroids, weighted by area.
 
-    A part is weighted by its area, and has the centroid of its polygon before rounding, or the mean of the
-    vertices if that polygon has no area. Areas of overlap count twice.
+    The centroid of a part is that of its unrounded polygon, or the mean of its vertices if that polygon has
+    no area. Areas of overlap count twice.
     """
     ((x, y),) = centres_of(FootprintBatch.from_footprints([footprint])).vertices.tolist()
     return x, y
@@ -545,8 +549,8 @@ def centre_object(tracked: TrackedObject) -> TrackedObject:
 
 
 def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
-    """Return what `centre_object` packs: a fiftieth of the time, for control loops."""
-    # a part's numbers are a pair of their own, then those of its vertices; writable, as kernels take them
+    """Return the `packed` of `centre_object` in a fiftieth of its time, for control loops."""
+    # rows are headers (number of vertices, radius) and vertices in turn; a bytearray is writable for kernels
     numbers, centre = np.frombuffer(bytearray(b"".join(tracked.packed[1:]))).reshape(-1, 2), np.empty(2)
     _fill_packed_centre(numbers, centre)
     bottom, top = tracked.height or (math.nan, math.nan)
@@ -559,7 +563,7 @@ def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
 @elementwise
 @kernel
 def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
-    """Fill `centre` (2,), by the steps of `_fill_centres`; see `ConvexPart.packed`."""
+    """Fill `centre` (2,) from packed parts, by the same steps as `_fill_centres`."""
     total = sum_x = sum_y = mean_x = mean_y = 0.0
     at, parts = 0, 0
     while at < len(numbers):
@@ -605,19 +609,19 @@ def radius_of(tracked: TrackedObject) -> float:
 
 
 def shift_rows(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
-    """Return the rows of a batch, each moved in the plane by its shift (R, 2)."""
+    """Return a batch with each row moved in the plane by its shift (R, 2)."""
     counts = np.diff(batch.vertex_start[batch.part_start])
     return replace(batch, vertices=batch.vertices + np.repeat(shifts, counts, axis=0))
 
 
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
-    """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
+    """Return the object turned by an angle in radians, with its centre at (x, y) and the same height."""
     (moved,) = moved_copies(tracked, np.array([[x, y]]), turn)
     return moved
 
 
 def moved_copies(tracked: TrackedObject, places: Floats, turn: float = 0.0) -> list[TrackedObject]:
-    """Return an object with its centre at each of some places (M, 2), turned by an angle in radians."""
+    """Return copies of an object, turned by an angle in radians, with their centres at `places` (M, 2)."""
     batch = with_poses(FootprintBatch.unknown(0), tracked, places, np.array([turn]))
     yaw = None if tracked.yaw is None else tracked.yaw + turn
     return [
@@ -628,7 +632,7 @@ def moved_copies(tracked: TrackedObject, places: Floats, turn: float = 0.0) -> l
 def with_poses(
     batch: FootprintBatch, tracked: TrackedObject, positions: Floats, turns: Floats
 ) -> FootprintBatch:
-    """Return a batch, and A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
+    """Return a batch with A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
     parts = tracked.footprint.parts
     centre = np.array(centre_of(tracked.footprint))
     count = len(positions) * len(turns)
@@ -638,11 +642,11 @@ def with_poses(
     bottom, top = tracked.height or (math.nan, math.nan)
     part_start = batch.part_start[-1] + np.arange(count + 1, dtype=np.int64) * len(sizes)
     vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(sizes, count))
-    # of many cells, they are written where they stay
+    # one array for old and new vertices, because copying the vertices of many cells again takes time
     vertices = np.empty((len(batch.vertices) + count * len(corners), 2))
     vertices[: len(batch.vertices)] = batch.vertices
     placed = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
-    # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
+    # complex numbers add x and y in one operation; each operation runs over the many positions
     at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
     filled = placed.view(np.complex128)[..., 0]
     x, y = (corners - centre).T

@@ -1,11 +1,12 @@
-"""Measurements of footprints and orientations over many samples, in one kernel call; points of contact.
+"""Measurements of footprints and orientations over many samples in one kernel call, and points of contact.
 
-The closest two of many footprints are found by a sweep over bounding boxes. It leaves out pairs whose boxes
-are farther apart than the closest two so far. The signed distance of two footprints is at least the gap
-between their boxes along either axis, even a negative one. The result equals that of all pairs, bit for bit.
+The closest pair of many footprints is found by a sweep over bounding boxes. The sweep skips pairs whose boxes
+are farther apart than the closest pair so far. This is exact: the signed distance of two footprints is at
+least the gap between their boxes along either axis, even a negative gap. The result equals that of all pairs,
+bit for bit.
 
-Contacts are where two footprints are nearest, overlap deepest, or where one protrudes farthest from another.
-They are for pictures and explanations only.
+A contact is the place where two footprints are nearest, overlap deepest, or where one protrudes farthest.
+Contacts are for pictures and explanations only.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from spatial_replay.geometry.kernels import (
 )
 
 _SHARE = 16_384
-"""So many quantities pay for a thread of their own."""
+"""Quantities per thread, at least; fewer do not pay for starting it."""
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
 
@@ -40,8 +41,8 @@ class Operand:
     """A footprint over T samples: the union of some rows in each sample.
 
     Attributes:
-        rows: (T, M) int64, row numbers into a `FootprintBatch`; any negative number leaves the
-            place empty. A single object has M = 1, a group M = its number of members.
+        rows: (T, M) int64, row numbers of a `FootprintBatch`; negative for an absent member. M is 1 for a
+            single object, and the number of members for a group.
         enlargement: radius of the disc added (Minkowski sum), in footprint units.
     """
 
@@ -51,10 +52,11 @@ class Operand:
 
 @dataclass(frozen=True, slots=True)
 class MeasureRequest:
-    """One quantity of one operand, or between two (indices into the operands).
+    """One quantity of one operand, or of two.
 
     Attributes:
-        quantity: a key of `QUANTITY_CODES`.
+        quantity: key of `QUANTITY_CODES`.
+        first, second: indices of operands; -1 without a second one.
     """
 
     quantity: str
@@ -65,20 +67,24 @@ class MeasureRequest:
 def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]) -> Floats:
     """Compute each requested quantity in each sample.
 
-    signed_distance(A, B) is the least over pairs of parts of the signed distance of two rounded convex parts:
-    their distance when apart, minus their penetration depth when not (Def. 2-4 of the paper), minus both
-    radii; with height intervals on both footprints, that of upright prisms. protrusion(A, B) is a maximum
-    over parts of A of a minimum over parts of B. For two parts it is the maximum over vertices p of sd(p, B's
-    polygon) + r_A - r_B. For prisms it is the greatest of that, B.bottom - A.bottom and A.top - B.top.
-    Projections run over all parts (radius and enlargement included; the centroid's: area centroids of the
-    unrounded polygons). Over an empty union the least is +inf and the greatest -inf. Along z, a footprint
-    without a height gives NaN.
+    signed_distance(A, B) is the minimum over pairs of parts. For two parts it is the distance of their
+    polygons, or minus the penetration depth if they overlap (Def. 2-4 of the paper), minus both radii. If
+    both footprints have heights, it is that of upright prisms.
+
+    protrusion(A, B) is a maximum over parts of A of a minimum over parts of B. For two parts it is the
+    maximum over vertices p of A of sd(p, B's polygon) + r_A - r_B. For prisms it is the greatest of that,
+    B.bottom - A.bottom and A.top - B.top.
+
+    Projections run over all parts and include radius and enlargement. Projections of centroids use the area
+    centroids of the unrounded polygons. Along z, a footprint without a height gives NaN.
+
+    Over an empty union, a minimum is +inf and a maximum -inf.
 
     Returns:
         (K, T) float64 for K requests.
 
     Raises:
-        GeometryError: a row that the batch does not have.
+        GeometryError: the batch lacks a row.
     """
     members = np.concatenate([np.ravel(operand.rows) for operand in operands] or [_NO_ROWS])
     if members.size and members.max() >= len(batch):
@@ -104,7 +110,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
 
 
 def _arrays_of(batch: FootprintBatch) -> Any:
-    """Return what kernels take first."""
+    """Return the leading arguments of kernels."""
     starts = (writable(batch.part_start), writable(batch.vertex_start))
     return (*starts, *map(writable, (batch.vertices, batch.radius, batch.bottom, batch.top)))
 
@@ -113,7 +119,7 @@ def misalignment(first: Floats, second: Floats) -> Floats:
     """Return half the squared distance of unit vectors at two angles (Def. 10, 11): 1 - cos(difference).
 
     Args:
-        first, second: (T,) radians; NaN for no orientation, which makes the result NaN.
+        first, second: (T,) radians; NaN for a missing orientation, which makes the result NaN.
     """
     result = np.empty(len(first))
     _misalignment(first, second, result)
@@ -141,16 +147,16 @@ LEFT, RIGHT, LOWER, UPPER = 0, 1, 2, 3
 
 
 def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, enlargement: float) -> Floats:
-    """Compute the signed distance of the closest two of some footprints in each sample.
+    """Compute the signed distance of the closest pair of footprints in each sample.
 
     Args:
-        rows: (T, M), the rows of M footprints in each of T samples; any negative number is none.
-        uncertainty: at least one for each of these rows, at least 0, in footprint units.
-        enlargement: by how much each distance is less, in footprint units.
+        rows: (T, M), the rows of M footprints in each of T samples; negative for an absent footprint.
+        uncertainty: radius for each row of the batch, at least 0, in footprint units.
+        enlargement: length subtracted from each distance, in footprint units.
 
     Returns:
-        (T, 3): the least over pairs of their distance, of that less both uncertainties, of that plus both;
-        +inf where there are fewer than two.
+        (T, 3), three minima over pairs: distance, distance minus both uncertainties, distance plus both
+        uncertainties. All are +inf in samples with fewer than two footprints.
     """
     result = np.empty((len(rows), 3))
     members = np.ascontiguousarray(rows), writable(uncertainty), float(enlargement)
@@ -162,14 +168,14 @@ def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, en
 def candidate_pairs(
     batch: FootprintBatch, rows: Integers, uncertainty: Floats, enlargement: float
 ) -> Integers:
-    """Return the pairs that may be the closest two in one sample, with or without uncertainty.
+    """Return the pairs that may be the closest pair of one sample, with or without uncertainty.
 
     Args:
         rows: (M,), the rows of M footprints.
         uncertainty, enlargement: as for `closest_pairs`.
 
     Returns:
-        (P, 2), the lesser of two places among `rows` first, in order.
+        (P, 2), indices into `rows`: the lesser of each pair first, pairs in ascending order.
     """
     footprints = batch.select(rows)
     first_vertex = footprints.vertex_start[footprints.part_start[:-1]]
@@ -179,7 +185,7 @@ def candidate_pairs(
     high = closest_pairs(batch, rows[None], uncertainty, enlargement)[0, 2]
     size = max(np.abs(least).max(), np.abs(greatest).max())
     reach = high + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * size
-    # from left to right: all pairs at once would take gigabytes for some thousands
+    # a sweep from left to right, because a matrix of all pairs of some thousands would take gigabytes
     order = np.argsort(least[:, 0], kind="stable")
     least, greatest = least[order], greatest[order]
     ends = np.searchsorted(least[:, 0], greatest[:, 0] + reach, side="right").tolist()
@@ -208,12 +214,12 @@ def closest_rows(
     edges: Floats,
     result: Floats,
 ) -> None:
-    """Fill `result` (T, 3); see `closest_pairs`. `edges` (V, 4) is room to work in."""
+    """Fill `result` (T, 3) as in `closest_pairs`; `edges` (V, 4) is scratch space."""
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     width = members.shape[1]
     boxes = np.full((width, 4), np.inf)
-    # from left to right; objects move little between samples, so that the order nearly stays
+    # from left to right; objects move little between samples, so that an insertion sort hardly moves anything
     order = np.arange(width)
     for t in range(result.shape[0]):
         present, size, widest = 0, 0.0, 0.0
@@ -240,7 +246,7 @@ def closest_rows(
                 order[at] = order[at - 1]
                 at -= 1
             order[at] = moving
-        # what boxes and distances may be off by from rounding, and a distance by uncertainty
+        # enlargement and uncertainty make distances less than gaps of boxes; 1e-9 covers rounding of both
         slack = enlargement + 2.0 * widest + 1e-9 * size
         least, low, high = np.inf, np.inf, np.inf
         for i in range(present):
@@ -273,9 +279,9 @@ class Contact:
     """A pair of points, one on each of two footprints.
 
     Attributes:
-        first, second: the nearest points of disjoint footprints; for overlapping ones, the ends of the
-            shortest translation that separates them.
-        distance: signed, negative for overlap; its absolute value is the distance of the points.
+        first, second: nearest points of disjoint footprints; for overlapping ones, the ends of the shortest
+            translation that separates them.
+        distance: distance of the two points, negative for overlap.
     """
 
     first: Point
@@ -284,14 +290,15 @@ class Contact:
 
 
 def contact(a: Footprint, b: Footprint) -> Contact:
-    """Return where the signed distance of two footprints is attained (Def. 2-4)."""
+    """Return the points that attain the signed distance of two footprints (Def. 2-4)."""
     return _contact(a, b, is_protrusion=False)
 
 
 def protrusion_contact(inner: Footprint, outer: Footprint) -> Contact:
-    """Return `inner`'s point farthest outside `outer` or least deep in it, and the nearest on its boundary.
+    """Return the points that attain the protrusion of `inner` from `outer` (Prop. 2).
 
-    The distance is the protrusion: positive where `inner` sticks out (Prop. 2).
+    The first is the point of `inner` farthest outside `outer`, or the least deep one inside. The second is
+    the nearest point of the boundary of `outer`. The distance is the protrusion, positive outside.
     """
     return _contact(inner, outer, is_protrusion=True)
 
@@ -309,14 +316,14 @@ def enlarge(footprint: Footprint, radius: float) -> Footprint:
 
 
 def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protrusion: bool) -> Floats:
-    """Return where the signed distance (or protrusion) of two operands is attained in each sample.
+    """Return the points that attain the signed distance (or protrusion) of two operands in each sample.
 
     Heights are ignored.
 
     Returns:
-        (T, 6): a point of `first`, a point of `second`, and their signed distance (or protrusion). The last
-        column is the upper end of the higher footprint, NaN if neither has a height. NaN where an operand is
-        empty.
+        (T, 6): x and y of a point of `first`, x and y of a point of `second`, their signed distance (or
+        protrusion), and the top of the higher footprint. The top is NaN if neither has a height. The whole
+        row is NaN if an operand is empty.
     """
     result = np.full((len(first.rows), 6), np.nan)
     fill_contacts(

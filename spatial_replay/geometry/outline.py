@@ -19,13 +19,13 @@ LARGEST_COORDINATE = 1e100
 """Larger coordinates are rejected: products of a few of them must stay finite."""
 
 MOST_CORNERS = 2_000
-"""Limit for a polygon that is split: its parts are measured one by one, in each sample."""
+"""Corner limit of polygons to be split, because each sample measures every part."""
 
 MOST_CONVEX_CORNERS = 10_000
-"""Limit for a convex polygon: its corners are measured for each pair of objects, in each sample."""
+"""Corner limit of convex polygons, because each sample measures all corners for every pair of objects."""
 
-# A vertex counts as on a line within the greatest of these: relative to the outline's extent, to the
-# resolution of its coordinates, and a floor that keeps squares of the tolerance above zero.
+# Factors of the tolerance within which a vertex counts as on a line: of the outline's extent, and of its
+# greatest coordinate (4 units in the last place). The floor keeps the squared tolerance above zero.
 _FLATNESS = 1e-9
 _ROUNDING = 4 * 2.0**-52
 _SMALLEST = 1e-100
@@ -41,8 +41,9 @@ class Outlines(NamedTuple):
     Attributes:
         vertex_start: (P + 1,) int64.
         vertices: (V, 2) float64.
-        fault: (P,) int8: `SOUND`; or, with its vertices unchanged, `EMPTY` (no vertex), `NOT_FINITE`
-            (or beyond `LARGEST_COORDINATE`), `NOT_CONVEX` (or a boundary that crosses itself).
+        fault: (P,) int8: `SOUND`, `EMPTY` (no vertex), `NOT_FINITE` (or beyond `LARGEST_COORDINATE`),
+            `NOT_CONVEX` (or a boundary that crosses itself) or `TOO_MANY_CORNERS`. A faulty outline keeps
+            its vertices; one with too many corners is normalised.
     """
 
     vertex_start: Integers
@@ -54,11 +55,11 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     """Order each outline counter-clockwise and drop repeated or collinear vertices.
 
     A vertex is superfluous if its distance from the segment between its neighbours is at most a billionth of
-    the outline's extent, or below the resolution of its coordinates. An outline no wider than that becomes a
-    segment or a point. Convex counter-clockwise input is returned bit for bit.
+    the outline's extent, or below the resolution of its coordinates. A narrower outline becomes a segment or
+    a point. Convex counter-clockwise input is returned bit for bit.
 
     Args:
-        vertex_start: (P + 1,) int64; outline p has the vertices vertex_start[p] up to vertex_start[p + 1].
+        vertex_start: (P + 1,) int64; outline p is vertices[vertex_start[p] : vertex_start[p + 1]].
         vertices: (V, 2) float64, in footprint units.
     """
     tidy = np.array(vertices, dtype=np.float64, order="C")
@@ -77,7 +78,7 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
 def _are_normal(counts: Integers, vertices: Floats) -> bool:
     """Return whether all outlines are points, or convex and counter-clockwise with equal numbers of corners.
 
-    Few outlines are tested by arrays much sooner than one by one in an interpreted kernel.
+    For a few outlines, NumPy is much faster than a loop over vertices in the interpreter.
     """
     most = int(counts.max(initial=0))
     is_point = counts == 1
@@ -92,7 +93,7 @@ def _are_normal(counts: Integers, vertices: Floats) -> bool:
     extent = np.maximum(np.ptp(x, axis=0), np.ptp(y, axis=0))
     magnitude = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
     tolerance = np.maximum(_FLATNESS * extent, np.maximum(_ROUNDING * magnitude, _SMALLEST))
-    # the test of `_winding`, of all corners at once
+    # the test of `_winding` for all corners at once
     next_x, next_y = np.roll(x, -1, axis=0), np.roll(y, -1, axis=0)
     along_x, along_y = next_x - x, next_y - y
     before_x, before_y = np.roll(along_x, 1, axis=0), np.roll(along_y, 1, axis=0)
@@ -118,7 +119,9 @@ def _limit_corners(counts: Integers, fault: NDArray[np.int8]) -> None:
 
 
 _FEW_OUTLINES = 4_096
+"""Outlines at most that NumPy tests before the kernel; more of them are worth a compiled kernel."""
 _MOST_TESTED_CORNERS = 16
+"""Corners at most of an outline that NumPy tests."""
 
 
 @elementwise
@@ -136,7 +139,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
             fault[p] = EMPTY if first == stop else NOT_FINITE
         elif counts[p] > 1:
             winding = _winding(vertices, first, stop, tolerance)
-            # only an outline that is not plainly convex is tidied, so that sound ones keep their bits
+            # an outline that is already convex is not tidied, so that it keeps its bits
             if winding == 0:
                 _copy(vertices, first, scratch, 0, counts[p])
                 left = _tidy(scratch, counts[p], tolerance)
@@ -155,7 +158,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
 
 @inlined
 def _copy(source: Floats, source_start: int, target: Floats, target_start: int, count: int) -> None:
-    """Copy vertices, in ascending order: a target that overlaps may begin before its source."""
+    """Copy vertices in ascending order, so that the target may overlap a source that begins behind it."""
     for i in range(count):
         target[target_start + i, 0] = source[source_start + i, 0]
         target[target_start + i, 1] = source[source_start + i, 1]
@@ -172,7 +175,7 @@ def _reverse(vertices: Floats, start: int, stop: int) -> None:
 
 @inlined
 def _tolerance(vertices: Floats, first: int, stop: int) -> float:
-    """Return how far a vertex may lie from a line and still count as on it; -1 for an unusable outline."""
+    """Return the distance within which a vertex counts as on a line; -1 for an unusable outline."""
     least_x = least_y = np.inf
     most_x = most_y = -np.inf
     for i in range(first, stop):
@@ -190,9 +193,9 @@ def _tolerance(vertices: Floats, first: int, stop: int) -> float:
 
 @inlined
 def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
-    """Return 1 if every turn is to the left and they make one round; -1 if all are to the right; else 0.
+    """Return 1 for one round of left turns, -1 for one round of right turns, else 0.
 
-    A turn whose vertex lies within `tolerance` of its neighbours' line counts as neither.
+    A turn whose vertex lies within `tolerance` of its neighbours' line is neither left nor right.
     """
     left = right = rounds = 0
     count = stop - first
@@ -208,7 +211,7 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
             left += cross > 0.0
             right += cross < 0.0
         is_upper = cy > by or (cy == by and cx > bx)
-        # one round changes between rising and falling edges twice; a star with left turns only, more often
+        # a convex outline rises once and falls once; a star, which also turns left only, more often
         rounds += is_upper != was_upper
         was_upper = is_upper
         ax, ay, bx, by = bx, by, cx, cy
@@ -267,7 +270,7 @@ def _farthest(vertices: Floats, count: int, origin: int) -> int:
 
 @inlined
 def _strays(vertices: Floats, i: int, head: int, tail: int) -> float:
-    """Return the distance of vertex i from the segment between two others."""
+    """Return the distance of vertex i from the segment between vertices `head` and `tail`."""
     length = _distance(vertices, head, tail)
     if length == 0.0:
         return _distance(vertices, i, head)
@@ -288,15 +291,15 @@ def convex_hull(vertices: Floats) -> Floats:
 def convex_pieces(vertices: Floats, holes: Sequence[Floats] = ()) -> list[Floats]:
     """Split a polygon into few convex polygons with disjoint interiors.
 
-    Triangulates (Delaunay), then merges neighbours across the longest edges first while the result stays
-    convex (Hertel and Mehlhorn: at most four times the minimal number of pieces).
+    A Delaunay triangulation is merged across shared edges, the longest first, while the result stays convex.
+    There are at most four times as many pieces as necessary (Hertel and Mehlhorn, 1983).
 
     Args:
-        vertices: (n, 2) float64, corners in either order, no two equal in a row.
-        holes: the corners of what is cut out, in the same form.
+        vertices: (n, 2) float64, corners in either order; neighbours differ.
+        holes: corners of each hole, in the same form.
 
     Raises:
-        GeometryError: a boundary that crosses or touches itself, more than `MOST_CORNERS` corners.
+        GeometryError: the boundary crosses or touches itself, or has more than `MOST_CORNERS` corners.
     """
     outline, vertices = vertices, np.concatenate([vertices, *holes])
     if len(vertices) > MOST_CORNERS:
@@ -329,7 +332,7 @@ def _describe_crossing(polygon: object) -> str:
 
 
 def _turn(corners: Sequence[_Corner], a: int, b: int, c: int) -> float:
-    """Return a positive number if the path a, b, c turns left."""
+    """Return a number above 0 if the path a, b, c turns left, below 0 if it turns right."""
     (ax, ay), (bx, by), (cx, cy) = corners[a], corners[b], corners[c]
     return (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
 
@@ -360,7 +363,7 @@ def _edges(ring: _Ring) -> Iterable[tuple[int, int]]:
 
 
 def _rotate(ring: _Ring, first: int) -> _Ring:
-    """Return the same ring, starting at one of its corners."""
+    """Return the same ring, starting at corner `first`."""
     place = ring.index(first)
     return ring[place:] + ring[:place]
 
