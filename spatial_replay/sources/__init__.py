@@ -1,6 +1,6 @@
-"""Logs of any format: open one, or list what one holds.
+"""Logs of any format: open one, or list its contents.
 
-Names are loaded when they are first used.
+Modules are imported at the first use of their names.
 """
 
 from __future__ import annotations

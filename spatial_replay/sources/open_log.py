@@ -1,6 +1,6 @@
-"""Open any log: the content of a file decides its format, and `FORMATS` names the reader of each.
+"""Open any log: the content of a file decides its format, and `FORMATS` lists the reader of each format.
 
-Readers that take long to load are loaded when there is a log for them.
+Readers with slow imports are imported when the first log needs them.
 """
 
 from __future__ import annotations
@@ -51,28 +51,28 @@ from spatial_replay.trace.units import OUR_AXES, Axes
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
 LOG_ENDINGS = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
-"""Endings of the names of logs."""
+"""File endings of logs."""
 _MOST_LOOKED_AT = 20
-"""Entries of a folder without a log, in which a data set is looked for."""
+"""Entries of a folder at most that are searched for a data set."""
 _HEAD = 4096
-"""Bytes by which a file's format is recognised."""
+"""Size of the beginning that identifies a file's format, bytes."""
 
 
 def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source:
-    """Open the log in a file of any format; the content decides, not the name.
+    """Open a log in any format; the content of the file decides, not its name.
 
-    Only the needed parts of an MCAP log at an address are read; a log of another format is downloaded once.
+    From an MCAP log at an address, only the needed parts are read. A log of another format is downloaded
+    once.
 
     Args:
-        path: on this machine, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://…. An
+        path: a local path, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://…. An
             episode of a data set is the set's path with a number: push_v3#17.
-        reading: how to read it; see `ReadOptions`.
+        reading: options; see `ReadOptions`.
 
     Raises:
-        UsageError: no path was given, an option that means nothing to this format, or a file in none of the
-            known formats.
+        UsageError: there is no path, an option does not apply to the format, or the format is unknown.
         MissingFileError: there is no such file, or it cannot be opened.
-        LogError: the file has the name of a log, and is none.
+        LogError: the file has the ending of a log, but is not one.
         RemoteError: an address does not answer.
     """
     argument: object = path
@@ -106,7 +106,7 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}; "
         "a video becomes a log by `record video`"
     )
-    # one that is called a log is a damaged one
+    # a file with the ending of a log is probably a damaged log
     raise LogError(message) if path.name.lower().endswith(LOG_ENDINGS) else UsageError(message)
 
 
@@ -114,12 +114,12 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
     """Read a whole log into memory.
 
     Args:
-        path: a log in any format that `open_source` knows.
-        allow_damage: return the readable part of a damaged log, with its `faults`.
-        reading: how to read it; see `ReadOptions`.
+        path: a log in any format that `open_source` reads.
+        allow_damage: whether to return the readable part of a damaged log, with its `faults`.
+        reading: options; see `ReadOptions`.
 
     Raises:
-        UsageError: no path was given, or an option that means nothing to this format.
+        UsageError: there is no path, or an option does not apply to the format.
         MissingFileError: there is no such file.
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
@@ -141,12 +141,12 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
 
 
 def readable_file(path: str | PathLike[str]) -> LogFile:
-    """Return the file of a log; a remote one that cannot be read in parts is downloaded.
+    """Return the file of a log, after a download if a remote file cannot be read in parts.
 
     Raises:
-        UsageError: an address that names no file, or obstore is not installed.
+        UsageError: the address has no file name, or obstore is not installed.
         MissingFileError, RemoteError: the address cannot be read.
-        LogError: the file is too large to be downloaded, or a named pipe or another that may never end.
+        LogError: the file is too large to be downloaded, or it is a pipe, a socket or a device.
     """
     file = log_file(path)
     if isinstance(file, RemoteFile) and (metadata := bag_metadata_at(file)) is not None:
@@ -157,7 +157,7 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
         except (OSError, ValueError) as error:
             raise MissingFileError.of(path, error) from None
         if file.name == BAG_METADATA and is_bag_folder(file.absolute().parent):
-            # the bag, by one of its files
+            # the metadata file stands for its bag
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
             names = sorted(entry.name for entry in file.iterdir())
@@ -185,10 +185,10 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
 
 
 def _refuse_data_set(path: Path) -> None:
-    """Refuse a data set of episodes, each of which is a log.
+    """Refuse a data set of episodes, because each of its episodes is a log.
 
     Raises:
-        UsageError: it is one.
+        UsageError: the path is a data set.
     """
     data_set = open_data_set(path)
     if data_set is not None and data_set.episodes:
@@ -203,7 +203,7 @@ def _refuse_description(path: Path) -> None:
     """Refuse the JSON file next to the trajectories of ManiSkill.
 
     Raises:
-        UsageError: it is one.
+        UsageError: the path is such a file.
     """
     trajectories = path.with_suffix(".h5")
     data_set = open_data_set(trajectories)
@@ -212,7 +212,7 @@ def _refuse_description(path: Path) -> None:
 
 
 def _data_set_in(folder: Path) -> Path | None:
-    """Return the first data set in a folder, such as the name space of Minari's; None without one."""
+    """Return the first data set in a folder, such as a namespace folder of Minari; None without one."""
     for path in sorted(folder.iterdir())[:_MOST_LOOKED_AT]:
         with suppress(SpatialReplayError):
             if open_data_set(path) is not None:
@@ -224,7 +224,7 @@ def _open_episode(path: str, number: int, options: ReadOptions) -> Source:
     """Open an episode of a data set.
 
     Raises:
-        UsageError: there is no such episode, or no mapping although the data set needs one.
+        UsageError: there is no such episode, the data set needs a mapping, or the mapping is one for topics.
     """
     data_set = open_data_set(path)
     if data_set is None:
@@ -254,10 +254,10 @@ def _open_episode(path: str, number: int, options: ReadOptions) -> Source:
 
 
 def _refuse_endless(path: Path) -> None:
-    """Refuse pipes, sockets and devices: to read one may wait for ever.
+    """Refuse pipes, sockets and devices, because reading one may never end.
 
     Raises:
-        LogError: it is one, or a folder of a bag holds one.
+        LogError: the path is one, or the folder of a bag holds one.
         OSError: there is no such file.
     """
     mode = path.stat().st_mode
@@ -270,17 +270,17 @@ def _refuse_endless(path: Path) -> None:
 
 
 def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
-    """Return the metadata of the ROS 2 bag whose folder is at an address; None if that is a file.
+    """Return the metadata of the ROS 2 bag whose folder is at an address; None if the address is a file.
 
     Raises:
-        MissingFileError, RemoteError: there is neither.
+        MissingFileError, RemoteError: the address is neither a bag nor a file.
     """
     if file.name == BAG_METADATA:
         return file
     try:
         _ = file.version
     except MissingFileError:
-        # a folder, written without the slash
+        # the address of a folder without the slash at its end
         inside = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
         with suppress(MissingFileError, RemoteError):
             _ = inside.version
@@ -290,11 +290,11 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
 
 
 def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
-    """Return the files of a ROS 2 bag at an address: its metadata, and those that this lists.
+    """Return the files of a ROS 2 bag at an address: its metadata, and the files that the metadata lists.
 
     Raises:
         LogError: the metadata cannot be used.
-        MissingFileError, RemoteError: it cannot be read.
+        MissingFileError, RemoteError: the metadata cannot be read.
     """
     from spatial_replay.bags.sqlite import LARGEST_METADATA, bag_metadata_from_bytes
 
@@ -322,7 +322,7 @@ def downloaded_bag(metadata: RemoteFile) -> Path:
 
 
 def format_of(path: LogFile) -> str | None:
-    """Return the name of a file's format, or None if it is in none of the known ones.
+    """Return the name of a file's format; None if it is unknown.
 
     Raises:
         MissingFileError: the file cannot be opened.
@@ -332,7 +332,7 @@ def format_of(path: LogFile) -> str | None:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Return whether a folder holds what a ROS 2 bag is made of."""
+    """Return whether a folder holds a file of a ROS 2 bag."""
     try:
         return path.is_dir() and any(_BAG_FILE.search(entry.name) for entry in path.iterdir())
     except (OSError, ValueError):
@@ -340,7 +340,10 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def _head(path: LogFile) -> bytes:
-    """Read the first bytes of a file, decompressed; what is missing from a broken one is left out."""
+    """Return the first bytes of a file, decompressed.
+
+    A damaged gzip file counts as track JSONL, whose reader reports the damage with its place.
+    """
     try:
         with open_text(path) if isinstance(path, Path) else path.open() as stream:
             return stream.read(_HEAD)
@@ -368,9 +371,9 @@ class Format(NamedTuple):
     """A format of logs.
 
     Attributes:
-        recognise: whether a file that begins with the given bytes is of this format.
-        open: a source of the file, given what the format is called.
-        options: the names of the `ReadOptions` that apply to it, but for `concave`.
+        recognise: returns whether a file with the given first bytes has this format.
+        open: opens a file, given the name of the format and options.
+        options: names of the `ReadOptions` that apply to it; `concave` always does.
     """
 
     recognise: Callable[[bytes], bool]
@@ -381,7 +384,7 @@ class Format(NamedTuple):
 def _track_source(
     path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, usual: Axes = OUR_AXES
 ) -> Source:
-    """Return the source of a file, with the axes that are usual in its format unless options say others."""
+    """Return the source of a track file; option `y_down` overrides the usual axes of its format."""
     axes = usual if options.y_down is None else replace(usual, y="down" if options.y_down else "up")
     return TrackSource(path, kind, options, iter_traces=iter_traces, axes=axes)
 
@@ -413,7 +416,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
             " does, with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info "
             f"{shlex.quote(str(path))} --suggest-mapping"
         )
-    # readers of external logs are loaded when there is one
+    # imported here, because readers of external logs are slow to import
     from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import load_mapping
 
@@ -436,6 +439,8 @@ _MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 _TRACKS = frozenset({"y_down", "max_gap"})
 
 FORMATS: dict[str, Format] = {
+    # first bytes: https://mcap.dev/spec#magic, https://wiki.ros.org/Bags/Format/2.0 and
+    # https://www.sqlite.org/fileformat2.html#magic_header_string
     "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),
     "ROS 1 bag": Format(lambda head: head.startswith(b"#ROSBAG V2.0\n"), _open_messages, _MESSAGES),
     "ROS 2 bag": Format(lambda head: head.startswith(b"SQLite format 3\x00"), _open_messages, _MESSAGES),

@@ -1,4 +1,4 @@
-"""Overview of a log: its objects and signals, or the topics of an external log that could map to objects."""
+"""Overview of a log: its objects and signals, or the topics of an external log that a mapping could read."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from spatial_replay.trace.trace import Pauses, Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _STEP = 10_000
-"""Messages between two reports of progress."""
+"""Messages between two progress reports."""
 _ENOUGH = 1024
-"""Messages of a topic after which nothing new is expected."""
+"""Messages of a topic that are enough for a survey."""
 _LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
-"""Which messages of a topic are decoded: the first ones, and ever fewer of those that come later."""
+"""Numbers of the decoded messages of a topic: the first ones, then powers of two, ever more rarely."""
 _EXAMPLE_BYTES = 2**22
-"""How much of a topic is decoded, beyond its first message: pictures and clouds of points are large."""
+"""Decoding limit of a topic after its first message, bytes; images and point clouds are large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +48,8 @@ class TopicSurvey:
     """A topic of an external log.
 
     Attributes:
-        messages: how many were read.
-        entry: its entry in a mapping; empty if nothing looks like an object.
+        messages: number of messages read.
+        entry: suggested entry of a mapping; empty if no field looks like an object.
     """
 
     topic: Topic
@@ -63,9 +63,9 @@ class Survey:
 
     Attributes:
         start_ns, end_ns: log times of the first and the last message; None without messages.
-        mapping: a mapping file to start from.
-        faults: what is damaged, each with its place.
-        remarks: what is worth knowing although nothing was lost.
+        mapping: text of a suggested mapping file.
+        faults: damage, each with its place.
+        remarks: notes that do not concern losses.
     """
 
     name: str
@@ -83,8 +83,9 @@ class Survey:
 
 
 def messages_in(path: str | PathLike[str]) -> MessageReader | None:
-    """Return a reader of a log of messages that needs a mapping; None for logs that name their objects, and
-    for episodes of data sets.
+    """Return a reader of a log of messages that needs a mapping.
+
+    Return None for a log that names its objects, and for an episode of a data set.
 
     Raises:
         MissingFileError: there is no such file.
@@ -113,7 +114,8 @@ def survey(
 
     Args:
         advance: called repeatedly with the number of messages read since the last call.
-        whole: read all of it, and so all damage; else only until enough is known about every topic.
+        whole: whether to read the whole log and find all damage; otherwise reading ends when there are enough
+            messages of every topic.
 
     Raises:
         LogError: nothing can be read.
@@ -143,12 +145,13 @@ def survey(
 
 @dataclass(frozen=True, slots=True)
 class Regularity:
-    """How regularly something comes over a log.
+    """Regularity of samples or messages over a log.
 
     Attributes:
-        rate: how many a second, with two decimals, rounded down.
-        max_gap: the longest time without one, in seconds with three decimals, rounded up; also from the
-            beginning of the log to the first, and from the last to the end.
+        count: number of them.
+        rate: their rate in hertz with two decimals, rounded down.
+        max_gap: longest pause in seconds with three decimals, rounded up. The pauses before the first and
+            after the last one count.
     """
 
     count: int
@@ -159,6 +162,7 @@ class Regularity:
     def of(cls, times_ns: Integers, start_ns: int, end_ns: int) -> Regularity:
         gaps = np.diff(times_ns, prepend=start_ns, append=end_ns)
         seconds = max(end_ns - start_ns, 1) / 1e9
+        # rounded against the log, so that a printed figure never meets a limit that the log misses
         return cls(
             len(times_ns),
             math.floor(100.0 * (len(times_ns) - 1) / seconds) / 100.0,
@@ -166,7 +170,7 @@ class Regularity:
         )
 
     def lacks(self, wanted: Mapping[str, Any], what: str) -> Iterator[str]:
-        """Yield how something named `what` is less regular than wanted."""
+        """Yield a sentence for each limit in `wanted` that is missed; `what` is their subject."""
         if self.rate < (rate := wanted.get("rate", 0.0)):
             yield f"{what} have {self.rate:g} a second, at least {rate:g} are required"
         if self.max_gap > (gap_ns(wanted.get("max_gap")) or math.inf) / 1e9:
@@ -178,8 +182,9 @@ class Fitness:
     """Fitness of a log to be judged.
 
     Attributes:
-        topics: of a log of messages, by name.
-        objects: the share of samples in which each is known, with three decimals, rounded down.
+        samples: regularity of the samples.
+        topics: regularity of messages by topic; empty for other logs.
+        objects: share of samples in which an object is known, by name, with three decimals, rounded down.
     """
 
     samples: Regularity
@@ -187,7 +192,7 @@ class Fitness:
     objects: Mapping[str, float]
 
     def lacks(self, required: Mapping[str, Any]) -> Iterator[str]:
-        """Yield how a log falls short of the `requires` of a suite."""
+        """Yield a sentence for each requirement in the `requires` of a suite that the log misses."""
         yield from self.samples.lacks(required.get("samples", {}), "samples")
         for name, requirement in required.get("topics", {}).items():
             if name in self.topics:
@@ -200,7 +205,7 @@ class Fitness:
 
 
 def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
-    """Read a log, and the times of all of its messages, and return what judging it depends on.
+    """Read the samples of a log and the times of all of its messages, and return its fitness.
 
     Raises:
         LogError: nothing can be read.
@@ -235,7 +240,11 @@ def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
 
 
 class _Counter:
-    """Counts messages, and decodes the first ones of each topic; `missing` are those not known enough."""
+    """Counter of messages, which also decodes examples of each topic.
+
+    Attributes:
+        missing: topics without enough messages so far.
+    """
 
     def __init__(self, reader: MessageReader, topics: Sequence[Topic]) -> None:
         self.start_ns: int | None = None
@@ -284,7 +293,7 @@ class _Counter:
             self._undecodable[topic] = count + 1, first
 
     def take_remarks(self) -> list[str]:
-        """Return remarks on topics, and on messages looked at, that cannot be decoded."""
+        """Return remarks on topics and on examples that cannot be decoded."""
         return self._remarks + [
             Sentence(first, f" ({count} of {count + len(self.examples[topic])} messages looked at)")
             for topic, (count, first) in self._undecodable.items()
@@ -297,8 +306,8 @@ class ObjectOverview:
 
     Attributes:
         classes: its class names, in order of code points.
-        samples: in how many samples it was observed.
-        unreadable: in how many of them its coordinates were not all finite.
+        samples: number of samples in which it was observed.
+        unreadable: number of these samples in which a coordinate was not finite.
     """
 
     name: str
@@ -313,13 +322,13 @@ class Overview:
 
     Attributes:
         start_ns, end_ns: times of the first and the last sample; None without samples.
-        period_ns: how often samples usually come; 0 without two of them.
-        faults: what was lost or left out.
+        period_ns: usual time between samples; 0 with fewer than two samples.
+        faults: data that was lost or left out.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
-        remarks: what is worth knowing although nothing was lost.
-        axes: those of the source; its samples have ours.
+        remarks: notes that do not concern losses.
+        axes: axes of the source; its samples are already converted to ours.
         doubts: assumptions that the log contradicts.
-        facts: how each mapped topic was read.
+        facts: facts of each mapped topic.
     """
 
     name: str
@@ -339,23 +348,23 @@ class Overview:
 
 
 def overview_of(source: Source, advance: Callable[[int], object] = lambda samples: None) -> Overview:
-    """Read a log once and return what it holds.
+    """Read a log once and return its overview.
 
     Args:
         advance: called repeatedly with the number of samples read since the last call.
 
     Raises:
-        LogError: nothing in the log can be read as a sample.
+        LogError: the log has no readable sample.
     """
     tally = _Tally()
     remarks: list[str] = []
     doubts: dict[Doubt, None] = {}
     facts: tuple[TopicFacts, ...] = ()
     container = summarise_mcap(source) if isinstance(source, McapSource) else None
-    # an external log has no samples, and yet a container to list
+    # an external log has no samples; only its container is listed
     if container is None or container.has_objects:
         try:
-            # the whole log, with all its damage, unless it lies elsewhere
+            # a local log is read whole, to find all of its damage; of a remote one, only the samples are read
             read = source.keeping() if isinstance(source.path, RemoteFile) else source
             for block in read.iter_blocks():
                 tally.add(block.trace)
@@ -364,7 +373,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
                 facts += block.facts
                 advance(len(block.trace))
         except UsageError as error:
-            # a scenario without objects is not damaged; a mapping that does not fit is a mistake of the user
+            # a scenario without objects is sound; a mapping that does not fit is the user's mistake
             if not isinstance(source, TrackSource):
                 raise
             remarks.append(str(error))
@@ -389,7 +398,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
 
 
 def overview_of_survey(path: str | PathLike[str], survey: Survey) -> Overview:
-    """Return what an external log holds, of which nothing says yet what its samples are."""
+    """Return the overview of an external log without a mapping, which has no samples yet."""
     container = summarise_mcap(McapSource(readable_file(path))) if survey.kind == McapSource.kind else None
     faults = container.faults if container is not None else ()
     return Overview(survey.name, survey.kind, 0, None, None, 0, (), (), faults, container)

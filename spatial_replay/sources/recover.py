@@ -1,4 +1,4 @@
-"""Recover damaged logs: the whole of what can be read, as an MCAP log with an index and a list of losses."""
+"""Recover damaged logs: write all readable messages to an MCAP log with an index and a list of losses."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from spatial_replay.text import Instant, Sentence, counted_from, plural
 from spatial_replay.trace.trace import FOREVER
 
 _MOST_GAPS = 1_000
-"""Gaps among samples that are listed; the samples in later ones are counted in the last one listed."""
+"""Sample gaps at most in a list; the last one listed is extended over later ones."""
 _BY_ENDING: Mapping[str, type[MessageReader]] = {".mcap": McapLog, ".bag": Ros1Bag}
-"""Readers of files whose first bytes are damaged."""
+"""Readers by file ending, for files whose first bytes are damaged."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampleGap:
-    """Samples of a recording that are missing, by their numbers.
+    """A gap of missing samples in a recording.
 
     Attributes:
-        first, last: of those that are missing; counted from 0.
-        after_ns, before_ns: times of the samples around them; None where there is none.
+        first, last: numbers of the first and the last missing sample, from 0.
+        after_ns, before_ns: times of the samples before and after the gap; None without one.
     """
 
     first: int
@@ -53,15 +53,15 @@ class Recovery:
     """Saved and missing parts of a log.
 
     Attributes:
-        name: of the damaged log.
-        start_ns, end_ns: log times of the first and the last message that was saved.
-        saved: how many messages of each topic.
-        missing: how many more the log declares, of topics of which it does; a log without an index declares
-            nothing.
-        spans: from when to when something is missing, as far as that is known.
-        samples: the gaps among its samples, if it is a recording of ours.
-        faults: all that is damaged, each with its place; times count from the first message.
-        remarks: what is worth knowing although nothing was lost.
+        name: name of the damaged log.
+        start_ns, end_ns: log times of the first and the last saved message.
+        saved: number of saved messages by topic.
+        missing: number of missing messages by topic, from the counts that the log declares. A log without an
+            index declares none.
+        spans: known (start, end) times of losses, in nanoseconds.
+        samples: gaps among the samples of a recording of ours; empty for other logs.
+        faults: damage, each with its place; times count from the first message.
+        remarks: notes that do not concern losses.
     """
 
     name: str
@@ -76,12 +76,12 @@ class Recovery:
 
     @property
     def messages(self) -> int:
-        """How many messages were saved."""
+        """Number of saved messages."""
         return sum(self.saved.values())
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing is missing."""
+        """Whether the log has no fault."""
         return not self.faults
 
     @property
@@ -96,7 +96,7 @@ class Recovery:
         return "how much is missing is not known"
 
     def metadata(self) -> dict[str, str]:
-        """Return the metadata record with what is missing."""
+        """Return the metadata record of the losses."""
         return {
             "source": self.name,
             "losses": self.losses,
@@ -112,22 +112,24 @@ def recover_log(
     output: str | PathLike[str],
     advance: Callable[[int], object] = lambda messages: None,
 ) -> Recovery:
-    """Write all that can be read of a log to an MCAP log with an index.
+    """Write all readable messages of a log to an MCAP log with an index.
 
-    Messages are copied byte for byte, in the order of their time, with their topics, types, numbers and
-    times; so are metadata and attachments. Samples of ours that cannot be used, or repeat a time, are left
-    out. The result and a metadata record of the output name the missing parts. An output in which nothing
-    is missing gets no such record: recovered again, it gives the same bytes.
+    Messages are copied byte for byte in order of time, with their topics, types, sequence numbers and times.
+    Metadata and attachments are copied, too. Samples of ours are left out if they cannot be decoded or repeat
+    a time.
+
+    The result and a metadata record of the output list the losses. Without losses there is no record, and
+    recovering the output again gives the same bytes.
 
     Args:
         log: MCAP, ours or external; a ROS 1 bag; a file or a folder of a ROS 2 bag.
-        output: replaces a file of that name when it is complete.
+        output: path of the output, which replaces an existing file once it is complete.
         advance: called with the number of messages of each step.
 
     Raises:
         UsageError: the log is a text file, or the output is an input.
         MissingFileError: there is no such log.
-        LogError: nothing in it can be read.
+        LogError: no message can be read.
         OutputError: the output cannot be written.
     """
     inputs, output = local_files([log]), Path(output)
@@ -135,7 +137,7 @@ def recover_log(
     reader, faults = _open_log(readable_file(log))
     recovery, is_ordered = _write(reader, faults, output, inputs, advance)
     if not is_ordered:
-        # a message whose time is damaged is where its chunk was; in what was written, each is at its own time
+        # messages with damaged times were read at their chunk's place; reading the output sorts them by time
         _write(McapLog(output), FaultList(), output, (), advance)
     return recovery
 
@@ -147,7 +149,7 @@ def _write(
     inputs: Sequence[Path],
     advance: Callable[[int], object],
 ) -> tuple[Recovery, bool]:
-    """Write all that a reader gives; return what was saved, and whether it came in the order of time."""
+    """Write all messages of a reader; return the recovery, and whether messages came in order of time."""
     try:
         topics = reader.topics()
     except LogError as error:
@@ -204,7 +206,7 @@ def _write(
 
 
 def _open_log(file: LogFile) -> tuple[MessageReader, FaultList]:
-    """Return a reader of a log, also if its first bytes are damaged, with the faults so far."""
+    """Return a reader of a log, even one with damaged first bytes, and the faults so far."""
     faults = FaultList()
     if isinstance(file, Path) and is_bag_folder(file):
         return open_messages(file), faults
@@ -226,7 +228,7 @@ def _missing(count: int, noun: str) -> str:
 
 
 def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return from when to when something was lost, of faults that know it, in order."""
+    """Return the (start, end) times in nanoseconds of faults that contain times, in order."""
     times_of_faults = [
         [part.time_ns for part in fault.parts if isinstance(part, Instant)]
         for fault in faults
@@ -236,7 +238,7 @@ def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 class _Samples:
-    """Separates usable samples of ours from others, and finds gaps in their numbers."""
+    """Filter of our own samples, which also finds gaps in their numbers."""
 
     def __init__(
         self,
@@ -248,7 +250,7 @@ class _Samples:
         self._name = name
         self._faults = faults
         self._own = [number for number, channel in channels.items() if is_samples(channel)]
-        # a replay of a part of a log keeps the numbers of its samples
+        # only recordings number samples from 0; a replay of a part of a log keeps the numbers of that log
         is_recording = metadata.get(METADATA, {}).get("written_by") == "record"
         self._last = -1 if is_recording else None
         self._declared = metadata.get(ENDING, {}).get("samples", "") if is_recording else ""
@@ -256,7 +258,7 @@ class _Samples:
         self._gaps: list[SampleGap] = []
 
     def usable(self, messages: Messages) -> Messages:
-        """Return messages without samples that cannot be decoded, or repeat a time."""
+        """Return the messages without samples of ours that cannot be decoded or repeat a time."""
         sampled = np.flatnonzero(np.isin(messages.channel, self._own))
         if not len(sampled):
             return messages
@@ -265,7 +267,7 @@ class _Samples:
         return select(messages, without(messages, sampled, sound)) if len(sound) < len(sampled) else messages
 
     def gaps(self) -> tuple[SampleGap, ...]:
-        """Return the gaps, with the one between the last sample and as many as the recording declares."""
+        """Return all gaps, also the one between the last sample and the declared number of samples."""
         if self._declared.isdecimal() and self._last is not None:
             self._gap(self._last + 1, int(self._declared) - 1, None)
         return tuple(self._gaps)
