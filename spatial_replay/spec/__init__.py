@@ -1,6 +1,6 @@
-"""The language: text to formulas and back.
+"""The specification language: text to formulas and back.
 
-Names are loaded when they are first used: values of formulas need no parser.
+Names are imported when they are first used, because formulas made in Python need no parser.
 """
 
 from __future__ import annotations

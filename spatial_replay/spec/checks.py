@@ -1,4 +1,4 @@
-"""Checks of a specification: warnings about its text, and its names against those of a log."""
+"""Checks of a specification: warnings about its text, and names that a log lacks."""
 
 from __future__ import annotations
 
@@ -56,9 +56,10 @@ from spatial_replay.text import is_text_number, names_from_unit, text_number
 
 _NO_CHOICE: Mapping[str, str] = MappingProxyType({})
 _LISTED = 12
-"""Names that a hint lists."""
+"""Most names that a hint lists."""
 _R2U2_SIGNS = frozenset({"&&", "||"})
 _TIGHTNESS = MappingProxyType({"IFF": 0, "IMPLIES": 1, "OR": 2, "XOR": 3, "AND": 4})
+"""Precedence of binary operators; the highest binds most tightly."""
 
 
 @dataclass(slots=True)
@@ -71,12 +72,12 @@ class _Level:
 
 
 def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool) -> Iterator[Diagnostic]:
-    """Yield a warning for each operator that, without brackets, reaches further than a reader may expect.
+    """Yield a warning for each operator whose operand is longer than a reader may expect.
 
     Args:
-        published: warn too wherever the published grammar groups otherwise. It knows no precedence:
-            Boolean operators group to the right, `not` reaches as far as F and G, and U takes all
-            on both of its sides.
+        published: whether to warn also where the grammar of the published implementation groups differently.
+            That grammar has no precedence: Boolean operators group to the right, and `not` reaches as far as
+            F and G. Its U reaches to the ends of the formula on both sides.
     """
     levels = [_Level()]
     for before, token in pairwise([None, *tokens]):
@@ -108,7 +109,7 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
 
 
 def _is_strong_sign(before: Token, token: Token) -> bool:
-    """Return whether a `!` is written as a part of the operator in front of it, as in `X! a`."""
+    """Return whether a `!` directly follows a prefix operator, as in `X! a`."""
     return token.value == "!" and before.type == "PREFIX" and before.end_pos == token.start_pos
 
 
@@ -145,9 +146,9 @@ def _differs(first: Token, second: Token) -> bool:
 
 
 def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[Diagnostic]:
-    """Yield a warning for each operator that the tool whose spelling was read defines otherwise.
+    """Yield a warning for each operator in a foreign spelling that its tool defines differently.
 
-    A bounded until is spelt alike here and in R2U2, so it counts only in a text with signs of R2U2.
+    A bounded until has the same spelling in R2U2. It is warned about only if the text contains `&&` or `||`.
     """
     signs = (token for token in tokens if token.type in ("AND", "OR"))
     is_of_r2u2 = any(_source_text(token, source) in _R2U2_SIGNS for token in signs)
@@ -172,7 +173,7 @@ def _source_text(token: Token, source: SourceText) -> str:
 
 
 def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:
-    """Yield a warning for each past operator outside any future one: it only sees the first sample."""
+    """Yield a warning for each past operator outside future operators: it sees only the first sample."""
     warned: set[Span] = set()
     for spec in specs:
         stack: list[Formula] = [spec.formula] if spec.is_result else []
@@ -191,7 +192,7 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
 
 
 def last_sample_warnings(specification: Specification) -> Iterator[Diagnostic]:
-    """Yield a warning for each `F G p` and `G F p`: over a finite log both ask for its last sample alone."""
+    """Yield a warning for each `F G p` and `G F p`: over a finite log both mean p at the last sample."""
     source = SourceText.of(specification.source, specification.filename)
     warned: set[Span] = set()
     for spec in specification.results:
@@ -211,18 +212,18 @@ _LASTING: Final = {
     "G F": "write G ((F[0s, 9s] p) or not (F[9s, inf] true)) for again and again, at least every"
     " nine seconds",
 }
-"""Remedies by pairs of operators."""
+"""Suggested formula by pair of operators."""
 
 
 def _is_unbounded(formula: Formula) -> bool:
-    """Return whether a formula is an operator over all samples from the present one on."""
+    """Return whether a formula is an F or G over all samples from the current one to the end."""
     if not isinstance(formula, Temporal) or formula.operator not in ("F", "G"):
         return False
     return formula.bound is None or (formula.bound.lower, formula.bound.upper) == (0, None)
 
 
 def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:
-    """Yield a warning for each `a dist b == c`: what is measured is hardly ever equal to a number."""
+    """Yield a warning for each `a dist b == c`: a measured distance hardly ever equals a number."""
     warned: set[Span] = set()
     for spec in specs:
         for atom in iter_formulas(spec.formula):
@@ -238,7 +239,7 @@ def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterato
 
 
 def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic]:
-    """Yield a warning for each definition that nothing refers to; a spec is a result by itself."""
+    """Yield a warning for each unused definition, except specs: an unused spec is a result."""
     for name, statement in names.definitions.items():
         if isinstance(statement, (SpecStatement, BrokenStatement)) or name in names.used:
             continue
@@ -249,7 +250,7 @@ def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic
 def scale_warnings(
     statements: Sequence[Statement], specs: Sequence[NamedSpec], source: SourceText
 ) -> Iterator[Diagnostic]:
-    """Yield a warning for each `scale` line that divides no atom's number."""
+    """Yield a warning for each `scale` line that applies to no atom."""
     scales = [statement for statement in statements if isinstance(statement, ScaleStatement)]
     units = {str(unit.signal or LENGTHS): unit for spec in specs if scales for unit in units_of(spec.formula)}
     for statement in scales:
@@ -262,7 +263,7 @@ def scale_warnings(
 
 
 def object_names(specification: Specification) -> tuple[str, ...]:
-    """Return the tracked objects that the specs are about, members of groups included, as in the text."""
+    """Return the tracked objects in atoms of the specs, members of named groups included, in text order."""
     names: dict[str, None] = {}
     for atom in _atoms(specification):
         for term in terms_of(atom.expression):
@@ -275,7 +276,7 @@ def object_names(specification: Specification) -> tuple[str, ...]:
 
 
 def group_classes(specification: Specification) -> tuple[str, ...]:
-    """Return the classes of open groups, in the order of the text; `ANY_CLASS` for all objects."""
+    """Return the classes of open groups in text order; `ANY_CLASS` is the group of all objects."""
     terms: list[Term] = []
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
@@ -288,13 +289,13 @@ def group_classes(specification: Specification) -> tuple[str, ...]:
 
 
 def signal_names(specification: Specification) -> tuple[str, ...]:
-    """Return the numeric signals that the specs compare, in the order of the text."""
+    """Return the logged signals that the specs compare, in text order."""
     atoms = _atoms(specification)
     return tuple(dict.fromkeys(name for atom in atoms for name in logged_signals(atom.expression)))
 
 
 def _atoms(specification: Specification) -> Iterable[Atom]:
-    # specs share formulas
+    # a spec that names another shares its formula, so one atom can be in several specs
     visited: set[int] = set()
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
@@ -317,15 +318,16 @@ def check_names(
 
     Args:
         known: names of the log's objects.
-        signals: names of its numeric signals.
-        where: what has them, if not a log.
-        during: the part of it that is known, such as "in its first 5.000 s"; "" for all.
-        classes: of its objects.
-        each: for parameters of templates, the objects that they stand for: "all", "class:NAME" or a name.
+        signals: names of the log's numeric signals.
+        where: source of the names, for messages.
+        during: part of the source that was read, such as "in its first 5.000 s"; "" for the whole source.
+        classes: classes of the log's objects.
+        each: objects by template parameter: "all", "class:NAME" or the name of one object.
 
     Returns:
-        An error for each object, signal and class of a template that the log never has, with the nearest
-        name. A warning for each object of the log that a definition of the same name hides.
+        Errors and warnings in text order. Each object, signal and template class that the log lacks is an
+        error with the nearest name. The class of an open group is an error only if a class of the log has a
+        similar name. Each object of the log that is hidden by a definition of the same name is a warning.
     """
     objects, numeric = tuple(known), tuple(signals)
     known_classes = tuple(classes)
@@ -336,7 +338,7 @@ def check_names(
     def report(
         kind: str, name: str, candidates: tuple[str, ...], span: Span, hint: str = "", during: str = ""
     ) -> None:
-        # a sum takes a misspelt constant for a signal
+        # an unknown name in a sum is parsed as a signal, so it may be a misspelt constant
         choices = (*candidates, *specification.constants) if kind == "signal" else candidates
         hint = hint or " ".join(filter(None, (nearest_hint(name, choices), _listing(kind, candidates))))
         message = f"the {where} never has the {kind} {name!r}" + (during and f" {during}")
@@ -359,7 +361,7 @@ def check_names(
         elif kind != "class" and choice not in ("all", *objects):
             report("object", choice, objects, spec.span)
     for name in group_classes(specification):
-        # a log may lack a class; one that is nearly spelt like another is taken for a mistake
+        # a log may lack a class, so only a name that is close to one of its classes is reported as misspelt
         if name != ANY_CLASS and name.casefold() not in folded_classes and nearest_hint(name, known_classes):
             report("class", name, known_classes, places.get(name, Span(0, 0)))
     for name, span in defined.items():
@@ -372,11 +374,14 @@ def check_names(
 
 
 def with_numbers(specification: Specification, units: Mapping[str, str]) -> Specification:
-    """Return a specification that compares signals with numbers, not with the names that these have.
+    """Return a specification with the names of enumerated signals replaced by their numbers.
+
+    Args:
+        units: declared unit by signal; an enumerated signal has a JSON object of numbers by name instead.
 
     Raises:
-        SpecificationError: it compares a signal with a name that none of its numbers has, or adds or compares
-            numbers of different units.
+        SpecificationError: an unknown name of an enumerated signal, or a sum or comparison of numbers with
+            different units.
     """
     tables = {signal: names for signal, unit in units.items() if (names := names_from_unit(unit))}
     faults = Faults(SourceText.of(specification.source, specification.filename))
@@ -416,7 +421,7 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
 
 
 def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
-    """Return the spelling of a class that was taken for an object; "" for none."""
+    """Return a hint that an unknown object name is a class; "" if it is not."""
     meant = next((label for label in classes if label.casefold() == name.casefold()), None)
     if kind != "object" or meant is None:
         return ""
@@ -433,7 +438,7 @@ def _listing(kind: str, names: tuple[str, ...]) -> str:
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:
-    """Return the first place of each name in the source, and the place of each definition."""
+    """Return two maps from names to places: the first occurrence, and the definition."""
     relations = RELATION_NAMES | specification.relations
     tokens = tokenize(specification.source, relations, Faults(source))
     places: dict[str, Span] = {}

@@ -1,4 +1,4 @@
-"""Comparisons of numbers: of one signal, distance or rate with a constant, and of sums of them."""
+"""Comparisons: a signal, distance or rate with a constant, and comparisons of sums."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ _MIRRORED: Final[Mapping[str, str]] = MappingProxyType(
     {"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "==", "!=": "!="}
 )
 _SIMPLE: Final = (Name, DistanceSyntax, RateSyntax)
-"""Quantities that relations of their own compare with a constant: "signal", "dist", "speed", "rate"."""
+"""Quantities whose comparison with a constant is a relation: "signal", "dist", "speed", "rate"."""
 
 
 class Comparison(NamedTuple):
-    """The parts of an atom that compares numbers; see `Atom`."""
+    """Parts of an atom that compares numbers; see `Atom`."""
 
     relation: str
     expression: Expression
@@ -75,7 +75,7 @@ class Comparison(NamedTuple):
 
 
 _NOTHING: Final = Comparison("sum", compare(Number(0.0), "<=", Number(0.0)), (), ("<=",))
-"""The comparison after a fault."""
+"""Placeholder for a comparison with a fault."""
 _NOT_EQUAL: Final[Mapping[str, str]] = MappingProxyType(
     {
         "dist": "write what is too near or too far: a dist b <= c, a dist b >= c",
@@ -91,12 +91,12 @@ _PLUGIN: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ComparisonBuilder:
-    """Builds the comparisons of one text."""
+    """Builder of the comparisons of one text."""
 
     resolver: Resolver
 
     def build(self, written: ComparisonSyntax, scope: Scope) -> Comparison:
-        """Return what a comparison computes."""
+        """Return the expression of a comparison with its relation, terms and parameters."""
         operands, signs = written.operands, [token.value for token in written.operators]
         if len(operands) == 3:
             return self._range(written, scope)
@@ -124,7 +124,7 @@ class ComparisonBuilder:
         written: ComparisonSyntax,
         scope: Scope,
     ) -> Comparison:
-        """Return how one signal, distance or rate compares with one constant, or with two."""
+        """Return the comparison of one signal, distance or rate with one or two constants."""
         limits = [(sign, self.resolver.number(limit, scope)) for sign, limit in comparisons]  # type: ignore[arg-type]
         if isinstance(quantity, Name):
             ((sign, limit),) = limits
@@ -154,7 +154,7 @@ class ComparisonBuilder:
     def _of_signal(
         self, name: Name, sign: str, limit: float, limit_text: float | str, scope: Scope
     ) -> Comparison:
-        """Return how a signal compares with a constant or a text; `==` and `!=` are exact."""
+        """Return the comparison of a signal with a constant or a text; `==` and `!=` are exact."""
         signal = self._signal(name, scope)
         is_equal = Equality(signal, limit)
         exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
@@ -164,7 +164,7 @@ class ComparisonBuilder:
     # ----------------------------------------------------------------------------------------------- sums
 
     def _range(self, written: ComparisonSyntax, scope: Scope) -> Comparison:
-        """Return `c1 <= a dist b <= c2`, the lesser of both comparisons."""
+        """Return a chained comparison, `c1 <= a dist b <= c2`: the minimum of two comparisons."""
         (lower, middle, upper), (below, above) = written.operands, written.operators
         for token, side in ((below, "left"), (above, "right")):
             if token.value not in ("<=", "<"):
@@ -199,7 +199,7 @@ class ComparisonBuilder:
         return Comparison("sum", expression, tuple(terms), (*signs, *limits))
 
     def _number(self, written: ArgumentSyntax, scope: Scope) -> Expression:
-        """Return what was written in the place of a number; 0 after a fault."""
+        """Return the expression of a written number; 0 after a fault."""
         self.resolver.size += 1
         if self._is_constant(written, scope):
             return Number(self.resolver.number(written, scope))  # type: ignore[arg-type]
@@ -229,7 +229,7 @@ class ComparisonBuilder:
         return Number(0.0)
 
     def _multiple(self, written: Arithmetic, scope: Scope) -> Expression:
-        """Return a number times or divided by a constant."""
+        """Return a number multiplied or divided by a constant."""
         operand, factor = written.operands
         is_product = written.operator == "*"
         if is_product and self._is_constant(operand, scope):
@@ -252,7 +252,7 @@ class ComparisonBuilder:
         return multiple if amount > 0.0 else -multiple
 
     def _absolute(self, written: Call, scope: Scope) -> Expression:
-        """Return `abs(x)`, the greater of x and -x; any other function is a fault."""
+        """Return `abs(x)` as the maximum of x and -x; report a fault for any other function."""
         name, arguments = written.name.text, written.arguments
         macro = self.resolver.names.definitions.get(name)
         if name == "abs" and len(arguments) == 1 and not isinstance(macro, DefStatement):
@@ -286,7 +286,7 @@ class ComparisonBuilder:
         return speed_of(*(self._moving(argument, scope, alone=is_alone) for argument in arguments))
 
     def _moving(self, written: ArgumentSyntax, scope: Scope, *, alone: bool) -> Term:
-        """Return a term that `speed` takes."""
+        """Return an argument of `speed`; report a fault if it cannot move."""
         if not isinstance(written, (Name, *DERIVED_TERMS)):
             self.resolver.fault(written.span, scope, "a number has no speed", "write speed(a) or speed(a, b)")
             return TrackedName("")
@@ -303,7 +303,7 @@ class ComparisonBuilder:
         return term
 
     def _signal(self, name: Name, scope: Scope) -> Signal:
-        """Return a signal of the log or of a plug-in; a name of something else is a fault."""
+        """Return a signal of the log or of a plug-in; report a fault for a name with another meaning."""
         plugin = self.resolver.names.signals.get(name.text)
         defined = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:
@@ -315,7 +315,7 @@ class ComparisonBuilder:
         return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
 
     def _is_constant(self, written: ArgumentSyntax, scope: Scope) -> bool:
-        """Return whether something is a number by itself: also a parameter of an unused macro."""
+        """Return whether an argument is a constant; parameters of unused macros count as constants."""
         match written:
             case NumberSyntax():
                 return True
@@ -333,27 +333,27 @@ class ComparisonBuilder:
     def _check_units(
         self, first: Expression, second: Expression, written: Arithmetic | ComparisonSyntax, scope: Scope
     ) -> None:
-        """Refuse a distance plus a speed, or compared with one."""
+        """Report a sum or a comparison of a distance and a speed."""
         kinds = {kind for kind in (_kind(first), _kind(second)) if kind}
         if len(kinds) > 1:
             hint = "multiply one of them by a constant: a dist b >= 2 * speed(a)"
             self.resolver.fault(written.span, scope, "a distance and a speed have different units", hint)
 
     def _check_constant(self, limit: FormulaSyntax, quantity: FormulaSyntax, scope: Scope) -> None:
-        """Report a limit that is most likely a misspelt constant, not a signal."""
+        """Report a limit that is probably a misspelt constant instead of a signal."""
         definitions = self.resolver.names.definitions
         if not isinstance(limit, Name) or limit.is_quoted or limit.text in {*definitions, *scope.values}:
             return
         constants = [key for key in definitions if isinstance(definitions[key], ConstStatement)]
         if isinstance(quantity, Name):
-            # signals that are compared have similar names
+            # two signals of one comparison often have similar names, so only another case is a misspelling
             constants = [key for key in constants if key.casefold() == limit.text.casefold()]
         if nearest := self.resolver.faults.nearest(limit.text, constants):
             hint = f"{nearest} A signal of that name is written in quotes: {quote_name(limit.text)}"
             self.resolver.fault(limit.span, scope, f"unknown constant {limit.text!r}", hint)
 
     def _check_hyphen(self, written: Arithmetic, scope: Scope) -> None:
-        """Report `cup dist base-link`: a difference of a distance is written with blanks."""
+        """Report `cup dist base-link`: probably an unquoted name, because a difference has blanks."""
         left, right = written.operands
         sign = Span(left.span.end, right.span.start)
         if sign.end - sign.start > 1 or written.operator != "-":
@@ -394,7 +394,7 @@ class ComparisonBuilder:
 
 
 def _written_terms(expression: Expression) -> tuple[Term, ...]:
-    """Return the terms of a distance or a speed as written."""
+    """Return the terms of a distance or a speed; none of other expressions."""
     match expression:
         case Rate():
             return expression.terms
@@ -404,7 +404,7 @@ def _written_terms(expression: Expression) -> tuple[Term, ...]:
 
 
 def _kind(expression: Expression) -> str:
-    """Return "length" or "speed" for a number of that unit; "" where a constant or a signal may have any."""
+    """Return "length" or "speed", the dimension of a number; "" for constants and signals, which fit both."""
     match expression:
         case SignedDistance():
             return "length"

@@ -1,4 +1,4 @@
-"""Values of constants: arithmetic, ranges, and values given from outside in place of those of the text."""
+"""Values of constants: arithmetic, ranges, and values from outside that replace those of the text."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class _ImpossibleError(Exception):
 def value_of(
     written: Quantity, named: Callable[[Name], Value | None], report: Callable[[Span, str, str], None]
 ) -> Value | None:
-    """Return the value of a quantity; None, and a fault, where it has none.
+    """Return the value of a quantity; report a fault and return None if it has no value.
 
     Args:
-        named: returns the value of a name; where that has none, reports it and returns None.
-        report: takes the place of a fault, its message and a hint.
+        named: function that returns the value of a name; without a value it reports a fault and returns None.
+        report: function that receives a fault: place, message and hint.
     """
     if isinstance(written, NumberSyntax):
         return written.value
@@ -57,7 +57,7 @@ def value_of(
 
 
 def names_in(written: Quantity) -> Iterator[Name]:
-    """Yield the names that a quantity is computed from."""
+    """Yield the names in a quantity."""
     if isinstance(written, Name):
         yield written
     elif isinstance(written, Arithmetic):
@@ -66,9 +66,10 @@ def names_in(written: Quantity) -> Iterator[Name]:
 
 
 def _compute(written: Arithmetic, values: list[Value]) -> Value:
-    """Return a result, exact in decimal digits and then rounded: 0.1 * 30 is 3, as written."""
+    """Return the result of an operation in exact decimal arithmetic, rounded once: 0.1 * 30 is 3."""
     first, *rest = values
     if not rest:
+        # 0.0 - x, because the negative of 0.0 is -0.0
         return Duration(-first.ns) if isinstance(first, Duration) else 0.0 - first
     durations = [isinstance(value, Duration) for value in values]
     left, right = _exact(first), _exact(rest[0])
@@ -84,6 +85,7 @@ def _compute(written: Arithmetic, values: list[Value]) -> Value:
 
 
 def _exact(value: Value) -> Fraction:
+    # repr gives the decimal digits of the text; Fraction(0.1) would be the binary float nearest to 0.1
     return Fraction(value.ns) if isinstance(value, Duration) else Fraction(repr(value))
 
 
@@ -100,7 +102,7 @@ def _round(result: Fraction, is_duration: bool) -> Value:
 
 
 def constant_of(written: Quantity, value: Value, ends: tuple[Value, Value] | None) -> Constant:
-    """Return a constant as specifications list it."""
+    """Return the entry of `Specification.constants` for a constant; `ends` are those of its range."""
     is_computed = any(True for _ in names_in(written))
     span = None if ends is None else (_plain(ends[0]), _plain(ends[1]))
     return Constant(_plain(value), value.ns if isinstance(value, Duration) else None, span, is_computed)
@@ -111,7 +113,7 @@ def _plain(value: Value) -> float:
 
 
 def range_fault(value: Value, ends: tuple[Value, Value]) -> tuple[str, str] | None:
-    """Return what is wrong with the range of a constant, and a hint; None if it holds the value."""
+    """Return the message and hint of a faulty range; None if the range contains the value."""
     kinds = {isinstance(number, Duration) for number in (value, *ends)}
     if len(kinds) > 1:
         return "a range from numbers to durations", "write both ends like the constant itself"
@@ -125,7 +127,7 @@ def range_fault(value: Value, ends: tuple[Value, Value]) -> tuple[str, str] | No
 
 
 def text_of(value: Value) -> str:
-    """Return a value as written in a text."""
+    """Return the text of a value in a specification."""
     return format_duration(value.ns) if isinstance(value, Duration) else format_number(value)
 
 
@@ -138,15 +140,15 @@ def replace_constants(
     values: Mapping[str, Value | None],
     given: Mapping[str, float | str],
 ) -> str:
-    """Return a text with other values for some of its constants; comments and all else stay.
+    """Return a text with new values in some `const` lines; everything else stays unchanged.
 
     Args:
-        statements: the text's `const` lines by name.
-        values: what the constants are in the text as it is.
-        given: the new values: numbers and, as texts, durations.
+        statements: `const` lines of the text by name.
+        values: values in the text by name.
+        given: new values by name: numbers, or durations as texts.
 
     Raises:
-        UsageError: no such constant, a value that is none, a number for a duration or the reverse.
+        UsageError: an unknown constant, an invalid value, a number for a duration or the reverse.
     """
     pieces: list[tuple[Span, str]] = []
     for name, value in given.items():
@@ -171,13 +173,13 @@ def _new_text(name: str, value: object, written: Value | None) -> str:
 
 
 def value_from_outside(name: str, value: object) -> Value:
-    """Return the value given for a constant from outside.
+    """Return the value of a constant that a caller or the command line sets.
 
     Raises:
-        UsageError: it is neither a finite number nor the text of a number or a duration.
+        UsageError: neither a finite number nor the text of a number or a duration.
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        # an integer beyond every float is none
+        # float() of an integer above 1.8e308 raises OverflowError
         with suppress(OverflowError):
             if math.isfinite(value):
                 return float(value)

@@ -1,4 +1,4 @@
-"""Faults of a specification's text: each with its place, collected so that all are reported together."""
+"""Faults of a specification's text with their places; all faults of a text are reported together."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from spatial_replay.text import escape_text
 from spatial_replay.text import nearest_hint as nearest_hint
 
 MAX_FAULTS = 100
-"""Faults reported together; beyond, only their number."""
+"""Most faults in one report; further faults are only counted."""
 
 _MAX_SUGGESTION_EFFORT = 10_000
-"""Names compared for hints in one text; a text with a fault in every line would compare millions."""
+"""Most name comparisons for the hints of one text; faults in every line would otherwise need millions."""
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
 
 class Span(NamedTuple):
-    """A place in a source text: characters `start` up to, not including, `end`."""
+    """Place in a source text: offset of its first character, and of the character after its last."""
 
     start: int
     end: int
@@ -29,14 +29,14 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """An error or a warning about a specification, with its place.
+    """Error or warning about a specification, with its place.
 
     Attributes:
         severity: "error" or "warning".
-        line, column: counted from 1; the column in characters.
-        source_line: the line itself.
-        width: how many characters the caret underlines, at least 1.
-        hint: what to write instead, or "".
+        line, column: position, counted from 1; columns are characters.
+        source_line: text of the line.
+        width: number of underlined characters, at least 1.
+        hint: remedy, or "".
     """
 
     severity: Literal["error", "warning"]
@@ -51,6 +51,7 @@ class Diagnostic:
     def __str__(self) -> str:
         first = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
         piece = self.source_line[first : first + _SHOWN]
+        # control characters of a text would act on the terminal
         printable_piece = "".join(character if character.isprintable() else " " for character in piece)
         offset = self.column - 1 - first
         caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
@@ -61,13 +62,14 @@ class Diagnostic:
 
 
 _SHOWN = 200
-"""Characters of a line that a message shows; of a longer one, those around the fault."""
+"""Most characters of a source line in a message; a longer line is cut around the fault."""
 _SHOWN_BEFORE = 100
+"""Characters before the fault in a cut line."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceText:
-    """A text and the name of its file; turns offsets into lines and columns."""
+    """Text with its file name and an index of its lines."""
 
     text: str
     filename: str
@@ -79,13 +81,13 @@ class SourceText:
         return cls(text, filename, (0, *(line_end.end() for line_end in _LINE_END.finditer(text))))
 
     def line_of(self, offset: int) -> int:
-        """Return the line, counted from 1, that an offset lies in."""
+        """Return the line of an offset, counted from 1."""
         return bisect_right(self.line_starts, offset)
 
     def diagnostic(
         self, severity: Literal["error", "warning"], span: Span, message: str, hint: str = ""
     ) -> Diagnostic:
-        """Return an error or a warning about a span, which is marked up to the end of its first line."""
+        """Return an error or a warning about a span; the underline ends with the first line of the span."""
         line = self.line_of(span.start)
         start = self.line_starts[line - 1]
         end = self.line_starts[line] if line < len(self.line_starts) else len(self.text)
@@ -97,7 +99,7 @@ class SourceText:
 
 @dataclass(slots=True)
 class Faults:
-    """The faults found so far in one text: at most one for each place, and a bounded number."""
+    """Faults of one text: at most one for each place, and at most `MAX_FAULTS` in all."""
 
     source: SourceText
     found: dict[Span, Diagnostic] = field(default_factory=dict)
@@ -106,16 +108,16 @@ class Faults:
 
     @property
     def is_full(self) -> bool:
-        """Whether further faults are only counted, so that no hint need be worked out for them."""
+        """Whether further faults are only counted and need no hints."""
         return len(self.found) >= MAX_FAULTS
 
     @property
     def count(self) -> int:
-        """All faults, reported or only counted."""
+        """Number of faults, unreported ones included."""
         return len(self.found) + self.unreported
 
     def add(self, span: Span, message: str, hint: str = "") -> None:
-        """Add a fault, unless its place has one already; when full, only count it."""
+        """Add a fault unless its place already has one; only count it if the report is full."""
         if span in self.found:
             return
         if self.is_full:
@@ -124,7 +126,7 @@ class Faults:
         self.found[span] = self.source.diagnostic("error", span, _crop(message), _crop(hint))
 
     def nearest(self, name: str, known: Iterable[str]) -> str:
-        """Return a hint with the known name most like one that is unknown, or ""."""
+        """Return a hint with the known name closest to an unknown name; "" if none is close."""
         if self.is_full or self.effort > _MAX_SUGGESTION_EFFORT:
             return ""
         candidates = tuple(known)
@@ -132,10 +134,10 @@ class Faults:
         return nearest_hint(name, candidates)
 
     def raise_if_any(self) -> None:
-        """Raise the error of all faults, in the order of the text.
+        """Raise one error with all faults in text order.
 
         Raises:
-            SpecificationError: there is a fault.
+            SpecificationError: the text has a fault.
         """
         if not self.found:
             return
@@ -151,7 +153,7 @@ _LONGEST_MESSAGE = 400
 
 
 def _crop(message: str) -> str:
-    """Shorten the middle of a long message, such as one about a name of several pages."""
+    """Cut the middle out of a long message, such as one that quotes a very long name."""
     if len(message) <= _LONGEST_MESSAGE:
         return message
     half = _LONGEST_MESSAGE // 2

@@ -1,8 +1,7 @@
-"""The canonical text of terms, formulas and specifications, and the lines of a formula's tree.
+"""Canonical text of terms, formulas and specifications, and the lines of a formula's tree.
 
-Constants, macros and quantifiers over named groups are written out; every operand that is not a
-name or `true` or `false` stands in brackets; numbers keep every digit. Reading the text back gives
-an equal specification.
+Constants, macros and quantifiers over named groups are expanded. Every operand except names, `true` and
+`false` is in brackets. Numbers keep all digits. Parsing the text gives an equal specification.
 """
 
 from __future__ import annotations
@@ -46,10 +45,11 @@ from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import quote_name, written_name
 
 _LARGEST_PLAIN = 1e16
+"""Whole numbers from here on are written with an exponent, as by `repr`."""
 
 
 def format_number(value: float) -> str:
-    """Return a number with all of its digits, without a fraction where it has none."""
+    """Return a number with all its digits; a whole number has no ".0"."""
     if value.is_integer() and abs(value) < _LARGEST_PLAIN:
         return str(int(value))
     return repr(value)
@@ -61,7 +61,7 @@ def format_duration(ns: int) -> str:
 
 
 def format_bound(bound: Bound | None) -> str:
-    """Return a window as written behind its operator; "" for none."""
+    """Return the text of a window, such as "[0, 10]"; "" without a window."""
     if bound is None:
         return ""
     write = format_duration if bound.unit == "ns" else str
@@ -73,7 +73,7 @@ def format_bound(bound: Bound | None) -> str:
 
 
 def format_term(term: Term, relations: frozenset[str] = RELATION_NAMES) -> str:
-    """Return a term as written; `relations` are names that need quotes."""
+    """Return the text of a term; a name in `relations` is quoted."""
     match term:
         case Enlarged():
             return f"enlarge({format_term(term.term, relations)}, {format_number(term.radius)})"
@@ -106,7 +106,7 @@ def format_relation(
     parameters: Sequence[float | str],
     relations: frozenset[str] = RELATION_NAMES,
 ) -> str:
-    """Return an atom as written, of its relation, terms and parameters (see `Atom`)."""
+    """Return the text of an atom from its relation, terms and parameters (see `Atom`)."""
     names = [format_term(term, relations) for term in terms]
     values = [format_number(value) if isinstance(value, float) else value for value in parameters]
     if relation == "signal":
@@ -137,7 +137,7 @@ def format_atom(
     parameters: Sequence[float | str],
     relations: frozenset[str] = RELATION_NAMES,
 ) -> str:
-    """Return an atom as written (see `Atom`); computed numbers are written from what they compute."""
+    """Return the text of an atom (see `Atom`); the text of a sum comes from its expression."""
     if relation != "sum":
         return format_relation(relation, terms, parameters, relations)
     whole = expression.operand if isinstance(expression, Scaled) else expression
@@ -149,7 +149,7 @@ def format_atom(
 
 
 def _sides(margin: Expression, sign: str) -> tuple[Expression, Expression]:
-    """Return what stands left and right of a comparison, given its margin (see `relations.compare`)."""
+    """Return the left and right side of a comparison from its margin (see `relations.compare`)."""
     match margin:
         case Sum(first, Negative(second)):
             return (first, second) if sign.startswith(">") else (second, first)
@@ -157,7 +157,7 @@ def _sides(margin: Expression, sign: str) -> tuple[Expression, Expression]:
 
 
 def format_sum(expression: Expression, relations: frozenset[str] = RELATION_NAMES) -> str:
-    """Return a computed number as written, with brackets wherever another operation stands in one."""
+    """Return the text of a computed number; each operand that is an operation is in brackets."""
 
     def operand(inner: Expression) -> str:
         text = format_sum(inner, relations)
@@ -204,8 +204,8 @@ def format_formula(
     """Return the canonical text of a formula.
 
     Args:
-        references: write the named specs below the root by their names, as in a file, instead of
-            what they refer to.
+        references: whether named specs below the root are written by their names, as in a file, instead of
+            as formulas.
         relations: names that need quotes.
     """
 
@@ -243,7 +243,7 @@ def format_formula(
 
 
 def format_specification(specification: Specification) -> str:
-    """Return the canonical text of a specification, every `spec` on a line of its own."""
+    """Return the canonical text of a specification, with one line for each `spec`."""
     relations = RELATION_NAMES | specification.relations
     lines = [f"use {specification.profile}"]
     lines += [f"use {name}  # SHA-256 {digest}" for name, digest in specification.plugins.items()]
@@ -269,7 +269,7 @@ def _format_spec(spec: NamedSpec, relations: frozenset[str]) -> str:
 
 
 def title_text(spec: NamedSpec) -> str:
-    """Return the requirement id and the title of a spec as one text; "" for none."""
+    """Return the requirement id and title of a spec as one text; "" without both."""
     return ": ".join(text for text in (spec.id, spec.title) if text is not None)
 
 
@@ -285,11 +285,11 @@ def _format_outline(outline: Outline) -> str:
 
 
 class Branch(NamedTuple):
-    """A node of a tree.
+    """Node of a tree, as a line of text.
 
     Attributes:
-        id: its number, from the root, 0, in the order of the text.
-        stem: the lines that lead to it from the nodes above: "│  ├─ ".
+        id: number of the node in text order; the root is 0.
+        stem: lines that connect the node with its ancestors, such as "│  ├─ ".
     """
 
     id: int
@@ -298,7 +298,7 @@ class Branch(NamedTuple):
 
 
 def iter_branches(formula: Formula) -> Iterator[Branch]:
-    """Yield every node, from the root, in the order of the text."""
+    """Yield every node in text order, the root first."""
     stack = [("", "", formula)]
     identifier = 0
     while stack:
@@ -313,7 +313,7 @@ def iter_branches(formula: Formula) -> Iterator[Branch]:
 
 
 def title_of(node: Formula) -> str:
-    """Return a node's operator or atom, without its name and operands: "F[0, 10]", "a ovlp b"."""
+    """Return the operator or atom of a node without name and operands: "F[0, 10]", "a ovlp b"."""
     match node:
         case Atom() | Quantified() | Truth():
             return format_formula(node)
@@ -324,5 +324,5 @@ def title_of(node: Formula) -> str:
 
 
 def label_of(node: Formula) -> str:
-    """Return the same with its name: "reach = F[0, 10]"."""
+    """Return the operator or atom of a node, with its name if it has one: "reach = F[0, 10]"."""
     return title_of(node) if node.name is None else f"{node.name} = {title_of(node)}"

@@ -1,13 +1,13 @@
 """Terms, expressions, formulas and specifications, as frozen values.
 
-Three layers, each built of the one before:
+There are three layers:
 
-- a *term* names footprints: a tracked object, a region, a group, one of these earlier in time or
-  enlarged, or its centre;
-- an *expression* is a number computed from terms in one sample: signed distance, enclosure,
-  projections, and their sums, minima and maxima. Every spatial relation is such an expression
-  (see `relations`), positive where the relation holds;
-- a *formula* combines atoms (an expression, as it was written) by Boolean and temporal operators.
+- A *term* names footprints: a tracked object, a region or a group. A term can also be delayed, enlarged or
+  reduced to its centre.
+- An *expression* is a number computed from terms in one sample: signed distance, enclosure,
+  projections, and their sums, minima and maxima. Every spatial relation is an expression that is positive
+  where the relation holds (see `relations`).
+- A *formula* combines atoms by Boolean and temporal operators. An atom is an expression with its text.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Side: TypeAlias = Literal["min", "max"]
 
 
 class NamedNumber(float):
-    """A number that constants give, which stays equal to the number alone.
+    """Number that is computed from constants; it is equal to the same number without names.
 
     Attributes:
-        constants: the names of the constants that it is computed from.
-        is_plain: whether it is the value of the only one of them.
+        constants: names of the constants.
+        is_plain: whether the number is the value of a single constant, without arithmetic.
     """
 
     __slots__ = ("constants", "is_plain")
@@ -50,36 +50,36 @@ class NamedNumber(float):
 
 @dataclass(frozen=True, slots=True)
 class TrackedName:
-    """A tracked object of the log, by its name."""
+    """Tracked object of the log, by name."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """An object still to be bound: by an open quantifier, or the parameter of a template."""
+    """Variable for an object: of an open quantifier, or the parameter of a template."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class RegionName:
-    """A region of the specification, by its name; `Specification.regions` holds its shape."""
+    """Region of the specification, by name; its shape is in `Specification.regions`."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A set of tracked objects; as a term, the union of its members' footprints.
+    """Set of tracked objects; as a term, the union of its members' footprints.
 
-    Exactly one of `members` (a named group) and `class_name` (an open group) is given.
+    A named group has `members`, an open group has `class_name`; the other attribute is None.
 
     Attributes:
-        name: the name it was declared under; "" for one written in place.
-        members: names of the members, in the order written; None for an open group.
-        class_name: objects of this class in the sample, ignoring case; `ANY_CLASS` for every object.
-        excluded: members left out, by name or by variable.
+        name: declared name; "" for a group written inside a formula.
+        members: names of the members in text order.
+        class_name: class of the members in each sample, ignoring case; `ANY_CLASS` for every object.
+        excluded: excluded objects or variables.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Group:
 
     @property
     def is_open(self) -> bool:
-        """Whether members are those of the current sample rather than fixed by name."""
+        """Whether the members are determined in each sample instead of listed by name."""
         return self.members is None
 
 
@@ -99,11 +99,11 @@ ANY_CLASS = "*"
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """A term as it was earlier; exactly one of `samples`, `duration_ns` and `rate` is given.
+    """Delayed term; exactly one of `samples`, `duration_ns` and `rate` is given.
 
-    `a[-3]` is that of 3 samples before, `a[-2.5s]` that of the last sample at or before that much earlier.
-    A rate moves a term back by its own velocity between the last two reports, over the shortest time between
-    two reports of any of the terms in `rate`.
+    `a[-3]` is the term 3 samples earlier. `a[-2.5s]` is the term in the last sample that is at least 2.5 s
+    earlier. With `rate`, the term is moved back along its velocity between its last two reports. The time of
+    this step is the shortest report interval of the terms in `rate`.
     """
 
     term: TrackedName | Variable | RegionName | Group
@@ -114,7 +114,7 @@ class Earlier:
 
 @dataclass(frozen=True, slots=True)
 class Enlarged:
-    """The Minkowski sum of a term with a disc in the plane (`enlarge(a, r)`); heights stay."""
+    """Minkowski sum of a term with a disc in the plane (`enlarge(a, r)`); heights do not change."""
 
     term: Term
     radius: float
@@ -122,20 +122,20 @@ class Enlarged:
 
 @dataclass(frozen=True, slots=True)
 class Centre:
-    """The point at a term's centroid (`center(a)`), halfway up; of a group, that of each member."""
+    """Centroid of a term at half its height (`center(a)`); a group has one centroid for each member."""
 
     term: TrackedName | Variable | RegionName | Group | Earlier
 
 
 DerivedTerm: TypeAlias = Earlier | Enlarged | Centre
-"""A term made of another, which it has as `term`; `replace` makes the same of a further one."""
+"""Term with an inner term, `term`; `replace(term, term=...)` applies the same change to another term."""
 Term: TypeAlias = TrackedName | Variable | RegionName | Group | DerivedTerm
 
 # ---------------------------------------------------------------------------------------- expressions
 
 
 class _Arithmetic:
-    """Operators of expressions, so that a relation reads like its definition."""
+    """Arithmetic operators, so that the code of a relation looks like its definition."""
 
     __slots__ = ()
 
@@ -157,19 +157,19 @@ class _Arithmetic:
 
 @dataclass(frozen=True, slots=True)
 class Number(_Arithmetic):
-    """A constant, in the units of the footprints or of the signal it is compared with."""
+    """Constant, in the unit of the footprints or of the signal in the same comparison."""
 
     value: float
 
 
 class Measurement(_Arithmetic):
-    """A number that geometry computes of one or two terms.
+    """Number that geometry computes from one or two terms.
 
-    A group is the union of its members: the measurement is that of the members that `extrema` picks.
+    For a group, the number is computed for each member, and `extrema` selects one of these numbers.
 
     Attributes:
-        unit: of its number.
-        needs_orientation: whether it compares the orientations of single objects, not footprints.
+        unit: unit of the number.
+        needs_orientation: whether orientations of single objects are compared instead of footprints.
     """
 
     __slots__ = ()
@@ -179,25 +179,25 @@ class Measurement(_Arithmetic):
     @property
     @abstractmethod
     def quantity(self) -> str:
-        """Its name in explanations; if it measures footprints, a key of `kernels.QUANTITY_CODES`, too."""
+        """Name in explanations; the name of a footprint measurement is a key of `kernels.QUANTITY_CODES`."""
 
     @property
     @abstractmethod
     def terms(self) -> tuple[Term, ...]:
-        """The one or two terms that it measures."""
+        """The measured terms, one or two."""
 
     @abstractmethod
     def with_terms(self, *terms: Term) -> Self:
-        """Return the same measurement of other terms, as many as in `terms`."""
+        """Return the same measurement of other terms; their number must be the same."""
 
     @property
     @abstractmethod
     def extrema(self) -> tuple[Side, ...]:
-        """Which member of a group decides, for each term; that of the first one is picked last."""
+        """Minimum or maximum over the members of each term, if it is a group; the first term is outermost."""
 
     @property
     def radius_effects(self) -> tuple[int, ...]:
-        """How much the number grows with the radius by which each term is enlarged: 1, 0 or -1."""
+        """Change of the number per unit of enlargement of each term: 1, 0 or -1."""
         return (0,) * len(self.terms)
 
 
@@ -243,7 +243,7 @@ class _OfSeveral(_Arithmetic):
 
 
 class SignedDistance(_OfTwo):
-    """Distance of two footprints when apart, minus their penetration depth when not (Def. 2-4)."""
+    """Distance of two footprints; if they overlap, minus their penetration depth (Def. 2-4)."""
 
     __slots__ = ()
     quantity = "signed_distance"
@@ -252,7 +252,7 @@ class SignedDistance(_OfTwo):
 
 @dataclass(frozen=True, slots=True)
 class Protrusion(Measurement):
-    """How far `inner` sticks out: max over hull(inner) of the signed distance to outer (Prop. 2)."""
+    """Protrusion of `inner` from `outer`: maximum over hull(inner) of the signed distance (Prop. 2)."""
 
     inner: Term
     outer: Term
@@ -279,7 +279,7 @@ class Projection(_AlongAxis):
 
     @property
     def radius_effects(self) -> tuple[int]:
-        # a disc in the plane leaves heights
+        # `enlarge` adds a disc in the plane, which does not change heights
         return (0 if self.axis == "z" else 1 if self.side == "max" else -1,)
 
 
@@ -294,7 +294,7 @@ class CentroidProjection(_AlongAxis):
 
 
 class Misalignment(_OfTwo):
-    """Half the squared distance of two unit orientation vectors, 1 - cos of their angle (Def. 10)."""
+    """Half the squared distance of two unit orientation vectors: 1 - cos of their angle (Def. 10)."""
 
     __slots__ = ()
     quantity = "misalignment"
@@ -304,35 +304,36 @@ class Misalignment(_OfTwo):
 
 @dataclass(frozen=True, slots=True)
 class Signal(_Arithmetic):
-    """A named numeric signal of the log."""
+    """Numeric signal of the log, by name."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class ComputedSignal(Signal):
-    """A signal that a plug-in computes of each sample; `plugin` is its module or file (see `relations`)."""
+    """Signal that a plug-in computes from each sample; `plugin` is its module or file (see `relations`)."""
 
     plugin: str
 
 
 @dataclass(frozen=True, slots=True)
 class PreviousSignal(Signal):
-    """A signal at its last report but the one that the sample shows."""
+    """Signal at the report before the one in the sample."""
 
     signal: Signal
 
 
 @dataclass(frozen=True, slots=True)
 class Rate(Signal):
-    """A rate of change between reports, per second: `speed(a)`, `speed(a, b)`, `rate(signal)`.
+    """Rate of change between reports, per second: `speed(a)`, `speed(a, b)`, `rate(signal)`.
 
-    To sentences and rules it is a signal; its numbers are computed (see `walks.change_of`).
+    A rate is handled like a signal in explanations and checks, but its numbers are computed (see
+    `walks.change_of`).
 
     Attributes:
-        name: as written.
-        terms: those of a speed.
-        signal: that of `rate`, else None.
+        name: text of the rate.
+        terms: terms of a speed.
+        signal: signal of `rate`; None for a speed.
     """
 
     terms: tuple[Term, ...]
@@ -341,11 +342,11 @@ class Rate(Signal):
 
 @dataclass(frozen=True, slots=True)
 class ReportStep(Signal):
-    """The seconds between the two reports that a rate compares; of several terms, the shortest time.
+    """Time between the last two reports of a rate, seconds; the shortest time if there are several terms.
 
     Attributes:
-        terms: those of a speed that move.
-        signal: that of `rate`, else None.
+        terms: terms of a speed, without regions.
+        signal: signal of `rate`; None for a speed.
     """
 
     terms: tuple[TrackedName | Variable | Group, ...]
@@ -354,23 +355,23 @@ class ReportStep(Signal):
 
 @dataclass(frozen=True, slots=True)
 class HasRate(Signal):
-    """Whether a rate has a value: 1 or 0; unknown where an object or the signal of it is missing."""
+    """Whether a rate has a value: 1 or 0; unknown if its object or signal is missing."""
 
     rate: Rate
 
 
 @dataclass(frozen=True, slots=True)
 class Present(Signal):
-    """Whether a sample has an object, wherever it is: 1 or 0, never unknown (`present(a)`)."""
+    """Whether a sample contains an object: 1 or 0, never unknown (`present(a)`)."""
 
     term: TrackedName | Variable
 
 
 @dataclass(frozen=True, slots=True)
 class Equality(_Arithmetic):
-    """+inf where a signal is equal to a number, -inf where it is not; unknown where the signal is.
+    """+inf where a signal equals a number, -inf elsewhere; unknown where the signal is unknown.
 
-    A text is its `text_number`; whether a number is equal to a text is unknown.
+    A text is represented by its `text_number`. The comparison of a number with a text is unknown.
     """
 
     signal: Signal
@@ -387,19 +388,19 @@ class Sum(_Arithmetic):
 
 @dataclass(frozen=True, slots=True)
 class Negative(_Arithmetic):
-    """-`operand`: how far a relation is from holding becomes how far it is from failing."""
+    """-`operand`; as a robustness, the negation of a relation."""
 
     operand: Expression
 
 
 class Minimum(_OfSeveral):
-    """The least of its operands, as in a conjunction."""
+    """Minimum of the operands, as in a conjunction."""
 
     __slots__ = ()
 
 
 class Maximum(_OfSeveral):
-    """The greatest of its operands, as in a disjunction."""
+    """Maximum of the operands, as in a disjunction."""
 
     __slots__ = ()
 
@@ -414,7 +415,7 @@ class Product(_Arithmetic):
 
 @dataclass(frozen=True, slots=True)
 class Scaled(_Arithmetic):
-    """`operand` / `divisor`: written so, or of a `scale` line; divisor > 0."""
+    """`operand` / `divisor`, from a formula or a `scale` line; divisor > 0."""
 
     operand: Expression
     divisor: float
@@ -426,10 +427,10 @@ Expression: TypeAlias = (
 
 
 def as_expression(value: object) -> Expression:
-    """Return a number as an expression, and an expression as it is.
+    """Return a number as an expression; return an expression unchanged.
 
     Raises:
-        TypeError: for anything else.
+        TypeError: neither a number nor an expression.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float, _Arithmetic)):
         raise TypeError(f"{value!r} is neither a number nor an expression over terms")
@@ -439,12 +440,12 @@ def as_expression(value: object) -> Expression:
 
 
 def minimum(*operands: Expression | float) -> Minimum:
-    """Return the least of some expressions."""
+    """Return the minimum of some expressions."""
     return Minimum(tuple(as_expression(operand) for operand in operands))
 
 
 def maximum(*operands: Expression | float) -> Maximum:
-    """Return the greatest of some expressions."""
+    """Return the maximum of some expressions."""
     return Maximum(tuple(as_expression(operand) for operand in operands))
 
 
@@ -453,12 +454,12 @@ def maximum(*operands: Expression | float) -> Maximum:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """The window of a temporal operator, both ends included; in samples or in nanoseconds.
+    """Window of a temporal operator, both ends included.
 
     Attributes:
-        lower: 0 <= lower.
-        upper: lower <= upper; None where there is no upper end.
-        unit: "samples" or "ns".
+        lower: lower end, at least 0.
+        upper: upper end, at least `lower`; None for an unbounded window.
+        unit: unit of both ends, "samples" or "ns".
     """
 
     lower: int
@@ -480,16 +481,16 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Atom:
-    """A relation or a comparison: one number in each sample, at least 0 where it holds.
+    """Relation or comparison: one number in each sample, at least 0 where the atom holds.
 
     Attributes:
-        text: its canonical text, in the profile of its specification.
-        relation: the relation's name ("closeto", "dist", ...; "signal" for a comparison of a signal; "sum"
-            for one of computed numbers).
-        expression: its robustness.
-        terms: what the relation is about, in the order written; none for a signal.
-        parameters: what is written besides: numbers, an axis, a comparison's operators. The text of a "sum"
-            is that of its expression.
+        text: canonical text in the profile of the specification.
+        relation: name of the relation, such as "closeto" or "dist"; "signal" for the comparison of one
+            signal, "sum" for a comparison of computed numbers.
+        expression: robustness.
+        terms: terms of the relation in text order; none for a signal.
+        parameters: numbers, axis and comparison operators in text order. A "sum" has only the operators and
+            numbers, because its text is made from its expression.
     """
 
     text: str
@@ -502,18 +503,20 @@ class Atom:
 
 
 BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "spec", "given", "with"]
-"""`spec` has one operand and is that operand: a spec that only repeats another under its own name.
+"""Boolean operators of the language, and three internal operators.
 
-`given` and `with` are in expansions alone: an operand of an operator that leaves samples without a rate out
-(see `judged_operands`). Their first operand is that there is a rate, their last one what was written.
+`spec` has one operand and its value: a spec that only repeats another spec under its own name. `given` and
+`with` occur only in expansions: they make an operator skip samples without a rate (see `judged_operands`).
+Their first operand is the condition that the rate has a value; their last operand is the written one.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Boolean:
-    """A Boolean operator: `not` and `spec` have one operand; `and` and `or` two or more; the rest two.
+    """Boolean operator: `not` and `spec` have one operand, `and` and `or` two or more, the others two.
 
-    Its `expansion` is the formula that defines it; None for `not`, `and` and `or` (see `expand`).
+    Attributes:
+        expansion: formula that defines the operator; None for `not`, `and` and `or` (see `expand`).
     """
 
     operator: BooleanOperator
@@ -533,10 +536,11 @@ PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
 
 @dataclass(frozen=True, slots=True)
 class Temporal:
-    """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
+    """Temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
 
-    Its `expansion` is the formula that defines R, W and WX, and any operator over a rate (see
-    `judged_operands`); None for the others (see `expand`).
+    Attributes:
+        expansion: formula that defines R, W, WX, an operator over a rate (see `judged_operands`), or U and S
+            with `true` on the left; None for the others (see `expand`).
     """
 
     operator: TemporalOperator
@@ -558,14 +562,13 @@ class Temporal:
 
 @dataclass(frozen=True, slots=True)
 class Quantified:
-    """`forall` or `exists` over an open group: one node, its members bound in each sample.
+    """`forall` or `exists` over an open group: one node, whose variables are bound in each sample.
 
-    Over several variables the members are ordered tuples of distinct ones. The body holds no temporal
-    operator.
+    Several variables are bound to ordered tuples of distinct members. The body has no temporal operator.
 
     Attributes:
-        group: an open `Group`, or one `Earlier` (its members are those of then).
-        judged: the body that is evaluated: it leaves members without a rate out (see `judged_operands`).
+        group: open `Group`, or `Earlier` with the members of an earlier sample.
+        judged: evaluated body, which skips members without a rate (see `judged_operands`).
     """
 
     quantifier: Literal["forall", "exists"]
@@ -584,10 +587,11 @@ Formula: TypeAlias = Truth | Atom | Boolean | Temporal | Quantified
 
 
 def expand(formula: Formula) -> Formula:
-    """Return a formula of the same value whose own operator is one that engines implement.
+    """Return an equal formula whose outermost operator is implemented by the engines.
 
-    These are `not`, `and`, `or`, X, F, G, U, Y, O, H and S. All others are written in terms of them when a
-    node is made; trees, texts and ids are those of the formula as written. Operands stay as they are.
+    Engines implement `not`, `and`, `or`, X, F, G, U, Y, O, H and S. Every other operator gets its `expansion`
+    in these when its node is made. Trees, texts and ids are those of the written formula. Operands are not
+    expanded.
     """
     while isinstance(formula, (Boolean, Temporal)) and formula.expansion is not None:
         formula = formula.expansion
@@ -611,7 +615,7 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
             return Boolean("and", (forward, backward))
         case "WX":
             return _not(Temporal("X", (_not(first),)))
-        # over a window that begins later, F takes less than half of the time of U
+        # over a window that begins later, U takes up to 2.7 times as long as the equal F
         case "U" if first == Truth(True):
             return Temporal("F", (last,), bound)
         case "S" if first == Truth(True):
@@ -621,7 +625,7 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
         case "R":
             return _not(Temporal("U", (_not(first), _not(last)), bound))
         case "W" if bound is None:
-            # not "U or G": that would count as two unbounded operators, each doubling the online state
+            # not "U or G", whose two unbounded operators would each double the state of a monitor
             return Temporal("R", (last, Boolean("or", (first, last))))
         case "W":
             return Boolean("or", (Temporal("U", operands, bound), Temporal("G", (first,), bound)))
@@ -640,13 +644,13 @@ _LEFT_OUT_AS: Final[Mapping[str, tuple[BooleanOperator, ...]]] = MappingProxyTyp
         "R": ("with", "given"),
     }
 )
-"""How each operator that ranges over samples or members leaves one out, by operand."""
+"""Operators that skip samples or members without a rate, one for each operand."""
 
 
 def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formula, ...]:
-    """Return operands with the samples or members left out in which a rate has no value yet.
+    """Return operands that skip the samples or members in which a rate has no value yet.
 
-    They are the same tuple where no rate stands in them without such an operator in between.
+    The result is the given tuple if the operands have no rates outside of inner operators that skip samples.
     """
     conditions = [rate_conditions(operand) for operand in operands] if operator in _LEFT_OUT_AS else []
     if not any(conditions):
@@ -660,17 +664,17 @@ def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formu
 
 
 def judged_operator(formula: Temporal) -> Temporal:
-    """Return a temporal operator with the operands that it reads (see `judged_operands`)."""
+    """Return a temporal operator with its evaluated operands (see `judged_operands`)."""
     expansion = formula.expansion
     is_judged = isinstance(expansion, Temporal) and expansion.operator == formula.operator
     return expansion if is_judged else formula  # type: ignore[return-value]
 
 
 def rate_conditions(formula: Formula) -> list[Formula]:
-    """Return that each rate in a formula has a value, in the samples in which the formula reads them.
+    """Return one condition for each rate in a formula: it has a value in the samples in which it is read.
 
-    Rates within an operator that leaves samples out itself do not count. Before the first sample and after
-    the last one there is nothing to leave out, and so the conditions hold there.
+    Rates inside an operator that skips samples itself have no condition. Conditions hold before the first
+    and after the last sample, where there is no sample to skip.
     """
     match formula:
         case Atom():
@@ -711,14 +715,14 @@ def _all(formulas: list[Formula]) -> Formula:
 
 
 def operands_of(formula: Formula) -> tuple[Formula, ...]:
-    """Return the formulas directly below a node of the tree; a quantifier over an open group has none."""
+    """Return the children of a node in the tree; a quantifier over an open group has none."""
     if isinstance(formula, (Boolean, Temporal)):
         return formula.operands
     return ()
 
 
 def operator_of(formula: Formula) -> str:
-    """Return the operator shown for a node: "and", "F", "forall", an atom's relation, "true", "false"."""
+    """Return the operator of a node for display: "and", "F", "forall", "true", or an atom's relation."""
     match formula:
         case Boolean() | Temporal():
             return formula.operator
@@ -731,7 +735,7 @@ def operator_of(formula: Formula) -> str:
 
 
 def iter_nodes(formula: Formula) -> Iterator[tuple[int, int | None, Formula]]:
-    """Yield the tree's nodes as (id, parent's id, node), from the root, 0, in the order of the text."""
+    """Yield the nodes of the tree as (id, id of the parent, node), in text order; the root is 0."""
     stack: list[tuple[int | None, Formula]] = [(None, formula)]
     identifier = 0
     while stack:
@@ -746,12 +750,12 @@ def iter_nodes(formula: Formula) -> Iterator[tuple[int, int | None, Formula]]:
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A region's shape: a polygon, or with one vertex and a radius, a disc.
+    """Shape of a region: a polygon, or a disc, which has one vertex and a radius.
 
     Attributes:
-        vertices: corners (x, y), in the order written; for a box counter-clockwise from (xmin, ymin).
-        radius: rounding radius, 0 for polygons and boxes.
-        height: (bottom, top), or None.
+        vertices: corners (x, y) in text order; those of a box counter-clockwise from (xmin, ymin).
+        radius: radius of a disc; 0 for polygons and boxes.
+        height: bottom and top, or None.
     """
 
     vertices: tuple[tuple[float, float], ...]
@@ -760,7 +764,7 @@ class Outline:
 
     @property
     def is_disc(self) -> bool:
-        """Whether it is a disc about its only vertex."""
+        """Whether the shape is a disc around its only vertex."""
         return self.radius > 0.0
 
 
@@ -769,8 +773,8 @@ class NamedSpec:
     """One `spec` statement.
 
     Attributes:
-        parameter: the object parameter of a template, or None.
-        is_result: whether no other spec of the file uses it; these are the results listed.
+        parameter: object parameter of a template, or None.
+        is_result: whether evaluations report the spec: no other spec of the file uses it.
         id, title: "REQ-12" and "no one is hit" of `spec calm "REQ-12: no one is hit" = ...`, or None.
     """
 
@@ -788,9 +792,9 @@ class Constant:
     """Value of a `const` statement: a number, or the seconds of a duration.
 
     Attributes:
-        duration_ns: None for a number.
-        range: the least and greatest value that its line allows, or None.
-        is_computed: whether it follows from other constants.
+        duration_ns: nanoseconds of a duration; None for a number.
+        range: least and greatest value that the `const` line allows, or None.
+        is_computed: whether the value is computed from other constants.
     """
 
     value: float
@@ -801,7 +805,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Divisor of the numbers of some atoms: atoms of one signal, or (None) of lengths."""
+    """Divisor for the numbers of all atoms of one signal; if `signal` is None, of all atoms of lengths."""
 
     signal: str | None
     divisor: float
@@ -809,22 +813,22 @@ class Scale:
 
 @dataclass(frozen=True)
 class Specification(Displayed):
-    """All specs of one text, parsed: macros, constants and named quantifiers expanded.
+    """All specs of one text, with macros, constants and quantifiers over named groups expanded.
 
-    Equality is of meaning: the source text, its file name, constants and warnings do not count.
+    Specifications are equal if they mean the same: source, file name, constants and warnings do not count.
 
     Attributes:
-        specs: every `spec`, in the order of the text.
-        profile: the relation profile, "paper" or "spatial_spec".
+        specs: all specs in text order.
+        profile: relation profile, "paper" or "spatial_spec".
         regions: shapes by name.
         groups: declared groups by name.
-        relations: names of the relations that were given in Python, or by plug-ins.
-        plugins: the SHA-256 of the file of each plug-in that the text uses.
-        constants: by name; formulas have their values already.
-        scales: what the numbers of atoms are divided by; formulas have that already.
-        source: the text it was parsed from, without a byte order mark; spans are offsets into it.
-        filename: base name of the file it came from, or "<text>".
-        warnings: what `check` warns of.
+        relations: names of relations from Python or plug-ins.
+        plugins: SHA-256 of the file of each used plug-in, by name.
+        constants: constants by name; formulas already contain their values.
+        scales: divisors of numbers of atoms; formulas already contain them.
+        source: parsed text without a byte order mark; spans are offsets into it.
+        filename: base name of the parsed file, or "<text>".
+        warnings: warnings of `check`.
     """
 
     specs: tuple[NamedSpec, ...]
@@ -841,5 +845,5 @@ class Specification(Displayed):
 
     @property
     def results(self) -> tuple[NamedSpec, ...]:
-        """The specs that no other spec uses: what an evaluation reports on."""
+        """The specs that no other spec uses; evaluations report these."""
         return tuple(spec for spec in self.specs if spec.is_result)

@@ -1,7 +1,7 @@
-"""Specifications from texts and files: names resolved, macros expanded, quantifiers written out or bound.
+"""Specifications from texts and files: names resolved, macros and quantifiers expanded.
 
-A quantifier over a named group is written out for its members; over an open group it is one node, because
-the members are known only sample by sample.
+A quantifier over a named group is expanded to one formula for each member. Over an open group it stays one
+node, because the members can differ in each sample.
 """
 
 from __future__ import annotations
@@ -117,10 +117,10 @@ _AXES: tuple[str, ...] = get_args(Axis)
 
 
 def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...]:
-    """Return the parameters that are written in brackets behind a relation's name.
+    """Return the parameters of a relation in square brackets: those after its terms.
 
     Raises:
-        UsageError: for a function that cannot be written as a relation.
+        UsageError: the function has too few parameters, or some that are not positional.
     """
     parameters = tuple(inspect.signature(relation).parameters.values())
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -133,7 +133,7 @@ def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...
 
 @dataclass(frozen=True, slots=True)
 class AtomBuilder:
-    """Builds the atoms of one text in one profile."""
+    """Builder of the atoms of one text in one profile."""
 
     relations: Mapping[str, Relation]
     names: frozenset[str]
@@ -141,7 +141,7 @@ class AtomBuilder:
     faults: Faults
 
     def relation(self, written: RelationSyntax, scope: Scope) -> Atom | None:
-        """Return an atom of a relation; None, and a fault, where its parameters do not fit."""
+        """Return the atom of a relation; report a fault and return None if its parameters do not fit."""
         terms = tuple([self.resolver.term(term, scope) for term in written.terms])
         parameters = self._parameters(written, scope)
         if parameters is None:
@@ -156,11 +156,11 @@ class AtomBuilder:
         return self._atom(written.relation, expression, terms, parameters, written, scope)
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
-        """Return the atom of a comparison of numbers."""
+        """Return the atom of a comparison."""
         return self._atom(*ComparisonBuilder(self.resolver).build(written, scope), written, scope)
 
     def presence(self, written: Call, scope: Scope) -> Formula:
-        """Return the atom of `present(a)`; `true` of anything but one object."""
+        """Return the atom of `present(a)`; report a fault and return `true` if `a` is not one object."""
         if len(written.arguments) == 1 and isinstance(written.arguments[0], (Name, *DERIVED_TERMS)):
             term = self.resolver.term(written.arguments[0], scope)
             if isinstance(term, (TrackedName, Variable)):
@@ -229,7 +229,7 @@ class AtomBuilder:
     # ---------------------------------------------------------------------------------------- checks
 
     def _check(self, expression: Expression, written: RelationSyntax, scope: Scope) -> None:
-        """Refuse orientations of what has none, and discs of negative radius."""
+        """Report relations of orientations with terms that have none, and negative radii."""
         for part in iter_expressions(expression):
             if isinstance(part, Measurement) and part.needs_orientation:
                 for term in part.terms:
@@ -249,11 +249,11 @@ class AtomBuilder:
 
 @dataclass(frozen=True, slots=True)
 class QuantifierBuilder:
-    """Builds the formulas of the quantifiers of one text.
+    """Builder of the quantified formulas of one text.
 
     Attributes:
-        words: every name that occurs in the text; variables that must be renamed avoid them.
-        elaborate: elaborates a body in a scope.
+        words: all words of the text; a renamed variable gets none of them.
+        elaborate: function that returns the formula of a body in a scope.
     """
 
     names: Namespace
@@ -263,7 +263,7 @@ class QuantifierBuilder:
     elaborate: Callable[[FormulaSyntax, Scope], Formula]
 
     def formula(self, written: QuantifierSyntax, scope: Scope, span: Span) -> Formula:
-        """Return the formula of a quantifier; `true` in place of one with faults."""
+        """Return the formula of a quantifier; `true` if it has faults."""
         doubled = first_repetition(written.variables)
         if doubled is not None:
             self.resolver.fault(doubled.span, scope, f"the variable {doubled.text!r} is given twice")
@@ -285,7 +285,7 @@ class QuantifierBuilder:
         return Truth(True)
 
     def _body_of_any(self, written: QuantifierSyntax, scope: Scope) -> None:
-        """Check a body for faults although it has no members."""
+        """Report the faults of a body whose quantifier has no members."""
         values = dict(scope.values) | {name.text: TrackedName(name.text) for name in written.variables}
         self.elaborate(written.body, replace(scope.deeper(), values=values))
 
@@ -295,6 +295,7 @@ class QuantifierBuilder:
             hint = "quantify over a class or all, or define the group without that member"
             self.resolver.fault(written.group.span, scope, message, hint)
         members = [TrackedName(name) for name in named_members(group)]
+        # permutations grow factorially; more than MAX_SIZE of them exceed the limit of a text anyway
         choices = list(islice(permutations(members, len(written.variables)), MAX_SIZE))
         if not choices:
             self._body_of_any(written, scope)
@@ -331,7 +332,7 @@ class QuantifierBuilder:
         return self._without_clash(quantified, scope)
 
     def _without_clash(self, quantified: Quantified, scope: Scope) -> Quantified:
-        """Rename variables that are written like something else in the body."""
+        """Rename variables that have the name of an object, region, group or definition."""
         others = other_names(quantified.body)
         renamed = {
             variable: self._fresh(variable, scope.bound | others)
@@ -353,7 +354,7 @@ class QuantifierBuilder:
 
 
 def first_repetition(names: Sequence[Name]) -> Name | None:
-    """Return the first of some names that an earlier one is equal to."""
+    """Return the first name that repeats an earlier one; None if all are distinct."""
     texts: set[str] = set()
     for name in names:
         if name.text in texts:
@@ -363,7 +364,7 @@ def first_repetition(names: Sequence[Name]) -> Name | None:
 
 
 def _split_title(text: str | None) -> tuple[str | None, str | None]:
-    """Return the requirement's id, which stands before ": " and has no blanks, and the title."""
+    """Return the requirement id and the title; the id is the text before ": " if that has no blanks."""
     if text is None:
         return None, None
     identifier, _, rest = text.partition(": ")
@@ -373,15 +374,16 @@ def _split_title(text: str | None) -> tuple[str | None, str | None]:
 
 
 _UNBOUNDED = frozenset({"X", "WX", "Y"})
+"""Temporal operators without windows."""
 
 
 class TooLargeError(Exception):
-    """An expansion went past its bound; the fault is already reported."""
+    """An expansion exceeds its limit; the fault is already reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """An elaborated spec; its size and depth count again wherever it is named."""
+    """Elaborated spec; its size and depth are added again for each reference to it."""
 
     spec: NamedSpec
     order: int
@@ -391,10 +393,10 @@ class _Known:
 
 @dataclass(slots=True)
 class Elaborator:
-    """Elaborates the statements of one text.
+    """Elaborator of the statements of one text.
 
     Attributes:
-        words: every name that occurs in the text; variables that must be renamed avoid them.
+        words: all words of the text; a renamed variable gets none of them.
     """
 
     names: Namespace
@@ -420,10 +422,10 @@ class Elaborator:
     # ----------------------------------------------------------------------------------------- specs
 
     def specs(self, statements: Sequence[SpecStatement]) -> tuple[NamedSpec, ...]:
-        """Return every spec, in the order of the text.
+        """Return all specs in text order.
 
         Raises:
-            TooLargeError: where the text expands to more than `MAX_SIZE` nodes.
+            TooLargeError: the text expands to more than `MAX_SIZE` nodes.
         """
         for order, statement in enumerate(statements):
             if self.names.definitions.get(statement.name.text) is statement:
@@ -478,7 +480,7 @@ class Elaborator:
             self.faults.add(parameter.span, message, "give the parameter another name")
 
     def _check_macro(self, definition: DefStatement) -> None:
-        """Check the body of a macro that nothing uses, for any arguments."""
+        """Report repeated parameters of a macro, and the faults of its body if the macro is unused."""
         doubled = first_repetition(definition.parameters)
         if doubled is not None:
             self.faults.add(doubled.span, f"the parameter {doubled.text!r} is given twice")
@@ -490,7 +492,7 @@ class Elaborator:
     # -------------------------------------------------------------------------------------- formulas
 
     def formula(self, written: FormulaSyntax, scope: Scope) -> Formula:
-        """Return the formula that was written; `true` in place of one with faults."""
+        """Return the formula of a syntax node; `true` if it has faults."""
         span = scope.call or written.span
         self._count(span, scope)
         match written:
@@ -668,7 +670,7 @@ class Elaborator:
 
 
 MAX_LENGTH = 256 * 1024
-"""Characters of a text."""
+"""Most characters of a text."""
 
 _MAX_WARNINGS = 100
 _RELATION_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
@@ -683,20 +685,20 @@ def parse_specification(
     relations: Mapping[str, Callable[..., Expression]] | None = None,
     constants: Mapping[str, float | str] | None = None,
 ) -> Specification:
-    """Parse a specification, or a formula by itself.
+    """Parse a specification or a single formula.
 
     Args:
         text: statements, or one formula, which becomes a spec named "spec".
-        filename: named in messages.
+        filename: name of the text in messages.
         profile: relation profile of a text without a `use` line: "paper" (the default) or "spatial_spec".
         relations: further relations by name, as functions; see `relations`.
-        constants: values to put into the text's `const` lines: numbers and, as texts, durations such as
-            "2s"; `Specification.source` has them, with the comments and all else as it was.
+        constants: values that replace those of `const` lines: numbers, or durations as texts, such as "2s".
+            `Specification.source` is the text with these values; the rest of it is unchanged.
 
     Raises:
-        SpecificationError: with every fault of the text. UsageError: not a text, an unknown profile, a
-        relation that does not take terms and numbers, an unknown constant, a number for a duration or the
-        reverse.
+        SpecificationError: the text has faults; the error lists them.
+        UsageError: not a text, an unknown profile, a relation whose parameters are not terms and numbers, an
+            unknown constant, a number for a duration or the reverse.
     """
     _require_text(text)
     plugins = plugins_of(text)
@@ -787,9 +789,10 @@ def load_specification(
     """Parse a specification file (UTF-8); see `parse_specification`.
 
     Raises:
-        MissingFileError: no such file, or one that cannot be read.
-        SpecificationError: with every fault of the text.
-        UsageError: no path, and what `parse_specification` raises.
+        MissingFileError: the file is missing or cannot be read.
+        SpecificationError: the text has faults; the error lists them.
+        UsageError: not a path, a log, a YAML file, a formula, or an argument that `parse_specification`
+            refuses.
     """
     _require_path(path)
     path = Path(path)
@@ -803,6 +806,7 @@ def load_specification(
         raise UsageError(f"{shortened(str(path))} is a formula; parse_specification(text) takes it")
     try:
         with path.open("rb") as file:
+            # a UTF-8 character has at most 4 bytes (RFC 3629), so a text that is cut here is too long anyway
             content = file.read(4 * MAX_LENGTH + 4)
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from error
@@ -821,10 +825,10 @@ def load_specification(
 
 
 def require_specification(value: object) -> None:
-    """Refuse anything but a specification.
+    """Raise an error if a value is not a specification.
 
     Raises:
-        UsageError: it is something else.
+        UsageError: the value has another type.
     """
     if not isinstance(value, Specification):
         remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
@@ -835,7 +839,7 @@ def listed_specifications(value: object) -> list[Specification]:
     """Return one or several specifications as a list.
 
     Raises:
-        UsageError: anything else, such as the path of a file.
+        UsageError: a value of another type, such as the path of a file.
     """
     is_several = isinstance(value, Iterable) and not isinstance(value, (str, bytes))
     specifications: list[Any] = list(value) if is_several else [value]  # type: ignore[call-overload]
@@ -845,6 +849,7 @@ def listed_specifications(value: object) -> list[Specification]:
 
 
 def _require_text(value: object) -> None:
+    # a text that looks like a file name is a path that was meant for load_specification
     if not isinstance(value, str) or _FILE.fullmatch(value):
         remedy = "give the text as a str; load_specification(path) reads a file"
         raise UsageError(f"text is {shortened(value)}; {remedy}")
@@ -868,15 +873,15 @@ def _check_relations(relations: Mapping[str, Relation]) -> None:
 
 
 def constant_writer(specification: Specification) -> Callable[[Mapping[str, float | str]], str]:
-    """Return a function that returns a specification's text with other values in its `const` lines.
+    """Return a function from values of constants to the text of a specification with these values.
 
-    For many values in turn: `parse_specification` with `constants` parses the text that comes of it, too.
+    It is faster for many values than `parse_specification` with `constants`, which parses each new text.
     """
     names = RELATION_NAMES | specification.relations
     return _constant_writer(specification.source, specification.filename, names)
 
 
-# a viewer changes the constants of one text again and again
+# viewers change the constants of the same text repeatedly
 @lru_cache(maxsize=16)
 def _constant_writer(
     text: str, filename: str, names: frozenset[str]
@@ -922,18 +927,18 @@ def _profile(statements: Sequence[Statement], plugins: Mapping[str, Plugin], fau
 _FORMULA = re.compile(
     r"[(<>=]|\S [a-z]+(\[.*\])? \S|^(true|false)$|^(!|not |always |eventually |([FGXYOH]|WX)(\[.*\])? )"
 )
-"""Marks of a formula that file names hardly ever have: signs, a word between two others, an operator."""
+"""Parts of a formula that are rare in file names: signs, a word between two words, an operator."""
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
 
 def constants_from_texts(texts: Iterable[str]) -> dict[str, float | str]:
-    """Read values of constants as they are written on a command line: `near=80`, `hold=2s`.
+    """Read values of constants from a command line: `near=80`, `hold=2s`.
 
     Returns:
-        A number or, as a text, a duration for each name.
+        A value by name: a number, or a duration as a text.
 
     Raises:
-        UsageError: no `NAME=VALUE`, or a name that is given twice.
+        UsageError: a text is not `NAME=VALUE`, or a name occurs twice.
     """
     constants: dict[str, float | str] = {}
     for text in texts:
@@ -948,7 +953,7 @@ def constants_from_texts(texts: Iterable[str]) -> dict[str, float | str]:
 
 @dataclass(frozen=True, slots=True)
 class SpecificationText:
-    """The text of a specification, and the name of the file that it is from."""
+    """Text of a specification with the name of its file."""
 
     text: str
     filename: str
@@ -959,16 +964,16 @@ def load_specifications(
     *,
     constants: Mapping[str, float | str] | None = None,
 ) -> list[Specification]:
-    """Parse several files or texts, with values in place of those of their constants.
+    """Parse several files or texts with other values of their constants.
 
     Args:
-        constants: a value for every file that has a constant of the name; `STEM.NAME` is the one of the file
-            of that stem.
+        constants: values by name; `NAME` applies to all files with that constant, `STEM.NAME` only to the
+            file with that stem.
 
     Raises:
-        MissingFileError: a file that cannot be read.
-        SpecificationError: a specification with errors.
-        UsageError: a constant that no file has, or a value of another kind.
+        MissingFileError: a file cannot be read.
+        SpecificationError: a specification has faults.
+        UsageError: a constant that no file has, or a number for a duration or the reverse.
     """
     files = [_parse(source, {}) for source in sources]
     if not constants:
@@ -984,14 +989,14 @@ def load_specifications(
 def _with_titles(
     changed: Specification, written: Specification, values: Mapping[str, float | str]
 ) -> Specification:
-    """Return a specification whose titles name the values that are not those of its text.
+    """Return a specification whose titles list the changed values of constants.
 
-    A title such as "keep 30 cm from people" may say a number that does not hold any more.
+    A title such as "keep 30 cm from people" may otherwise contain a number that is no longer true.
 
     Args:
-        changed: with the values.
-        written: the same without them.
-        values: of constants, by name.
+        changed: specification with the new values.
+        written: specification with the values of its text.
+        values: new values of constants by name.
     """
     before = {spec.name: spec.formula for spec in written.specs}
     pairs = {name: (changed.constants[name], written.constants[name]) for name in values}
@@ -1003,7 +1008,7 @@ def _with_titles(
     text = changed.source
     faults = Faults(SourceText.of(text, changed.filename))
     tokens = tokenize(text, RELATION_NAMES | changed.relations, faults)
-    # from the last one, so that places before it stay
+    # backwards, so that the offsets of earlier titles stay valid
     for spec in sorted(changed.specs, key=lambda spec: spec.span.start, reverse=True):
         if spec.title is None or spec.formula == before[spec.name]:
             continue
@@ -1024,7 +1029,7 @@ def _constant_text(constant: Constant) -> str:
 
 
 def is_formula(source: Path) -> bool:
-    """Return whether a formula was written where a file is expected."""
+    """Return whether an argument for a file is a formula instead."""
     text = str(source)
     return bool(_FORMULA.search(text)) and not text.endswith(".spatial") and not source.exists()
 
@@ -1042,7 +1047,7 @@ def _qualify(file: Specification, constant: str) -> str:
 
 
 def _own_constants(file: Specification, constants: Mapping[str, float | str]) -> dict[str, float | str]:
-    """Return the values that are for constants of this file, by their names in it."""
+    """Return the values for the constants of one file, by their names without the stem."""
     return {
         constant_name: constants[given_name]
         for constant_name in file.constants
@@ -1052,7 +1057,7 @@ def _own_constants(file: Specification, constants: Mapping[str, float | str]) ->
 
 
 def _check_names(files: Sequence[Specification], constants: Mapping[str, float | str]) -> None:
-    """Check that some file has each of the constants."""
+    """Raise an error for a constant that no file has."""
     constant_names = dict.fromkeys(name for file in files for name in file.constants)
     accepted_names = {*constant_names, *(_qualify(file, name) for file in files for name in file.constants)}
     for name in constants:

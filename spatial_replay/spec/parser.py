@@ -1,4 +1,4 @@
-"""Text to statements: every statement by itself, so that one that is wrong does not hide the others."""
+"""Text to statements: each statement is parsed separately, so that all faulty ones are reported."""
 
 from __future__ import annotations
 
@@ -67,19 +67,20 @@ from spatial_replay.spec.tokens import (
 )
 
 MAX_DEPTH = 100
-"""Brackets and operators within one another."""
+"""Most nested brackets or operators."""
 
 MAX_EXCLUDED = 1000
-"""Objects that one term leaves out of a group."""
+"""Most objects after `except` in one term."""
 
 MAX_DURATION_NS = 2**63 - 1
+"""Longest duration, ns: times in logs are signed 64-bit integers."""
 
 _BOOLEAN = MappingProxyType({"AND": "and", "OR": "or", "XOR": "xor", "IMPLIES": "->", "IFF": "<->"})
 _NS = MappingProxyType({"s": Decimal(10**9), "ms": Decimal(10**6)})
 
 
 class StatementError(Exception):
-    """A fault found while a rule is built."""
+    """Fault in a syntax node, raised while the node is built."""
 
     def __init__(self, span: Span, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -104,10 +105,10 @@ def _deeper(operands: tuple[FormulaSyntax, ...], span: Span) -> int:
 
 
 def read_number(text: str, span: Span) -> float | Duration:
-    """Return the value of a number or a duration as written.
+    """Return the value of the text of a number or a duration.
 
     Raises:
-        StatementError: for one too large, or a duration of less than whole nanoseconds.
+        StatementError: the number is too large, or the duration is not a whole number of nanoseconds.
     """
     unit = "ms" if text.endswith("ms") else "s" if text.endswith("s") else ""
     digits = text.removesuffix(unit)
@@ -118,6 +119,7 @@ def read_number(text: str, span: Span) -> float | Duration:
             raise StatementError(span, f"{text} is too large for a number", hint)
         return value
     seconds = Decimal(digits)
+    # int() of 1e999999999s would be a number of a billion digits
     if seconds and not -40 < seconds.adjusted() < 40:
         raise StatementError(span, f"{text} is not a usable duration", "durations go from 1e-9s to 9e9s")
     ns = seconds * _NS[unit]
@@ -143,10 +145,10 @@ def _arithmetic(operator: Any, operands: tuple[Quantity, ...], children: list[An
 
 
 def _looking_back(written: Quantity) -> Quantity:
-    """Return how far a delay looks back: n of `[-n]`.
+    """Return the length of a delay: n of `[-n]`.
 
     Raises:
-        StatementError: no minus sign leads what is written.
+        StatementError: the text in brackets does not begin with a minus sign.
     """
     if isinstance(written, Arithmetic):
         leftmost: Quantity = written
@@ -164,7 +166,7 @@ def _looking_back(written: Quantity) -> Quantity:
 
 
 class TreeBuilder:
-    """Builds a node from the pieces of each rule, tokens included; lark calls a method by the rule's name."""
+    """Builder of syntax nodes; lark calls the method with the name of a rule, with its tokens and nodes."""
 
     # ------------------------------------------------------------------------------------ statements
 
@@ -240,6 +242,7 @@ class TreeBuilder:
         depth = _deeper((left, right), span_of(token))
         gathers = operator in ("and", "or") and isinstance(left, BooleanSyntax)
         if gathers and left.operator == operator and not left.is_bracketed:
+            # in place, because a copy for each operand would take quadratic time in a long chain
             left.operands.append(right)
             return BooleanSyntax(operator, left.operands, span, max(left.depth, 1 + depth_of(right)))
         return BooleanSyntax(operator, [left, right], span, depth)
@@ -336,13 +339,13 @@ class TreeBuilder:
 
 
 FORMULA_NAME = "spec"
-"""The name of the specification in a text that is only a formula."""
+"""Name of the spec in a text that is only a formula."""
 
 TABLES_FILE = "grammar_tables.json"
-"""Written by `tools/make_grammar`."""
+"""File of the parser tables; `tools/make_grammar` writes it."""
 _OPENING = frozenset({"LPAR", "LSQB"})
 
-# other tools count objects as in (#people <= 2)
+# in other tools (#people <= 2) counts objects; in this language # begins a comment
 _COUNTED = re.compile(r"# *\w+ *[<>=!]")
 _COUNTED_HINT = "# begins a comment; a plug-in counts objects"
 _STATEMENT_WORDS = (*(word for word, kind in KEYWORDS.items() if kind in STATEMENT_TYPES), "scale")
@@ -350,7 +353,7 @@ _STATEMENT_WORDS = (*(word for word, kind in KEYWORDS.items() if kind in STATEME
 
 @dataclass(frozen=True, slots=True)
 class TokenGroup:
-    """The tokens of one statement, or of the formula that a text consists of."""
+    """Tokens of one statement, or of a text that is one formula."""
 
     tokens: tuple[Token, ...]
     is_bare_formula: bool = False
@@ -358,9 +361,9 @@ class TokenGroup:
 
 
 def parse_statements(tokens: Sequence[Token], relations: Collection[str], faults: Faults) -> list[Statement]:
-    """Return the statements of a text that can be read; the rest is reported.
+    """Return the statements of a text without faults; the faults of the others are reported.
 
-    A bare formula comes back as a `spec` of the name `FORMULA_NAME`.
+    A bare formula becomes a `spec` with the name `FORMULA_NAME`.
     """
     statements: list[Statement] = []
     for group in split_statements(tokens, faults):
@@ -374,10 +377,9 @@ def parse_statements(tokens: Sequence[Token], relations: Collection[str], faults
 
 
 def split_statements(tokens: Sequence[Token], faults: Faults) -> Iterator[TokenGroup]:
-    """Cut the tokens of a text into statements.
+    """Divide the tokens of a text into statements.
 
-    Statement words are reserved, so one of them always begins a statement: an unclosed bracket costs
-    no more than the statement that it stands in.
+    Statement words are reserved and always begin a statement, so an unclosed bracket affects one statement.
     """
     if not any(token.type in STATEMENT_TYPES - {"USE"} for token in tokens):
         yield from _split_bare_formula(tokens, faults)
@@ -423,7 +425,7 @@ def _begins_statement(token: Token, last: Token, in_bracket: bool, continues: bo
 
 
 def _step(token: Token, before: Sequence[Token], brackets: list[tuple[Token, bool]]) -> bool:
-    """Update the open brackets for a token; return whether a line that ends in it goes on in the next."""
+    """Update the open brackets for a token; return whether a line that ends in it is continued."""
     if token.type in _OPENING:
         brackets.append((token, bool(before) and before[-1].type in ("PREFIX", "INFIX")))
         return True
@@ -452,7 +454,7 @@ def _close(
 
 
 class _Tokens(Lexer):
-    """Stands in for lark's lexers: tokens are fed to the parser one by one."""
+    """Lexer without tokens; lark requires one, but tokens are fed to the parser one by one."""
 
     def __init__(self, lexer_conf: object) -> None:
         super().__init__()
@@ -463,15 +465,16 @@ class _Tokens(Lexer):
 
 @cache
 def grammar() -> Lark:
-    """Return the parser of statements and formulas; a conflict in the grammar would be an error here.
+    """Return the parser of statements and formulas; a conflict in the grammar is an error.
 
-    Working out the parser's tables takes longer than reading a specification, so they are kept in a file
-    beside the grammar. It is used if it was made from this grammar by the same version of the library.
+    Computing the parser tables takes longer than reading a specification, so a file next to the grammar
+    stores them. The file is used if it was made from this grammar with the installed version of lark.
     """
     text = _resource("grammar.lark")
     tables: Any = json.loads(_resource(TABLES_FILE), object_hook=_with_numbers)
     if tables["made_from"] == made_from(text):
         data = tables["data"]
+        # JSON cannot store classes, so they are put back
         data["options"] |= {"lexer": _Tokens, "transformer": TreeBuilder()}
         data["parser"]["lexer_conf"]["lexer_type"] = _Tokens
         return Lark.load({"data": data, "memo": tables["memo"]})
@@ -479,7 +482,7 @@ def grammar() -> Lark:
 
 
 def built_grammar(text: str) -> Lark:
-    """Return the parser of a grammar, its tables worked out."""
+    """Compute the tables of a grammar and return its parser."""
     builder: Any = TreeBuilder()
     return Lark(
         text, parser="lalr", lexer=_Tokens, start=["statement", "formula"], strict=True,
@@ -488,7 +491,7 @@ def built_grammar(text: str) -> Lark:
 
 
 def made_from(grammar_text: str) -> str:
-    """Return what tables depend on: the library's version and a digest of the grammar."""
+    """Return the key of parser tables: the version of lark and a digest of the grammar."""
     return f"lark {lark.__version__}, grammar {hashlib.sha256(grammar_text.encode()).hexdigest()}"
 
 
@@ -497,7 +500,7 @@ def _resource(name: str) -> str:
 
 
 def _with_numbers(table: dict[str, Any]) -> dict[Any, Any]:
-    """Return a table whose keys are numbers where JSON made texts of them."""
+    """Return a table with numeric keys as numbers; JSON has only texts as keys."""
     return {int(key) if key.isdecimal() else key: value for key, value in table.items()}
 
 
@@ -528,7 +531,7 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
         result = parsing.feed_eof(tokens[-1])
     except UnexpectedToken as unexpected:
         if faults.is_full:
-            # the tokens that could stand here are found by trying each of them
+            # `parsing.accepts()` tries every kind of token, which is slow
             faults.add(_place(unexpected.token, tokens), "")
         else:
             _report(unexpected.token, tokens, parsing.accepts(), relations, faults)
@@ -544,7 +547,7 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
 
 
 def _too_deep(tokens: Sequence[Token]) -> Token | None:
-    """Return the bracket that goes past the bound on nesting, if one does."""
+    """Return the first bracket that is nested more than `MAX_DEPTH` deep; None if there is none."""
     depth = 0
     for token in tokens:
         if token.type in _OPENING:
@@ -614,7 +617,7 @@ def _place(token: Token, tokens: Sequence[Token]) -> Span:
 
 
 def _between_objects(tokens: Sequence[Token], position: int) -> str:
-    """Return a relation that was written like a function, `closeto(a, b, 0.1)`, between its objects."""
+    """Return the correct text of a relation that was written like a function: `closeto(a, b, 0.1)`."""
     arguments: list[list[str]] = [[]]
     for token in tokens[position + 2 :]:
         if token.type == "RPAR":
@@ -635,7 +638,7 @@ def _between_objects(tokens: Sequence[Token], position: int) -> str:
 def _report(
     token: Token, tokens: Sequence[Token], accepted: set[str], relations: Collection[str], faults: Faults
 ) -> None:
-    """Report a token that cannot stand where it does."""
+    """Report a token at a place where the grammar does not allow it."""
     position = next((index for index, candidate in enumerate(tokens) if candidate is token), len(tokens))
     before = tokens[position - 1] if position else None
     span = _place(token, tokens)

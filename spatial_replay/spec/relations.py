@@ -1,16 +1,16 @@
-"""The spatial relations, as definitions: what number each of them means.
+"""Definitions of the spatial relations as expressions.
 
-A relation is a function from terms (and parameters) to an expression that is positive where the
-relation holds. To add one, write such a function and pass it to `parse_specification`:
+A relation is a function from terms and parameters to an expression that is positive where the relation
+holds. A further relation is a function that is passed to `parse_specification`:
 
     def near_but_apart(a, b, most):
         return minimum(SignedDistance(a, b), most - SignedDistance(a, b))
 
     parse_specification("F (cup near_but_apart[0.2] plate)", relations={"near_but_apart": near_but_apart})
 
-Its first two parameters are the terms left and right of its name. The others are numbers in brackets after
-the name; numbers with a default may be left out. A parameter called `axis` takes x, y or z instead. `closer`
-and `between` have three terms, and a syntax of their own.
+The first two parameters are the terms left and right of the name. The other parameters are numbers in
+brackets after the name; a number with a default is optional. A parameter with the name `axis` is x, y or z.
+`closer` and `between` have three terms and their own syntax.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ THREE_TERM_RELATIONS: frozenset[str] = frozenset({"closer", "between"})
 
 
 def compare(quantity: Expression, operator: str, limit: Expression | float) -> Expression:
-    """Return the margin by which a quantity keeps a limit; strict comparisons have the same."""
+    """Return the margin of a comparison; strict and non-strict comparisons have the same margin."""
     match operator:
         case "<=" | "<":
             return limit - quantity
@@ -74,7 +74,7 @@ def farfrom(a: Term, b: Term, e: float) -> Expression:
 
 
 def touch(a: Term, b: Term, e: float) -> Expression:
-    """`a touch[e] b`: min(e - sd, sd + e), at most `e` apart, and no deeper in one another (Def. 5)."""
+    """`a touch[e] b`: min(e - sd, sd + e), at most `e` apart and at most `e` deep (Def. 5)."""
     return minimum(e - SignedDistance(a, b), SignedDistance(a, b) + e)
 
 
@@ -97,12 +97,12 @@ def enclosedin(a: Term, b: Term) -> Expression:
 
 
 def partovlp(a: Term, b: Term) -> Expression:
-    """`a partovlp b`: min(a ovlp b, -(a enclosedin b)), overlapping, yet not wholly inside (Def. 5)."""
+    """`a partovlp b`: min(a ovlp b, -(a enclosedin b)), overlapping but not wholly inside (Def. 5)."""
     return minimum(ovlp(a, b), -enclosedin(a, b))
 
 
 def moved(a: Term, b: Term, e: float) -> Expression:
-    """`a moved[e] b`: -(a enclosedin enlarge(b, e)), somewhere more than `e` outside of b (Eq. 5)."""
+    """`a moved[e] b`: -(a enclosedin enlarge(b, e)), some point of a more than `e` outside of b (Eq. 5)."""
     return -enclosedin(a, Enlarged(b, e))
 
 
@@ -173,22 +173,22 @@ def oriented(a: Term, b: Term, k: float) -> Expression:
 
 
 def closeto_in_pixels(a: Term, b: Term, e: float = 70.0) -> Expression:
-    """`a closeto b`: e - sd(a, b), with 70 pixels where no `e` is written."""
+    """`a closeto b`: e - sd(a, b); `e` defaults to 70 pixels."""
     return closeto(a, b, e)
 
 
 def farfrom_in_pixels(a: Term, b: Term, e: float = 150.0) -> Expression:
-    """`a farfrom b`: sd(a, b) - e, with 150 pixels where no `e` is written."""
+    """`a farfrom b`: sd(a, b) - e; `e` defaults to 150 pixels."""
     return farfrom(a, b, e)
 
 
 def touch_in_pixels(a: Term, b: Term, e: float = 5.0) -> Expression:
-    """`a touch b`: e - sd(a, b), however deep; with 5 pixels where no `e` is written."""
+    """`a touch b`: e - sd(a, b), without a limit on the depth; `e` defaults to 5 pixels."""
     return closeto(a, b, e)
 
 
 def moved_in_pixels(a: Term, b: Term, e: float = 25.0) -> Expression:
-    """`a moved b`: -(a enclosedin enlarge(b, e)), with 25 pixels where no `e` is written."""
+    """`a moved b`: -(a enclosedin enlarge(b, e)); `e` defaults to 25 pixels."""
     return moved(a, b, e)
 
 
@@ -197,22 +197,22 @@ def _centroid_before(a: Term, b: Term, axis: Axis) -> Expression:
 
 
 def leftof_by_centroid(a: Term, b: Term) -> Expression:
-    """`a leftof b`: min of b minus max of a, over the x of the centroids of their parts."""
+    """`a leftof b`: least x of the centroids of b's parts minus greatest x of those of a's parts."""
     return _centroid_before(a, b, "x")
 
 
 def below_by_centroid(a: Term, b: Term) -> Expression:
-    """`a below b`: min of b minus max of a, over the y of the centroids of their parts."""
+    """`a below b`: least y of the centroids of b's parts minus greatest y of those of a's parts."""
     return _centroid_before(a, b, "y")
 
 
 def rightof_by_centroid(a: Term, b: Term) -> Expression:
-    """`a rightof b`: b leftof a, by centroids."""
+    """`a rightof b`: `b leftof a` by centroids."""
     return _centroid_before(b, a, "x")
 
 
 def above_by_centroid(a: Term, b: Term) -> Expression:
-    """`a above b`: b below a, by centroids."""
+    """`a above b`: `b below a` by centroids."""
     return _centroid_before(b, a, "y")
 
 
@@ -245,25 +245,25 @@ DEFAULT_PROFILE = "paper"
 PROFILES: Mapping[str, Mapping[str, Relation]] = MappingProxyType(
     {"paper": _PAPER, "spatial_spec": _PUBLISHED}
 )
-"""Relations by name, for each profile; both profiles have the same names."""
+"""Relations by profile and name; both profiles have the same names."""
 
 RELATION_NAMES: frozenset[str] = frozenset(_PAPER)
 
 # ------------------------------------------------------------------------------------------- plug-ins
 
 PLUGINS_VARIABLE = "SPATIAL_REPLAY_PLUGINS"
-"""The plug-ins of `--plugin`, as PATH has its folders; other processes of a command inherit it."""
+"""Environment variable with the plug-ins of `--plugin`, separated as in PATH; child processes inherit it."""
 _USED = re.compile(r'^[ \t]*use[ \t]+"?([A-Za-z_][\w.]*)"?[ \t]*(?:#.*)?$', re.MULTILINE | re.ASCII)
 
 
 class Plugin(NamedTuple):
-    """A module with own relations and signals.
+    """User module with further relations and signals.
 
     Attributes:
-        place: its file, or the name to import it by.
-        sha256: of its file.
-        relations: functions from terms, and numbers, to an expression, by name (`RELATIONS`).
-        signals: functions from a `Sample` to a number, by name; None where it is unknown (`SIGNALS`).
+        place: file of the module, or its import name.
+        sha256: SHA-256 of the file.
+        relations: functions from terms and numbers to an expression, by name (`RELATIONS`).
+        signals: functions from a `Sample` to a number or None (unknown), by name (`SIGNALS`).
     """
 
     name: str
@@ -274,18 +274,18 @@ class Plugin(NamedTuple):
 
 
 def used_modules(text: str) -> dict[str, tuple[int, int]]:
-    """Return the names in the `use` lines of a text that are no relation profiles, with their places."""
+    """Return the plug-in names in `use` lines of a text, with their offsets; profiles are left out."""
     return {use[1]: use.span(1) for use in _USED.finditer(text) if use[1] not in PROFILES}
 
 
 def plugins_of(text: str) -> dict[str, Plugin]:
     """Load the plug-ins of the command line, and those that a text uses and the user allows.
 
-    No text loads a module by itself: it is allowed by `--plugin`, or by `[tool.spatial-replay] plugins` in
-    the pyproject.toml of the current folder.
+    A `use` line alone loads no module, because loading runs code. The user allows a module by `--plugin`, or
+    by `[tool.spatial-replay] plugins` in the pyproject.toml of the current folder.
 
     Raises:
-        UsageError: a plug-in that cannot be loaded.
+        UsageError: a plug-in cannot be loaded.
     """
     plugin_places = [place for place in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if place]
     used = set(used_modules(text))
@@ -314,7 +314,7 @@ def _listed_plugins() -> list[str]:
 
 
 def _place(module: str) -> str:
-    """Return the file of a module in the current folder, or the module's name."""
+    """Return the file of a module if the current folder has one, else the name of the module."""
     file = Path(module if module.endswith(".py") else f"{module.replace('.', '/')}.py").absolute()
     return str(file) if file.exists() or module.endswith(".py") else module
 
@@ -324,10 +324,10 @@ def load_plugin(location: str) -> Plugin:
     """Import a plug-in.
 
     Args:
-        location: its file, or the name to import it by.
+        location: file of the plug-in, or its import name.
 
     Raises:
-        UsageError: it cannot be imported, or holds no relations and signals.
+        UsageError: the plug-in cannot be imported, or has neither relations nor signals.
     """
     try:
         if location.endswith(".py"):
@@ -355,14 +355,15 @@ def load_plugin(location: str) -> Plugin:
 
 
 def computed_signal(signal: ComputedSignal, sample: Any) -> float:
-    """Return the number of a plug-in's signal in a sample, NaN where it is unknown.
+    """Return the value of a plug-in's signal in a sample; NaN if it is unknown.
 
     Raises:
-        UsageError: the plug-in fails, or returns no number.
+        UsageError: the plug-in raises an error, or returns something other than a number or None.
     """
     try:
         value = load_plugin(signal.plugin).signals[signal.name](sample)
         return nan if value is None else float(value)
+    # code of a user may raise any error
     except Exception as error:
         what = f"the plug-in {signal.plugin} fails for the signal {signal.name!r} at {sample.time_ns} ns"
         raise UsageError(f"{what}: {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""Names resolved: the definitions of a text, and the terms, numbers and windows that names refer to."""
+"""Name resolution: definitions of a text, and the terms, numbers and windows of its names."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ Corner: TypeAlias = tuple[float, float]
 
 @dataclass(slots=True)
 class Effort:
-    """The pairs of edges that may still be compared, for all polygons of one text."""
+    """Remaining budget of edge comparisons for all polygons of one text."""
 
     left: int = 100_000
 
 
 class OutlineError(Exception):
-    """A fault of a shape, and its remedy."""
+    """Fault of a shape, with its remedy."""
 
     def __init__(self, message: str, hint: str) -> None:
         super().__init__(message)
@@ -73,8 +73,8 @@ def polygon(corners: Sequence[Corner], effort: Effort) -> Outline:
     """Return the outline of a polygon.
 
     Raises:
-        OutlineError: no corner, or a boundary that crosses or touches itself. Corners on one line
-            are accepted: they make a point or a segment.
+        OutlineError: no corner, or a boundary that crosses or touches itself. Collinear corners are accepted
+            as a point or a segment.
     """
     if not corners:
         raise OutlineError("a polygon without corners", "write at least one corner (x, y)")
@@ -94,7 +94,7 @@ def box(xmin: float, ymin: float, xmax: float, ymax: float) -> Outline:
     """Return the outline of a box.
 
     Raises:
-        OutlineError: a least coordinate above the greatest.
+        OutlineError: a minimum is above its maximum.
     """
     for axis, least, greatest in (("x", xmin, xmax), ("y", ymin, ymax)):
         if least > greatest:
@@ -107,7 +107,7 @@ def circle(centre: Corner, radius: float) -> Outline:
     """Return the outline of a disc.
 
     Raises:
-        OutlineError: a negative radius.
+        OutlineError: the radius is negative.
     """
     if radius < 0.0:
         raise OutlineError(f"a circle of the negative radius {radius:g}", "write a radius of at least 0")
@@ -115,7 +115,7 @@ def circle(centre: Corner, radius: float) -> Outline:
 
 
 def _turn(a: Corner, b: Corner, c: Corner) -> float:
-    """Return twice the signed area of a triangle: positive where a, b, c turn left, 0 on one line."""
+    """Return twice the signed area of a triangle: positive for a left turn a, b, c; 0 on one line."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
@@ -131,7 +131,7 @@ def _within(a: Corner, b: Corner, c: Corner) -> bool:
 
 
 def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> bool:
-    """Return whether the segments ab and cd have a point in common."""
+    """Return whether the segments ab and cd have a common point."""
     c_side, d_side, a_side, b_side = _turn(a, b, c), _turn(a, b, d), _turn(c, d, a), _turn(c, d, b)
     if ((c_side > 0 > d_side) or (c_side < 0 < d_side)) and ((a_side > 0 > b_side) or (a_side < 0 < b_side)):
         return True
@@ -146,7 +146,7 @@ def _fold_back(a: Corner, b: Corner, c: Corner) -> bool:
 
 
 def _crossing(ring: Sequence[Corner], effort: Effort) -> tuple[Corner, Corner] | None:
-    """Return the first corners of two edges that meet where they should not."""
+    """Return the first corners of two edges that cross, touch or fold back; None for a simple polygon."""
     count = len(ring)
     edges = [(ring[index], ring[(index + 1) % count]) for index in range(count)]
     for index in range(count):
@@ -180,21 +180,22 @@ KIND_OF: Mapping[type, str] = MappingProxyType(
 
 
 def kind_of(statement: Statement) -> str:
-    """Return the kind of thing that a statement defines, with its article."""
+    """Return the kind of a definition with its article, such as "a constant"."""
     return KIND_OF[type(statement)]
 
 
 @dataclass(slots=True)
 class Namespace:
-    """The definitions of one text.
+    """Definitions of one text.
 
     Attributes:
-        signals: the plug-ins of the signals that these compute.
-        definitions: statements by name; of a name given twice, the first.
-        regions, groups: the values of those definitions.
-        used: names that something refers to.
-        entangled: those of them that constants, regions or scales refer to.
-        scales: what `scale` lines divide numbers by.
+        signals: plug-ins by the names of the signals that they compute.
+        definitions: statements by name; the first statement if a name is defined twice.
+        regions, groups: values of region and group definitions by name.
+        used: names with a reference.
+        entangled: names that constants, regions or scales refer to.
+        constants: values of constants by name; None for a constant with a fault.
+        scales: divisors from `scale` lines.
     """
 
     faults: Faults
@@ -208,7 +209,7 @@ class Namespace:
     scales: list[Scale] = field(default_factory=list)
 
     def declare(self, statements: Sequence[Statement]) -> None:
-        """Add the definitions of a text, and compute constants, regions and groups."""
+        """Add the definitions of a text and compute its constants, regions and groups."""
         for statement in statements:
             if not isinstance(statement, (UseStatement, ScaleStatement)):
                 self._declare(statement)
@@ -252,7 +253,8 @@ class Namespace:
             self.scales.append(Scale(signal, divisor))
 
     def constant(self, name: str) -> float | Duration | None:
-        """Return the value of a constant; None, and a fault, for one that is defined in terms of itself."""
+        """Return the value of a constant; report a fault and return None if its definition is circular."""
+        # a stack instead of recursion: a chain of constants can be longer than Python's recursion limit
         pending = [name]
         while pending:
             current = pending[-1]
@@ -282,7 +284,7 @@ class Namespace:
         return name.text not in self.constants and isinstance(self.definitions.get(name.text), ConstStatement)
 
     def constant_ranges(self) -> dict[str, Constant]:
-        """Return the constants that have a value, each checked against its range."""
+        """Return the constants that have a value; report those outside of their range."""
         ranges: dict[str, Constant] = {}
         for name, statement in self.definitions.items():
             value = self.constants.get(name)
@@ -302,7 +304,7 @@ class Namespace:
         return ranges
 
     def _report_not_a_number(self, name: Name, statement: Statement | None) -> None:
-        """Report that a name, and the statement that defines it if one does, is not a number."""
+        """Report that a name is not a number; `statement` is its definition, or None."""
         if name.text == "inf":
             self.faults.add(
                 name.span, "'inf' is not a number here", "it is the upper end of a window: [0, inf]"
@@ -325,11 +327,11 @@ class Namespace:
             self.faults.add(name.span, f"{name.text!r} is {kind_of(statement)}; a number is expected here")
 
     def quantity(self, written: Quantity) -> float | Duration:
-        """Return the number or duration written, or that of a constant; 0 after a fault."""
+        """Return the number or duration of a quantity outside of formulas; 0 after a fault."""
         return value_of(written, self.named_value, self.faults.add) or 0.0
 
     def named_value(self, name: Name) -> float | Duration | None:
-        """Return the value of the constant of a name; None, and a fault, if it is none."""
+        """Return the value of a constant; report a fault and return None if the name is not a constant."""
         self.used.add(name.text)
         statement = self.definitions.get(name.text)
         if not isinstance(statement, ConstStatement):
@@ -338,13 +340,13 @@ class Namespace:
         return self.constant(name.text)
 
     def with_constant_name(self, name: str, value: float | Duration | None) -> float | Duration | None:
-        """Return the value of a constant with its name, unless more than formulas depends on the constant."""
+        """Return the value of a constant with its name, if only formulas depend on the constant."""
         if isinstance(value, float) and name not in self.entangled:
             return NamedNumber(value, (name,), is_plain=True)
         return value
 
     def plain_number(self, written: Quantity) -> float:
-        """Return a number written outside of formulas; 0 after a fault."""
+        """Return a plain number outside of formulas; report a fault and return 0 for a duration."""
         value = self.quantity(written)
         if isinstance(value, Duration):
             message = "a duration, where a plain number is expected"
@@ -404,15 +406,15 @@ def class_of(group: OpenGroup) -> str:
 
 
 MAX_SAMPLES = 2**53
-"""Integers up to here are exact as floating-point numbers."""
+"""Largest number of samples; all integers up to 2**53 are exact as floating-point numbers."""
 
 MAX_SIZE = 20_000
-"""Operators, atoms and terms of one text, with macros, quantifiers and named specs written out."""
+"""Most operators, atoms and terms of one text after expansion of macros, quantifiers and named specs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Anything:
-    """The argument of a macro that nothing uses: fits any place, so that the body can be checked."""
+    """Placeholder argument for checking the body of an unused macro; it is valid as any kind of argument."""
 
 
 Value: TypeAlias = Term | float | Duration | Anything
@@ -420,14 +422,15 @@ Value: TypeAlias = Term | float | Duration | Anything
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """The local names at one place, and its depth.
+    """Local names and depth at one place of a text.
 
     Attributes:
-        values: parameters and variables.
-        call: where the outermost macro was used, while its body is read.
-        macros: the macros being expanded, from the outside.
-        bound: variables of quantifiers and templates around, in the way they are written out.
-        order: how many specs stand before this place.
+        values: values of parameters and variables by name.
+        call: place of the use of the outermost macro that is being expanded; None outside of macros.
+        macros: names of the macros that are being expanded, outermost first.
+        bound: variables of the enclosing quantifiers and template, after renaming.
+        depth: number of enclosing operators, plus 1.
+        order: number of specs before this place.
     """
 
     values: Mapping[str, Value] = field(default_factory=dict)
@@ -438,20 +441,24 @@ class Scope:
     order: int = 0
 
     def deeper(self) -> Scope:
-        """Return the scope of an operand: one operator further in."""
+        """Return the scope of an operand, one level deeper."""
         return replace(self, depth=self.depth + 1)
 
 
 @dataclass(slots=True)
 class Resolver:
-    """Resolves what is written in places of objects and numbers; faults are collected."""
+    """Resolver of terms, numbers and windows; it collects faults.
+
+    Attributes:
+        size: number of resolved parts, compared with `MAX_SIZE`.
+    """
 
     names: Namespace
     faults: Faults
     size: int = field(default=0)
 
     def fault(self, span: Span, scope: Scope, message: str, hint: str = "") -> None:
-        """Report a fault; inside a macro, say so."""
+        """Report a fault; the message names the macro that is being expanded."""
         if scope.macros and scope.call is not None:
             line = self.faults.source.line_of(scope.call.start)
             message += f" (in {scope.macros[-1]!r}, used in line {line})"
@@ -460,7 +467,7 @@ class Resolver:
     # ----------------------------------------------------------------------------------------- terms
 
     def term(self, written: TermSyntax, scope: Scope) -> Term:
-        """Return the term that was written; some tracked object after a fault."""
+        """Return the term of a syntax node; a tracked object after a fault."""
         self.size += 1
         match written:
             case Name():
@@ -519,7 +526,7 @@ class Resolver:
         return replace(group, excluded=tuple(left_out))
 
     def is_unknown(self, written: TermSyntax, scope: Scope) -> bool:
-        """Return whether a name is of unknown meaning: a parameter of `Anything`, a broken definition."""
+        """Return whether a name has no known meaning: an `Anything` parameter or a broken definition."""
         if not isinstance(written, Name):
             return False
         if isinstance(scope.values.get(written.text), Anything):
@@ -554,7 +561,7 @@ class Resolver:
     # --------------------------------------------------------------------------------------- numbers
 
     def quantity(self, written: Quantity, scope: Scope) -> float | Duration:
-        """Return the number or duration at a place; 0 after a fault."""
+        """Return the number or duration of a quantity in a formula; 0 after a fault."""
 
         def named_value(name: Name) -> float | Duration | None:
             value = scope.values.get(name.text)
@@ -574,14 +581,14 @@ class Resolver:
         return 0.0 if value is None else value
 
     def is_number(self, name: Name, scope: Scope) -> bool:
-        """Return whether a name is that of a constant, or of a number that a macro was given."""
+        """Return whether a name is a constant, or a macro parameter with a number as its argument."""
         local = scope.values.get(name.text)
         if local is not None:
             return isinstance(local, (float, Duration))
         return isinstance(self.names.definitions.get(name.text), ConstStatement)
 
     def number(self, written: Quantity, scope: Scope) -> float:
-        """Return a plain number; a duration in its place is a fault."""
+        """Return a plain number; report a fault and return 0 for a duration."""
         value = self.quantity(written, scope)
         if isinstance(value, Duration):
             hint = "leave out its unit"
@@ -600,7 +607,7 @@ class Resolver:
     # --------------------------------------------------------------------------------------- windows
 
     def bound(self, operator: TemporalSyntax, scope: Scope) -> Bound | None:
-        """Return the window of a temporal operator; None for none, and after a fault."""
+        """Return the window of a temporal operator; None without a window or after a fault."""
         window = operator.bound
         if window is None:
             return None
@@ -632,13 +639,14 @@ class Resolver:
         return Bound(first, last, unit)
 
     def _lacks_unit(self, operator: TemporalSyntax, written: BoundSyntax, scope: Scope) -> bool:
-        """Refuse a window in samples that is decimal, or written as in tools whose windows are seconds."""
+        """Report a window without a unit that is decimal, or has the spelling of a tool with other units."""
         text, ends = self.faults.source.text, (written.lower, written.upper)
         word, window = (text[span.start : span.end] for span in (operator.keyword, written.span))
         values = [self._end(end, scope) for end in ends]
         numbers = [value for value in values if isinstance(value, float)]
         is_whole = all(number.is_integer() for number in numbers)
         is_decimal = not is_whole or any("." in text[end.span.start : end.span.end] for end in ends)
+        # other tools write windows in seconds without a unit: always[0:5]
         is_ours = word == operator.operator and ":" not in window
         if (is_ours and not is_decimal) or numbers[0] < 0.0 or numbers != sorted(numbers):
             return False
@@ -655,7 +663,7 @@ class Resolver:
         return True
 
     def _end(self, written: Quantity, scope: Scope) -> float | Duration | None:
-        """Return an end of a window; None for inf."""
+        """Return the end of a window; None for inf."""
         is_inf = isinstance(written, Name) and written.text == "inf"
         if is_inf and "inf" not in scope.values and "inf" not in self.names.definitions:
             return None

@@ -1,6 +1,6 @@
-"""Statements, formulas and terms as written, with their places, before names are resolved.
+"""Syntax nodes of statements, formulas and terms, with their places; names are not resolved yet.
 
-They are named tuples: there are many kinds, and declaring one takes a tenth of what a dataclass takes.
+Nodes are named tuples, because declaring a named tuple takes a tenth of the time of a dataclass.
 """
 
 from __future__ import annotations
@@ -15,34 +15,36 @@ from spatial_replay.spec.diagnostics import Span
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """A length of time in whole nanoseconds."""
+    """Length of time, in whole nanoseconds."""
 
     ns: int
 
 
 class Name(NamedTuple):
-    """The name of an object or of a definition."""
+    """Name of an object or of a definition."""
 
     text: str
     span: Span
 
     @property
     def is_quoted(self) -> bool:
-        """Whether it was written in quotes."""
+        """Whether the name is quoted in the text."""
+        # a span includes the quotes, `text` does not
         return self.span.end - self.span.start > len(self.text)
 
 
 class NumberSyntax(NamedTuple):
-    """A number or a duration, as a value."""
+    """Number or duration in the text."""
 
     value: float | Duration
     span: Span
 
 
 class Arithmetic(NamedTuple):
-    """`first * second` or another operation; `-` with one operand is its negative.
+    """`first * second` or another operation; `-` with one operand is a negation.
 
-    In formulas the operands are what was written there: a number, a signal, a distance or a mistake.
+    In formulas an operand can be a number, a signal or a distance; any other operand is a fault that name
+    resolution reports.
     """
 
     operator: Literal["+", "-", "*", "/"]
@@ -95,7 +97,7 @@ class CentreSyntax(NamedTuple):
 
 
 DERIVED_TERMS = (OpenGroup, Exclusion, Delayed, Enlargement, CentreSyntax)
-"""Kinds of terms without names, which may also be those of numbers or formulas."""
+"""Kinds of terms that are not just a name; a name can also denote a number or a formula."""
 
 TermSyntax: TypeAlias = Name | OpenGroup | Exclusion | Delayed | Enlargement | CentreSyntax
 
@@ -110,7 +112,7 @@ class TruthSyntax(NamedTuple):
 
 
 class Call(NamedTuple):
-    """`name(argument, ...)`: a use of a `def`, or `abs`."""
+    """`name(argument, ...)`: a use of a `def`, `present` or `abs`."""
 
     name: Name
     arguments: tuple[ArgumentSyntax, ...]
@@ -118,7 +120,7 @@ class Call(NamedTuple):
 
 
 class RelationSyntax(NamedTuple):
-    """`first relation[parameters] others`; `operator` is the place of the relation's name."""
+    """`first relation[parameters] others`; `operator` is the place of the relation name."""
 
     relation: str
     operator: Span
@@ -144,7 +146,7 @@ class RateSyntax(NamedTuple):
 
 
 class ComparisonSyntax(NamedTuple):
-    """`signal >= 3.0` or, with three operands, `1 <= a dist b <= 2`; `operators` are between them."""
+    """`signal >= 3.0`, or a chain with three operands and two operators: `1 <= a dist b <= 2`."""
 
     operands: tuple[FormulaSyntax, ...]
     operators: tuple[Token, ...]
@@ -152,7 +154,7 @@ class ComparisonSyntax(NamedTuple):
 
 
 class BooleanSyntax(NamedTuple):
-    """A Boolean operator; `and` and `or` gather their operands until a bracket closes."""
+    """Boolean operator; consecutive `and` or `or` without brackets are one node with several operands."""
 
     operator: Literal["not", "and", "or", "xor", "->", "<->"]
     operands: list[FormulaSyntax]
@@ -162,7 +164,7 @@ class BooleanSyntax(NamedTuple):
 
 
 class BoundSyntax(NamedTuple):
-    """`[lower, upper]`, the window of a temporal operator."""
+    """`[lower, upper]`: window of a temporal operator."""
 
     lower: Quantity
     upper: Quantity
@@ -170,7 +172,7 @@ class BoundSyntax(NamedTuple):
 
 
 class TemporalSyntax(NamedTuple):
-    """A temporal operator; `keyword` is the place of the operator itself."""
+    """Temporal operator; `keyword` is the place of its word."""
 
     operator: str
     keyword: Span
@@ -181,7 +183,7 @@ class TemporalSyntax(NamedTuple):
 
 
 class QuantifierSyntax(NamedTuple):
-    """`forall variables in group: body`, or `exists`."""
+    """`forall variables in group: body`, or the same with `exists`."""
 
     quantifier: Literal["forall", "exists"]
     variables: tuple[Name, ...]
@@ -209,7 +211,7 @@ ArgumentSyntax: TypeAlias = TermSyntax | FormulaSyntax
 
 
 def depth_of(formula: FormulaSyntax) -> int:
-    """Return the number of operators above the deepest atom, counting that atom."""
+    """Return the depth of a formula: nested operators above the deepest atom, plus 1 for the atom."""
     return formula.depth if isinstance(formula, (BooleanSyntax, TemporalSyntax, QuantifierSyntax)) else 1
 
 
@@ -222,8 +224,8 @@ class Shape(NamedTuple):
     """`polygon`, `box` or `circle`.
 
     Attributes:
-        points: corners of a polygon, two opposite corners of a box, the centre of a circle.
-        radius: of a circle.
+        points: corners of a polygon, two opposite corners of a box, or the centre of a circle.
+        radius: radius of a circle, else None.
     """
 
     kind: Literal["polygon", "box", "circle"]
@@ -239,7 +241,7 @@ class UseStatement(NamedTuple):
 
 
 class ConstStatement(NamedTuple):
-    """`const name = value in [low, high]`; without a range, that is None."""
+    """`const name = value in [low, high]`; `range` is None if it is not written."""
 
     name: Name
     value: Quantity
@@ -254,7 +256,7 @@ class ScaleStatement(NamedTuple):
 
 
 class RegionStatement(NamedTuple):
-    """`region name = shape height (bottom, top)`; without a height, both are None."""
+    """`region name = shape height (bottom, top)`; `height` and `height_span` are None if not written."""
 
     name: Name
     shape: Shape
@@ -263,7 +265,7 @@ class RegionStatement(NamedTuple):
 
 
 class GroupStatement(NamedTuple):
-    """`group name = members`; exactly one of `members` and `open_group` is given."""
+    """`group name = members`; an open group has `open_group` instead of `members`."""
 
     name: Name
     members: tuple[Name, ...] | None
@@ -279,7 +281,7 @@ class DefStatement(NamedTuple):
 
 
 class SpecStatement(NamedTuple):
-    """`spec name "title" = formula`; with a parameter, a template."""
+    """`spec name "title" = formula`; a spec with a parameter is a template."""
 
     name: Name
     parameters: tuple[Name, ...]
@@ -288,7 +290,7 @@ class SpecStatement(NamedTuple):
 
 
 class BrokenStatement(NamedTuple):
-    """A statement that could not be read, but whose name is known: using it is not another fault."""
+    """Statement with a fault and a readable name; uses of the name are not reported as further faults."""
 
     name: Name
 

@@ -1,7 +1,7 @@
-"""Tokens of a text: the words, numbers and signs of the language, with their places.
+"""Tokens of a text: words, numbers and signs of the language with their places.
 
-A token is lark's `Token`: `type` as declared in grammar.lark, `value` (of a quoted name, the name
-itself), `start_pos`, `end_pos` and `line`.
+A token is lark's `Token` with `start_pos`, `end_pos` and `line`. Its `type` is declared in grammar.lark. The
+`value` of a quoted name has no quotes.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _MEANT: Mapping[str, str] = MappingProxyType(
         **{"[]": "G", "<>": "F", "s_next": "X", "s_prev": "Y", "prev": "not Y not", "z": "not Y not"},
     }
 )
-"""Operators for lower-case words that may also be names."""
+"""Operator by foreign word in lower case; these words can also be names."""
 _MEANT_BETWEEN: Mapping[str, str] = MappingProxyType(
     {
         **{"v": "R", "m": "U: (p) M (q) is (q) U (p and q)", "t": "S: (p) T (q) is not ((not p) S (not q))"},
@@ -122,7 +122,7 @@ _TYPES = frozenset(
         "signal",
     }
 )
-"""Words that declare signals elsewhere."""
+"""Words that declare signals in other tools."""
 _AT_TIMES: Mapping[str, str] = MappingProxyType(
     {
         **dict.fromkeys(("for", "during"), "G[0s, {0}]"),
@@ -130,7 +130,7 @@ _AT_TIMES: Mapping[str, str] = MappingProxyType(
         **{"after": "G[{0}, inf]", "from": "G[{0}, inf]", "at": "F[{0}, {0}]"},
     }
 )
-"""Operators that words of time stand for, given that time."""
+"""Operator with its window by English preposition; {0} is the time."""
 _ORDERING: Mapping[str, str] = MappingProxyType(
     {
         "at": "both in one sample: F (p and q); at the end of a log: F (p and WX false)",
@@ -140,13 +140,13 @@ _ORDERING: Mapping[str, str] = MappingProxyType(
         "by": "a margin is a part of an object: a leftof enlarge(b, 0.1)",
     }
 )
-"""Words between two formulas that no single operator stands for."""
+"""Remedy by word between two formulas, for words without a single equivalent operator."""
 SAMPLES: Mapping[str, str] = MappingProxyType(
     {
         **{"tt": "true", "ff": "false", "last": "WX false", "ftp": "not Y true"},
     }
 )
-"""Formulas that are words elsewhere, by the word in lower case."""
+"""Formula by word of other tools, in lower case."""
 _QUANTIFYING: Mapping[str, str] = MappingProxyType(
     {**dict.fromkeys(("for", "all", "every", "each"), "forall"), **dict.fromkeys(("any", "some"), "exists")}
 )
@@ -160,14 +160,14 @@ STARTS_FORMULA = frozenset(
     {"LPAR", "NAME", "NOT", "PREFIX", "TRUTH", "QUANTIFIER", "NUMBER", "MINUS", "ENLARGE", "ALL", "CLASS"}
 )
 _CALLED: Mapping[str, str] = MappingProxyType({"speed": "RATE", "rate": "RATE", "center": "CENTER"})
-"""Words of the language where a bracket follows; elsewhere, names."""
+"""Token types of words that are reserved only in front of a bracket; elsewhere they are names."""
 _RELATIONS = frozenset({"RELATION", "DIST", "CLOSER", "BETWEEN", "COMPARE"})
 
 
 def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
-    """Return the tokens with operators in the place of words that can be nothing else.
+    """Return the tokens with spellings of other tools replaced by operators.
 
-    A word counts only where no name could stand, so objects called `always` or `until` keep their names.
+    A word is replaced only where the grammar allows no name, so an object can be named `always` or `until`.
     """
     macros = {name.value for word, name in pairwise(tokens) if word.type in ("DEF", "SPEC")}
     result: list[Token] = []
@@ -188,7 +188,7 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
         elif token.type == "NAME" and following and not _is_quoted(token):
             word = _word(token, result, following, macros)
             if word.type == "ERROR":
-                # so far and no further, or a text full of such words would take quadratic time
+                # the limit keeps the time of a text full of such words linear
                 after = tokens[index + 1 : index + 1000]
                 if following[0].value in macros or _holds_formula(after):
                     _report(token, faults)
@@ -214,12 +214,12 @@ def _word(token: Token, before: Sequence[Token], after: Sequence[Token], macros:
 
 
 def _plain(token: Token) -> str:
-    """Return a word as the tables have it: `G_` and `Globally` are no more than other cases."""
+    """Return the key of a word in the tables: in lower case, without a trailing underscore."""
     return str(token.value).lower().removesuffix("_")
 
 
 def _holds_formula(after: Sequence[Token]) -> bool:
-    """Return whether what follows is no list of arguments: up to its closing bracket, it relates objects."""
+    """Return whether the bracket after a word contains a relation, and so a formula instead of arguments."""
     depth = 0
     for token in after:
         depth += {"LPAR": 1, "LSQB": 1, "RPAR": -1, "RSQB": -1}.get(token.type, 0)
@@ -239,20 +239,20 @@ def _report(token: Token, faults: Faults) -> None:
 
 
 def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
-    """Return whether a prefix operator can stand here, and no name can."""
+    """Return whether the grammar allows a prefix operator between these tokens, but no name."""
     if not _starts(before):
         return False
     if after[0].type == "LSQB":
         is_index = [token.type for token in after[1:]] == ["NAME", "RSQB"]
         return len(after) > 1 and after[1].type != "MINUS" and not is_index
-    # "always until p" is the name `always`, unless a relation follows: then `until` is one
+    # in "always until p", `always` is a name; if a relation follows, `until` is the name
     if after[0].value in _INFIX_WORDS and after[0].type == "NAME":
         return len(after) > 1 and after[1].type in _RELATIONS
     return after[0].type in STARTS_FORMULA - {"MINUS"}
 
 
 def _starts(before: Sequence[Token]) -> bool:
-    """Return whether a formula can start behind these tokens."""
+    """Return whether a formula can start after these tokens."""
     first = (
         not before or before[-1].type in _BEFORE_FORMULA or before[-1].type in ("PREFIX", "INFIX", "ERROR")
     )
@@ -260,7 +260,7 @@ def _starts(before: Sequence[Token]) -> bool:
 
 
 def _is_between(before: Sequence[Token], after: Sequence[Token]) -> bool:
-    """Return whether an infix operator can stand here, and no name can."""
+    """Return whether the grammar allows an infix operator between these tokens, but no name."""
     if not before or before[-1].type not in _AFTER_OPERAND:
         return False
     if len(before) > 1 and before[-2].type in ("USE", "SPEC", "DEF", "CONST", "REGION", "GROUP", "SCALE"):
@@ -282,15 +282,15 @@ def _is_quoted(token: Token) -> bool:
 
 
 def meant_sign(sign: str) -> str:
-    """Return how something is written that is a sign elsewhere, or ""."""
+    """Return the remedy for a sign of another language; "" if the sign is unknown."""
     return _MEANT_SIGNS.get(sign) or _MEANT_SIGNS.get(sign[:1], "")
 
 
 def unit_hint(number: str, unit: str, per: str = "") -> str:
-    """Return how a number with a unit is written, or "" where the unit is none.
+    """Return the remedy for a number with a unit; "" if the unit is unknown.
 
     Args:
-        per: the unit of time of a speed.
+        per: unit of time in the unit of a speed, such as "s" of "m/s".
     """
     if unit in _LENGTHS:
         seconds = _TIMES.get(per, 1.0)
@@ -310,11 +310,11 @@ def unit_hint(number: str, unit: str, per: str = "") -> str:
 def foreign_token_advice(
     tokens: Sequence[Token], position: int, accepted: Collection[str]
 ) -> tuple[str, str] | None:
-    """Return message and hint for a token that cannot stand where it does, if it is of another language.
+    """Return message and hint for a misplaced token if its tokens are typical of another language, else None.
 
     Args:
-        position: of the token; the number of tokens for their end.
-        accepted: types of tokens that could stand there.
+        position: index of the token; the number of tokens means the end.
+        accepted: types of tokens that the grammar allows at this position.
     """
     missing = Token("$END", "")
     token = tokens[position] if position < len(tokens) else missing
@@ -400,7 +400,7 @@ def foreign_token_advice(
 
 
 def _meant_window(tokens: Sequence[Token], position: int) -> str:
-    """Return the window that was meant behind the nearest operator; "" where none was begun."""
+    """Return the probable window of the nearest operator before a position; "" if it has none."""
     places = range(position - 1, max(-1, position - 6), -1)
     start = next((n for n in places if tokens[n].type in ("PREFIX", "INFIX")), None)
     if start is None:
@@ -430,7 +430,7 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
 
 
 def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
-    """Return what was meant between the name of a statement and its =."""
+    """Return message and hint for a token between the name of a statement and its =."""
     token, name = tokens[position] if position < len(tokens) else None, tokens[1].value
     if token is None or token.type in ("NAME", "EQUAL"):
         return None
@@ -465,7 +465,7 @@ def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[st
 
 
 def meant_statement(tokens: Sequence[Token]) -> str:
-    """Return how a line is written that begins with no word of a statement; "" where that is not known."""
+    """Return the probable statement for a line that begins with no statement word; "" if unknown."""
     line = [token for token in tokens if token.line == tokens[0].line]
     if line[0].value.lower() in _TYPES and len(line) > 1 and line[1].type == "NAME":
         return "signals are not declared: leave the line out"
@@ -486,13 +486,13 @@ def meant_statement(tokens: Sequence[Token]) -> str:
 
 
 def _source_text(tokens: Sequence[Token]) -> str:
-    """Return tokens as a text, with blanks where there were some."""
+    """Return the text of tokens; blanks between them are reduced to one."""
     gaps = ["" if first.end_pos == second.start_pos else " " for first, second in pairwise(tokens)]
     return "".join(token.value + gap for token, gap in zip(tokens, [*gaps, ""], strict=True))
 
 
 def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> str:
-    """Return how the shape of a region is written; "" where that is not what is wrong."""
+    """Return the remedy for a faulty shape of a region; "" if the fault is something else."""
     token = tokens[position] if position < len(tokens) else None
     if token is not None and "CIRCLE" in accepted and token.value.lower() in _SHAPES:
         return f"it is written {_SHAPES[token.value.lower()]}"
@@ -516,7 +516,7 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
 
 
 def is_called(tokens: Sequence[Token], position: int) -> bool:
-    """Return whether a bracket opens behind a token."""
+    """Return whether an opening bracket follows a token."""
     return 0 <= position < len(tokens) - 1 and tokens[position + 1].type == "LPAR"
 
 
@@ -524,7 +524,7 @@ _SHAPE = frozenset({"BOX", "CIRCLE", "POLYGON"})
 
 
 def _numbers(tokens: Sequence[Token]) -> list[str]:
-    """Return the numbers up to the end of the line, with their signs."""
+    """Return the numbers of a line with their signs."""
     line = [token for token in tokens if token.line == tokens[0].line]
     signs = ["-" if before.type == "MINUS" else "" for before in line]
     return [
@@ -533,7 +533,7 @@ def _numbers(tokens: Sequence[Token]) -> list[str]:
 
 
 def _argument(tokens: Sequence[Token], start: int) -> str:
-    """Return what stands in brackets from a place on, with the brackets."""
+    """Return the text from a position to the closing bracket, in brackets."""
     depth, end = 1, start
     while end < len(tokens) and depth:
         depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end].type, 0)
@@ -542,11 +542,11 @@ def _argument(tokens: Sequence[Token], start: int) -> str:
 
 
 def function_hint(name: str, argument: str, arguments: Sequence[str] = ()) -> str:
-    """Return how a function of other tools is written; "" where it is none that is known.
+    """Return the remedy for a function of other tools; "" if the function is unknown.
 
     Args:
-        argument: what it was of, in brackets.
-        arguments: each by itself, where a number is expected.
+        argument: text of all arguments, in brackets.
+        arguments: texts of the arguments if a number is expected; else empty.
     """
     match name.lower(), arguments:
         case "fabs" | "norm" | "magnitude", [inner]:
@@ -595,7 +595,7 @@ KEYWORDS: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("U", "R", "W", "S"), "INFIX"),
     }
 )
-"""Reserved words, apart from the names of relations."""
+"""Token types by reserved word; names of relations are reserved, too."""
 
 _SIGNS: Mapping[str, str] = MappingProxyType(
     {
@@ -638,19 +638,19 @@ _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
 
 
 def is_reserved(word: str, relations: Iterable[str]) -> bool:
-    """Return whether a word is part of the language, given the names of its relations."""
+    """Return whether a word is reserved: a word of the language or the name of a relation."""
     return word in KEYWORDS or word in relations
 
 
 def written_name(name: str, relations: Iterable[str]) -> str:
-    """Return a name as written in a text: in quotes unless it is an identifier that is not reserved."""
+    """Return the text of a name: in quotes unless it is an identifier that is not reserved."""
     if _IDENTIFIER.match(name) and not is_reserved(name, relations):
         return name
     return quote_name(name)
 
 
 def title_hint(name: str) -> str:
-    """Return how a specification that needs another name keeps its own as a title."""
+    """Return a hint that gives a spec a new name and keeps its old name as a title."""
     identifier = re.sub(r"\W", "_", name) + "_holds"
     return f"a title keeps its name: spec {identifier} {quote_name(name)} = ..."
 
@@ -667,13 +667,13 @@ def span_of(token: Token) -> Span:
 
 
 MAX_TOKENS = 40_000
-"""Words, numbers and signs of a text."""
+"""Most words, numbers and signs of a text."""
 
 
 def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token]:
-    """Return the tokens of a text; anything else is reported, and becomes a token of type ERROR.
+    """Return the tokens of a text; invalid characters are reported and become tokens of type ERROR.
 
-    A longer text yields its first `MAX_TOKENS` tokens, and the limit is reported.
+    The result has at most `MAX_TOKENS` tokens; further tokens are a fault.
     """
     tokens: list[Token] = []
     line = 1
@@ -708,20 +708,21 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             unit = piece.group("unit")
             if unit is not None and unit not in ("s", "ms"):
                 per = _PER.match(text, piece.end())
+                # in a window, m most likely stands for minutes instead of metres
                 is_window = unit == "m" and {"PREFIX", "INFIX"} & {token.type for token in tokens[-4:-1]}
                 meant_unit = "min" if is_window and "LSQB" in {token.type for token in tokens[-3:]} else unit
                 hint = unit_hint(value.removesuffix(unit), meant_unit, per.group(1) if per else "")
                 hint = hint or f"units of time are s and ms; a name is written in quotes: {quote_name(value)}"
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
-                # what is behind the sign is the rest of the unit
+                # in 3m/s the next tokens are the rest of the unit; ERROR prevents further faults about them
                 token_type = "ERROR" if per else token_type
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
     return read_spellings(_with_scales(_join_published_spellings(tokens)), faults)
 
 
 def _with_scales(tokens: list[Token]) -> list[Token]:
-    """Read `scale NAME =` as a statement; anywhere else `scale` is a name like others."""
+    """Mark `scale NAME =` at the beginning of a line as a statement; `scale` is not a reserved word."""
     for index, token in enumerate(tokens[:-2]):
         following = [token.type for token in tokens[index + 1 : index + 3]]
         if token.value == "scale" and token.type == "NAME" and following == ["NAME", "EQUAL"]:
@@ -732,7 +733,7 @@ def _with_scales(tokens: list[Token]) -> list[Token]:
 
 
 def _is_title_expected(before: list[Token]) -> bool:
-    """Return whether a quoted text is the title of a spec: behind its name, or its parameter."""
+    """Return whether a quoted text after these tokens is the title of a spec."""
     if not before:
         return False
     if before[-1].type == "NAME":
@@ -759,7 +760,7 @@ def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Toke
         faults.add(span, "a full stop behind a statement", meant_sign(";"))
         return
     if text == "}" and any(token.value == "{" for token in before[-8:]):
-        # it is reported where it opens
+        # the opening { is already reported
         return
     if text == "." and before and before[-1].type == "NAME" and before[-1].end_pos == span.start:
         owner = before[-1].value
@@ -782,7 +783,10 @@ def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Toke
 
 
 def _join_published_spellings(tokens: list[Token]) -> list[Token]:
-    """Read `!t` and `->t` as one operator where an operand follows them, not an object named t."""
+    """Join `!t` and `->t` to one operator if an operand follows.
+
+    These are the spellings of `not` and `->` in the published implementation; elsewhere `t` is a name.
+    """
     joined: list[Token] = []
     for index, token in enumerate(tokens):
         if (

@@ -1,4 +1,4 @@
-"""Walks over terms, expressions and formulas: their parts, substitution, and units."""
+"""Traversals of terms, expressions and formulas: parts, substitution and units."""
 
 from __future__ import annotations
 
@@ -57,31 +57,31 @@ from spatial_replay.text import plain_unit
 
 
 def base_of(term: Term) -> TrackedName | Variable | RegionName | Group:
-    """Return what a term names, without delays, enlargements and centres."""
+    """Return the object, variable, region or group of a term, without delays, enlargements and centres."""
     while isinstance(term, DerivedTerm):
         term = term.term
     return term
 
 
 def standing(term: Term) -> TrackedName | Variable | RegionName | Group | Earlier:
-    """Return a term as it stands in the log, without enlargements and centres; a delay stays."""
+    """Return a term without enlargements and centres; a delay is kept."""
     while isinstance(term, Enlarged | Centre):
         term = term.term
     return term
 
 
 def is_centre(term: Term) -> bool:
-    """Return whether a term is a centre, also an enlarged one."""
+    """Return whether a term is a centre or an enlarged centre."""
     return isinstance(term, Centre) or (isinstance(term, Enlarged) and is_centre(term.term))
 
 
 def looks_back(term: Term) -> bool:
-    """Return whether a term is that of an earlier sample."""
+    """Return whether a term is delayed."""
     return isinstance(standing(term), Earlier)
 
 
 def iter_expressions(expression: Expression) -> Iterator[Expression]:
-    """Yield an expression and all within it."""
+    """Yield an expression and all its subexpressions."""
     stack = [expression]
     while stack:
         current = stack.pop()
@@ -100,7 +100,7 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
 
 
 def terms_of(expression: Expression) -> Iterator[Term]:
-    """Yield the terms that an expression measures; of a rate, those of both samples."""
+    """Yield the measured terms of an expression; a rate yields its current and its earlier terms."""
     for part in iter_expressions(expression):
         if isinstance(part, Measurement):
             yield from part.terms
@@ -109,43 +109,43 @@ def terms_of(expression: Expression) -> Iterator[Term]:
 
 
 def speed_of(*terms: Term) -> Rate:
-    """Return how fast an object moves or, of two terms, how fast their distance decreases."""
+    """Return the speed of one term, or the speed at which the distance of two terms decreases."""
     return Rate(f"speed({', '.join(map(format_term, terms))})", terms)
 
 
 def rate_of(signal: Signal) -> Rate:
-    """Return how fast a signal changes."""
+    """Return the rate of change of a signal."""
     return Rate(f"rate({written_name(signal.name, RELATION_NAMES)})", (), signal)
 
 
 def presence_of(term: TrackedName | Variable) -> Equality:
-    """Return that a sample has an object."""
+    """Return the condition that a sample contains an object."""
     return Equality(Present(f"present({format_term(term)})", term), 1.0)
 
 
 def rates_of(formula: Formula) -> list[Rate]:
-    """Return the rates of change that a formula is about."""
+    """Return the rates of change in a formula."""
     return [part for part in iter_parts(formula) if isinstance(part, Rate)]
 
 
 def has_rate(formula: Formula) -> bool:
-    """Return whether a formula is about rates of change."""
+    """Return whether a formula contains a rate of change."""
     return bool(rates_of(formula))
 
 
 def leaves_out(formula: Formula) -> bool:
-    """Return whether an operator leaves samples or members out in which a rate has no value."""
+    """Return whether the outermost operator skips samples or members in which a rate has no value."""
     operands = (formula.body,) if isinstance(formula, Quantified) else operands_of(formula)
     return judged_operands(operator_of(formula), operands) is not operands
 
 
 def is_about_having_rates(leaf: Formula) -> bool:
-    """Return whether a leaf is that a rate has a value (see `judged_operands`)."""
+    """Return whether a leaf is the condition that a rate has a value (see `judged_operands`)."""
     return isinstance(leaf, Atom) and any(isinstance(part, HasRate) for part in iter_parts(leaf))
 
 
 def change_of(rate: Rate) -> Sum | SignedDistance:
-    """Return what a rate is per second: the difference between two reports."""
+    """Return the change of a rate's quantity between two reports; divided by `step_of`, it is the rate."""
     match rate.terms:
         case (first, second):
             before = (_moved_back(term, _moving(rate)) for term in rate.terms)
@@ -158,7 +158,7 @@ def change_of(rate: Rate) -> Sum | SignedDistance:
 
 
 def step_of(rate: Rate) -> ReportStep:
-    """Return the seconds between the reports that a rate compares."""
+    """Return the time between the two reports of a rate, in seconds."""
     return ReportStep("", _moving(rate), rate.signal)
 
 
@@ -178,7 +178,7 @@ def _moved_back(term: Term, rate: tuple[TrackedName | Variable | Group, ...]) ->
 
 
 def logged_signals(expression: Expression) -> Iterator[str]:
-    """Yield the names of the signals that an expression needs in the log."""
+    """Yield the names of the logged signals in an expression."""
     for part in iter_expressions(expression):
         signal = part.signal if isinstance(part, Rate) else part
         signal = signal.signal if isinstance(signal, PreviousSignal) else signal
@@ -187,12 +187,12 @@ def logged_signals(expression: Expression) -> Iterator[str]:
 
 
 def signals_in(expression: Expression) -> frozenset[str]:
-    """Return the names of the signals, and of the rates, that an expression compares."""
+    """Return the names of the signals and rates in an expression."""
     return frozenset(part.name for part in iter_expressions(expression) if isinstance(part, Signal))
 
 
 def iter_formulas(formula: Formula) -> Iterator[Formula]:
-    """Yield a formula and all within it, the bodies of quantifiers included, in the order of the text."""
+    """Yield a formula and its subformulas in text order, bodies of quantifiers included."""
     stack = [formula]
     while stack:
         current = stack.pop()
@@ -205,7 +205,7 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
 
 
 def iter_bound(formula: Formula) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
-    """Yield a formula and all within it, as `iter_formulas`, with the quantifiers around, outermost first."""
+    """Yield the formulas of `iter_formulas`, each with its enclosing quantifiers, outermost first."""
     stack: list[tuple[Formula, tuple[Quantified, ...]]] = [(formula, ())]
     while stack:
         node, around = stack.pop()
@@ -216,29 +216,29 @@ def iter_bound(formula: Formula) -> Iterator[tuple[Formula, tuple[Quantified, ..
 
 
 def iter_atoms(formula: Formula) -> Iterator[Atom]:
-    """Yield the atoms of a formula, those in quantifiers included, in the order of the text."""
+    """Yield the atoms of a formula in text order, those in quantifiers included."""
     return (part for part in iter_formulas(formula) if isinstance(part, Atom))
 
 
 def iter_parts(formula: Formula) -> Iterator[Expression]:
-    """Yield every expression within the atoms of a formula."""
+    """Yield every expression in the atoms of a formula."""
     return (part for atom in iter_atoms(formula) for part in iter_expressions(atom.expression))
 
 
 def leaf_key(leaf: Formula) -> tuple[object, ...]:
-    """Return what equal leaves have in common, wherever they stand in the text."""
+    """Return a key that is equal for equal leaves; names and places in the text do not count."""
     if isinstance(leaf, Quantified):
         return leaf.quantifier, leaf.variables, leaf.group, leaf.body
     return (leaf.expression,) if isinstance(leaf, Atom) else (leaf,)
 
 
 def nodes_of(formula: Formula) -> list[Formula]:
-    """Return every node of a tree, by id."""
+    """Return all nodes of a tree in the order of their ids."""
     return [node for _, _, node in iter_nodes(formula)]
 
 
 def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
-    """Return every node of a tree, by id, with the ids of its operands."""
+    """Return all nodes of a tree in the order of their ids, each with the ids of its operands."""
     nodes: list[tuple[Formula, list[int]]] = []
     for identifier, parent, node in iter_nodes(formula):
         nodes.append((node, []))
@@ -248,13 +248,13 @@ def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
 
 
 def named_members(group: Group) -> tuple[str, ...]:
-    """Return the members of a named group, without those left out; none of an open one."""
+    """Return the members of a named group without excluded ones; an open group has none."""
     left_out = {member.name for member in group.excluded}
     return tuple(name for name in group.members or () if name not in left_out)
 
 
 def is_spatial(formula: Formula) -> bool:
-    """Return whether a formula is about one sample: no operator in it looks ahead or back."""
+    """Return whether a formula depends on one sample: it has no temporal operator."""
     return not any(isinstance(part, Temporal) for part in iter_formulas(formula))
 
 
@@ -266,7 +266,7 @@ def looks_ahead(formula: Formula) -> bool:
 
 
 def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
-    """Yield the terms that atoms measure and the groups of open quantifiers, in the order of the text."""
+    """Yield the terms of atoms and the groups of open quantifiers, in text order."""
     for formula in formulas:
         for part in iter_formulas(formula):
             if isinstance(part, Atom):
@@ -276,7 +276,7 @@ def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
 
 
 def other_names(formula: Formula) -> frozenset[str]:
-    """Return the names in a formula of objects, regions, groups and specs: all but variables."""
+    """Return the names of objects, regions, groups and specs in a formula; variables are left out."""
     names = {part.name for part in iter_formulas(formula) if part.name is not None}
     objects = (part.term for part in iter_parts(formula) if isinstance(part, Present))
     for base in map(base_of, chain(iter_terms([formula]), objects)):
@@ -288,14 +288,14 @@ def other_names(formula: Formula) -> frozenset[str]:
 
 
 def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
-    """Return in which signs the robustness of an operand can become that of its node: 1, -1 or both.
+    """Return the signs with which an operand's robustness can be that of its node: 1, -1 or both.
 
     Args:
-        operand: its place among the operands.
+        operand: index of the operand.
     """
     if not isinstance(formula, Boolean):
         return (1,)
-    # stand-ins, because equal operands may be one object and still are two places in the text
+    # stand-ins, because two equal operands can be the same Python object
     stand_ins = tuple(Truth(True) for _ in formula.operands)
     node = Boolean(formula.operator, stand_ins)
     signs: set[int] = set()
@@ -315,7 +315,7 @@ Names = Mapping[str, TrackedName | Variable]
 
 
 def horizon_ns(formula: Formula) -> float:
-    """Return how long after its sample a formula depends on others; inf if that is not bounded in time."""
+    """Return the future horizon of a formula, in ns; inf if it is not bounded in time."""
     longest_ns = max(map(horizon_ns, operands_of(formula)), default=0.0)
     if not isinstance(formula, Temporal) or formula.operator not in FUTURE_OPERATORS:
         return longest_ns
@@ -326,9 +326,9 @@ def horizon_ns(formula: Formula) -> float:
 
 
 def can_settle(formula: Formula, *, satisfied: bool) -> bool:
-    """Return False if no prefix of a run can permanently satisfy, or violate, a formula.
+    """Return False if no prefix of a run can permanently satisfy a formula (violate it, if not `satisfied`).
 
-    True where that is not plain from its operators.
+    The check looks only at the operators, so True means that such a prefix may exist.
     """
     match formula:
         case Boolean(operator="not", operands=(operand,)):
@@ -351,7 +351,7 @@ def can_settle(formula: Formula, *, satisfied: bool) -> bool:
 
 
 def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELATION_NAMES) -> Formula:
-    """Return a formula with other objects in place of some of its variables."""
+    """Return a formula with some of its variables replaced."""
     if not names:
         return formula
     match formula:
@@ -376,7 +376,7 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
 
 
 def rewritten(formula: Formula, change: Callable[[Atom], Atom]) -> Formula:
-    """Return a formula of the same shape with some of its atoms changed."""
+    """Return a formula with a function applied to each of its atoms."""
     match formula:
         case Atom():
             return change(formula)
@@ -390,7 +390,7 @@ def rewritten(formula: Formula, change: Callable[[Atom], Atom]) -> Formula:
 
 
 def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) -> Formula:
-    """Return a formula with other operands of the operator that is a node, by its id."""
+    """Return a formula in which the node with an id has other operands."""
     if not isinstance(formula, Boolean | Temporal):
         return formula
     if node == 0:
@@ -406,9 +406,9 @@ def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) ->
 
 
 def without_variables(formula: Quantified) -> Formula:
-    """Return the body of a quantifier with variables that are known by their place alone."""
+    """Return the body of a quantifier with numbered variables, so that bodies with other names are equal."""
     inner = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
-    # no name of a text begins with a blank and a number
+    # a name of a text begins with a blank only in quotes, so in practice these clash with no other name
     return substitute(
         formula.body,
         {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)},
@@ -416,7 +416,7 @@ def without_variables(formula: Quantified) -> Formula:
 
 
 def substitute_term(term: Term, names: Names) -> Term:
-    """Return a term with other objects in place of some of its variables."""
+    """Return a term with some of its variables replaced."""
     match term:
         case Variable():
             return names.get(term.name, term)
@@ -440,7 +440,7 @@ def _object(term: TrackedName | Variable, names: Names) -> TrackedName | Variabl
 def map_leaves(
     expression: Expression, change: Callable[[Number | Signal | Measurement], Expression]
 ) -> Expression:
-    """Return an expression with its numbers, signals and measurements replaced."""
+    """Return an expression with a function applied to its numbers, signals and measurements."""
     match expression:
         case Sum():
             return Sum(map_leaves(expression.first, change), map_leaves(expression.second, change))
@@ -464,7 +464,7 @@ def map_leaves(
 
 
 def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], Term]) -> Expression:
-    """Return a number, a signal or a measurement with other terms in place of its own."""
+    """Return a number, signal or measurement with a function applied to its terms."""
     if isinstance(leaf, Rate):
         return speed_of(*map(change, leaf.terms)) if leaf.terms else leaf
     if isinstance(leaf, Present):
@@ -476,17 +476,18 @@ def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], T
 LENGTHS = "lengths"
 """Name of the footprint units in `scale`."""
 MULTIPLES = "multiples"
-"""Name of the unit of a number that is computed from multiples alone, as in `2 * x <= 1`."""
+"""Name of the unit of a number that has only multiples as summands, as in `2 * x <= 1`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """The unit of an atom's number.
+    """Unit of an atom's number.
 
     Attributes:
-        kind: a length, in the units of the footprints; a signal's; one of them per second ("rate"); or none.
-        signal: the name of the signal, or None.
-        divisor: what `scale` divides the number by, or None.
+        kind: "length" (unit of the footprints), "signal" (unit of the signal), "rate" (either unit per
+            second) or "orientation" (no unit).
+        signal: name of the signal, or None.
+        divisor: divisor from a `scale` line, or None.
     """
 
     kind: Literal["length", "signal", "rate", "orientation"]
@@ -500,22 +501,22 @@ class Unit:
 
 
 def units_of(formula: Formula) -> tuple[Unit, ...]:
-    """Return the units of the atoms of a formula, each once, in the order of the text.
+    """Return the distinct units of a formula's atoms, in text order.
 
-    `mode == 2` has none: it is infinite, and so never a number that a minimum returns.
+    An equality such as `mode == 2` has no unit, because its robustness is infinite.
 
-    A minimum over atoms of one unit is a number of that unit. Over several it compares what may not be
-    comparable, unless each of them is scaled: see `is_mixed`.
+    A minimum over atoms with the same unit has that unit. A minimum over several units may compare numbers
+    that are not comparable, unless each of them is scaled (see `is_mixed`).
     """
     return tuple(dict.fromkeys(unit for atom in iter_atoms(formula) for unit in _units(atom.expression)))
 
 
 def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: bool = True) -> str:
-    """Return the declared unit of a formula's number; "" where it has none, several, or none is declared.
+    """Return the declared unit of a formula's robustness; "" if there is not exactly one.
 
     Args:
-        declared: the units of signals by their names, that of lengths by "".
-        is_scaled: whether the number is what `scale` made of it, which has no unit.
+        declared: units by name of signal; the unit of lengths has the key "".
+        is_scaled: whether `scale` lines are applied; a scaled number has no unit.
     """
     if not declared:
         return ""
@@ -534,17 +535,17 @@ def _declared_name(unit: Unit, declared: Mapping[str, str]) -> str:
 
 
 def per_second(unit: str) -> str:
-    """Return the unit of a rate of change; "" where that of its numbers is not declared."""
+    """Return the unit of a rate of change; "" if the unit of the changing number is not declared."""
     return plain_unit(unit) and ("1/s" if unit == "1" else f"{unit}/s")
 
 
 def is_mixed(units: Sequence[Unit]) -> bool:
-    """Return whether numbers of these units should not be compared: several, and not all of them scaled."""
+    """Return whether numbers of these units are not comparable: several units, not all of them scaled."""
     return len(units) > 1 and any(unit.divisor is None and unit.kind != "orientation" for unit in units)
 
 
 def units_text(units: Sequence[Unit]) -> str:
-    """Return a sentence on the units of what a robustness is the least of; "" if it is one."""
+    """Return a sentence with the units that a robustness combines; "" for fewer than two."""
     if len(units) < 2:
         return ""
     *others, last = map(str, units)
@@ -553,7 +554,7 @@ def units_text(units: Sequence[Unit]) -> str:
 
 
 def divide_by_scale(expression: Expression, scales: Sequence[Scale]) -> Expression:
-    """Return what an atom computes, divided if there is a scale for the one unit of what it measures."""
+    """Return the expression of an atom, divided by the scale of its unit if there is one."""
     units = _units(expression)
     for scale in scales:
         kind: Literal["length", "signal"] = "length" if scale.signal is None else "signal"
@@ -575,7 +576,11 @@ def _units(expression: Expression) -> list[Unit]:
 
 
 def _unit_leaves(expression: Expression) -> list[Signal | Measurement]:
-    """Return the parts whose units an expression has: of a sum, one; a multiple may be in another unit."""
+    """Return the parts that determine the unit of an expression.
+
+    Summands have the same unit, so one of them is enough. A multiple is left out, because its constant may
+    convert the unit.
+    """
     match expression:
         case Sum(first, second):
             return _unit_leaves(first) or _unit_leaves(second)
@@ -600,10 +605,10 @@ def _unit_of(leaf: Signal | Measurement, divisor: float | None) -> Unit:
 
 
 def summed_units(expression: Expression, declared: Mapping[str, str]) -> list[str]:
-    """Return the declared units of what a sum adds and compares, each once; multiples may have any.
+    """Return the distinct declared units of a sum's operands; multiples are left out.
 
     Args:
-        declared: see `declared_unit`.
+        declared: units by name of signal (see `declared_unit`).
     """
     units: dict[str, None] = {}
     stack = [expression.operand if isinstance(expression, Scaled) else expression]
