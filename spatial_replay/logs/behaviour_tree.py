@@ -11,16 +11,16 @@ from spatial_replay.logs.topics import BEHAVIOUR_TREE, protobuf_channel
 TREE_CHANNEL: Final = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
 
 NAV2_LOG: Final = "nav2_msgs/msg/BehaviorTreeLog"
-"""The type of Nav2's messages about its behaviour tree."""
+"""Type of Nav2's behaviour-tree messages."""
 
 
 class TreeNode(NamedTuple):
     """A node of a behaviour tree.
 
     Attributes:
-        kind: such as Sequence, Selector, Retry, or Action for a leaf; empty if the log does not say.
-        parent: index of the node above among the nodes; None for the root, or if the log does not say.
-        status: RUNNING, SUCCESS or FAILURE; INVALID if it was not ticked since the tree began or was reset.
+        kind: type of the node, such as Sequence or Retry; Action for a leaf; empty for nodes of Nav2.
+        parent: index of its parent in `TreeTick.nodes`; None for the root, and for nodes of Nav2.
+        status: RUNNING, SUCCESS or FAILURE; INVALID without a tick since the start or reset of the tree.
     """
 
     name: str
@@ -30,13 +30,13 @@ class TreeNode(NamedTuple):
 
 
 class TreeTick(NamedTuple):
-    """A behaviour tree after a tick that changed the status of a node: depth first, children in order."""
+    """A behaviour tree after a tick that changed a status. Its nodes are in depth-first order."""
 
     number: int | None
     nodes: tuple[TreeNode, ...]
 
     def payload(self, time_ns: int) -> bytes:
-        """Return the message of this tick at a time on the clock of the samples."""
+        """Encode the tick as a message; `time_ns` is on the clock of the samples."""
         message = BehaviourTree(time_ns=time_ns, tick=self.number)
         for node in self.nodes:
             status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
@@ -45,7 +45,7 @@ class TreeTick(NamedTuple):
 
 
 class Behaviour(Protocol):
-    """The part of a behaviour of py_trees that is logged."""
+    """Attributes of a py_trees behaviour that are logged."""
 
     name: str
     status: Any
@@ -55,7 +55,7 @@ class Behaviour(Protocol):
 
 
 def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
-    """Return the nodes of a tree of py_trees."""
+    """Return the nodes of a py_trees tree, depth first."""
     nodes: list[TreeNode] = []
     branches: list[tuple[int | None, Behaviour]] = [(None, root)]
     while branches:
@@ -67,21 +67,21 @@ def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
 
 
 class Nav2Tree:
-    """The nodes of a tree of Nav2, from its log of status changes.
+    """Nodes of a Nav2 behaviour tree, from its log of status changes.
 
-    The log names no parents. Nodes have the order of their numbers, which is depth first. Older versions of
-    Nav2 number none; then nodes have the order of their first change.
+    The log names no parents. Nodes are sorted by `uid`, which is depth first. Older versions of Nav2 give no
+    `uid`; their nodes are in the order of their first status change.
     """
 
     def __init__(self) -> None:
         self._nodes: dict[int | str, TreeNode] = {}
 
     def add(self, log: Any) -> tuple[TreeNode, ...]:
-        """Take a message of type `NAV2_LOG`, and return the nodes after it."""
+        """Apply a message of type `NAV2_LOG`; return all nodes after its changes."""
         for change in log.event_log:
             key = getattr(change, "uid", change.node_name)
             if key in self._nodes and self._nodes[key].name != change.node_name:
-                # another tree was loaded, and numbers its nodes from 1 again
+                # Nav2 loaded another tree, whose uids start at 1 again
                 self._nodes.clear()
             is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
             status = change.current_status if is_active else "INVALID"

@@ -1,7 +1,7 @@
 """Messages of a log as columns, blocks of samples with their messages, and sinks.
 
-Messages of several channels are merged in an order that depends on what the channels are, not on their
-numbers, so that equal logs give equal files.
+Messages of several channels are merged in an order that depends on the content of the channels, not on their
+numbers. So equal logs give equal files.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from spatial_replay.trace.trace import LATEST_NS, Trace
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """How a channel's messages are described: an MCAP schema without its number."""
+    """Description of the messages of a channel: an MCAP schema without its number."""
 
     name: str
     encoding: str
@@ -30,13 +30,13 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A topic with the form of its messages: an MCAP channel without its number.
+    """A topic with the encoding of its messages: an MCAP channel without its number.
 
     Attributes:
-        topic: where messages go, such as /spatial/objects.
-        encoding: of the messages: protobuf, json, cdr, ros1.
-        schema: None where the log has none.
-        metadata: as in the log.
+        topic: name, such as /spatial/objects.
+        encoding: encoding of the messages: protobuf, json, cdr or ros1.
+        schema: description of the messages; None if the log has none.
+        metadata: key-value pairs, as in the log.
     """
 
     topic: str
@@ -64,8 +64,8 @@ class Messages:
     """M messages in the order (time, channel, sequence), byte for byte as in the log.
 
     Attributes:
-        channels: by the number that `channel` uses.
-        channel: (M,) int64.
+        channels: channels by number.
+        channel: (M,) int64, number of each message's channel.
         sequence: (M,) int64.
         log_time_ns, publish_time_ns: (M,) int64.
         payloads: M encoded messages.
@@ -80,7 +80,7 @@ class Messages:
 
     @classmethod
     def from_rows(cls, channels: Mapping[int, Channel], rows: Sequence[Row]) -> Messages:
-        """Return the messages one by one as columns."""
+        """Build the columns from single messages."""
         *numbers, payloads = zip(*rows, strict=True) if rows else [()] * len(Row._fields)
         channel, sequence, log_ns, publish_ns = (np.array(column, np.int64) for column in numbers)
         return Messages(channels, channel, sequence, log_ns, publish_ns, payloads)
@@ -106,7 +106,7 @@ class Messages:
 
     @property
     def topic_ranks(self) -> Integers:
-        """(M,) int64, of the topic of each message among all topics in order."""
+        """(M,) int64, rank of each message's topic among the sorted topics."""
         names = {channel.topic for channel in self.channels.values()}
         rank = {name: place for place, name in enumerate(sorted(names))}
         of_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
@@ -115,30 +115,33 @@ class Messages:
         return of_channel[self.channel]
 
     def by_channel(self) -> Iterator[tuple[Channel, Integers]]:
-        """Iterate over the channels that have messages, each with the places of these."""
+        """Iterate over the channels that have messages, with the indices of their messages."""
         for places in equal_places(self.channel):
             yield self.channels[int(self.channel[places[0]])], places
 
     def by_topic(self) -> Iterator[tuple[str, Integers]]:
-        """Iterate over the topics that have messages, in order, each with the places of these."""
+        """Iterate over the sorted topics that have messages, with the indices of their messages."""
         for places in equal_places(self.topic_ranks):
             yield self.channels[int(self.channel[places[0]])].topic, places
 
     def of_topics(self, topics: Collection[str]) -> Self:
-        """Return the messages of some topics, in the same order."""
+        """Return the messages of the given topics, in the same order."""
         numbers = [number for number, channel in self.channels.items() if channel.topic in topics]
         places = np.flatnonzero(np.isin(self.channel, numbers))
         return self if len(places) == len(self) else select(self, places)
 
     def within(self, start_ns: int, end_ns: int) -> Self:
-        """Return the messages logged from one time to before another, in the same order."""
+        """Return the messages with log times in [start_ns, end_ns), in the same order."""
         times_ns = self.log_time_ns
         inside = (times_ns >= start_ns) & (times_ns <= min(end_ns - 1, LATEST_NS))
         return self if inside.all() else select(self, np.flatnonzero(inside))
 
 
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
-    """Return messages of one channel, published when they are logged, numbered from `first`."""
+    """Return messages of one channel, with sequence numbers from `first`.
+
+    Their publish times are their log times.
+    """
     return Messages(
         channels={0: channel},
         channel=np.zeros(len(payloads), np.int64),
@@ -151,16 +154,15 @@ def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Some samples of a log with their messages.
+    """Consecutive samples of a log with their messages.
 
     Attributes:
-        trace: the samples; `trace.faults` lists what was lost since the previous block.
-        messages: those that a copy of the log must contain beside what is derived from the samples; empty for
-            sources that are not a log of messages. A copy gets a topic for the samples where they have none.
-        remarks: what is worth knowing although nothing was lost: how many observations are out of date, which
-            transforms are missing.
+        trace: the samples; `trace.faults` lists the losses since the previous block.
+        messages: messages that a copy of the log must contain, except topics derived from the samples; empty
+            for sources without messages. A copy adds a topic of samples if the messages have none.
+        remarks: notes on the data without a loss, such as the number of stale observations.
         doubts: assumptions that the log contradicts.
-        facts: how each mapped topic was read, once all of it is.
+        facts: how each mapped topic was read; empty until the topics are read to their end.
     """
 
     trace: Trace
@@ -171,17 +173,17 @@ class Block:
 
 
 def merge(streams: Sequence[Messages]) -> Messages:
-    """Merge messages in the order of time, topic and sequence.
+    """Merge messages by log time, channel and sequence.
 
-    Channel numbers mean nothing outside their log, so channels are ordered by their content. Equal messages
-    come out in the same order from any log.
+    Channel numbers are local to a log, so channels are ordered by their content. So the order of messages
+    does not depend on the numbering of their log.
     """
     joined = join(streams)
     return select(joined, np.lexsort((joined.sequence, joined.channel, joined.log_time_ns)))
 
 
 def join(streams: Sequence[Messages]) -> Messages:
-    """Join messages, one stream after the other."""
+    """Concatenate streams of messages; channels are renumbered by their content."""
     distinct = {id(channel): channel for stream in streams for channel in stream.channels.values()}
     by_rank = {_rank(channel): channel for channel in distinct.values()}
     number = {rank: place for place, rank in enumerate(sorted(by_rank))}
@@ -208,7 +210,7 @@ def _renumber(stream: Messages, number: dict[int, int]) -> Integers:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file in a log; its times are 0 where they are not known."""
+    """A file in a log. Unknown times are 0."""
 
     name: str
     media_type: str

@@ -1,7 +1,7 @@
-"""Samples as messages of /spatial/objects, many at a time, in both directions.
+"""Encode samples as messages of /spatial/objects and decode them, many at a time.
 
-Most messages of a log differ only in their numbers. So one message of a layout is parsed by the protobuf
-library, and the numbers of all others are read at its offsets, or written there (see `wire`).
+Most messages of a log differ only in their numbers. So the protobuf library parses one message of a layout,
+and the numbers of all others are read or written at its offsets (see `wire`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from spatial_replay.trace.observations import Observations, trace_from_observati
 from spatial_replay.trace.trace import ABSENT, Trace, class_order, require_few
 
 UNKNOWN, ZERO = -2, -1
-"""Slots of numbers that a message does not hold, after its last slot: they read as NaN and 0."""
+"""Slots of missing numbers: two columns after the last slot, NaN and 0."""
 
 
 OBJECTS_CHANNEL: Final = protobuf_channel(OBJECTS, ObjectStates)
@@ -45,14 +45,14 @@ class WrongMessageError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class SlotLayout:
-    """Which slot of a message holds what; `UNKNOWN` or `ZERO` where none does.
+    """Slot of each field in a message; `UNKNOWN` or `ZERO` for a missing field.
 
     Attributes:
         time: slot of the sample's time.
-        names, classes: of the J objects.
-        lasting: those among them that stand where they are until they are reported again.
-        part_counts: (J,) parts of each object.
-        vertex_counts: (P,) vertices of each part.
+        names, classes: names and classes of the J objects.
+        lasting: names of objects that hold their pose until their next report.
+        part_counts: (J,) number of parts of each object.
+        vertex_counts: (P,) number of vertices of each part.
         coordinates: (2 V,) slots of x, y, x, y …
         radius: (P,) slots.
         yaw, bottom, top, uncertainty, reported: (J,) slots.
@@ -77,10 +77,10 @@ class SlotLayout:
 
 
 def parse_object_states(payload: bytes) -> ObjectStates:
-    """Parse a message, or a piece of one.
+    """Parse a message or a piece of one.
 
     Raises:
-        WrongMessageError: it is not one, an object has no name or a vertex no y.
+        WrongMessageError: invalid bytes, an object without a name, or a vertex without y.
     """
     message = ObjectStates()
     try:
@@ -96,10 +96,10 @@ def parse_object_states(payload: bytes) -> ObjectStates:
 
 
 def layout_of(message: ObjectStates) -> SlotLayout:
-    """Return where `WireTemplate.of(message)` has its slots.
+    """Return the slots of `WireTemplate.of(message)` by field.
 
     Raises:
-        WrongMessageError: a signal without a name, or with one that another has.
+        WrongMessageError: a signal without a name, or two signals of one name.
     """
     slots = count()
 
@@ -110,7 +110,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
     names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty", "reported")
     columns: dict[str, list[int]] = {name: [] for name in names}
     for state in message.objects:
-        # in the order of the fields
+        # in the order in which protobuf encodes the fields
         for part in state.parts:
             columns["coordinates"] += (next(slots) for _ in part.coordinates)
             columns["radius"].append(slot(part.HasField("radius"), ZERO))
@@ -142,17 +142,17 @@ def layout_of(message: ObjectStates) -> SlotLayout:
 
 
 SAMPLES_PER_LAYOUT = 32
-"""Setting up a layout costs about as much as reading this many messages piece by piece."""
+"""Messages that a layout must serve on average: its setup costs as much as reading them piece by piece."""
 FIRST_LAYOUTS = 16
-"""Layouts that are set up before it counts how few messages each serves."""
+"""Number of layouts that are set up even if they serve few messages."""
 
-# the number of a field times 8, and how it is encoded: https://protobuf.dev/programming-guides/encoding
+# field number times 8 plus wire type: https://protobuf.dev/programming-guides/encoding
 _TIME_TAG, _OBJECT_TAG, _SIGNAL_TAG = 0x09, 0x12, 0x1A
 
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Samples (K,) of one layout with their numbers (K, W + 2)."""
+    """K samples of one layout: indices (K,), and numbers (K, W + 2) with the columns `UNKNOWN` and `ZERO`."""
 
     samples: Integers
     layout: SlotLayout
@@ -161,7 +161,7 @@ class _Group:
 
 @dataclass(frozen=True, slots=True)
 class _Pieces:
-    """Encodings, each of a message or of fields of one, with the samples that they belong to."""
+    """Encoded messages or parts of messages, with the sample index of each."""
 
     samples: Integers
     payloads: Sequence[bytes]
@@ -178,7 +178,7 @@ def decode_objects(
         concave: how polygons that are not convex are handled; our own logs hold none.
 
     Returns:
-        the trace of the messages that can be used, and what is wrong with the others, each with its time.
+        the trace of the valid messages, and a fault with its time for each other message.
     """
     faults: dict[int, str] = {}
     groups = _groups(payloads, faults)
@@ -197,9 +197,9 @@ def decode_objects(
 
 
 def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
-    """Group all numbers of all messages by layout; payloads that are not messages go to `faults`.
+    """Group the numbers of all messages by layout; invalid payloads go to `faults`.
 
-    Where most messages have a layout of their own, their objects do not: these are read piece by piece.
+    If layouts serve too few messages, messages are split into their objects and signals, which share layouts.
     """
     whole = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
     groups, left = _group_by_layout(whole, faults, SAMPLES_PER_LAYOUT)
@@ -212,16 +212,17 @@ def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
 
 
 def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[_Group], _Pieces]:
-    """Group pieces by layout; return also those left over once layouts serve too few pieces each.
+    """Group pieces by layout; return also the pieces left over when layouts serve too few pieces.
 
     Args:
-        worth: how many pieces a layout should serve on average, the first few layouts aside.
+        worth: least mean number of pieces per layout, not counting the first `FIRST_LAYOUTS`.
     """
     groups: list[_Group] = []
     left: list[Integers] = []
     layouts_tried = served = 0
     lengths = np.fromiter(map(len, pieces.payloads), np.int64, len(pieces.payloads))
     values, counts = np.unique(lengths, return_counts=True)
+    # frequent lengths first: their layouts serve most pieces
     for length in values[np.argsort(-counts, kind="stable")].tolist():
         places = np.flatnonzero(lengths == length)
         if (layouts_tried - FIRST_LAYOUTS) * worth > served:
@@ -245,7 +246,10 @@ def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tup
 def _first_group(
     first: _Pieces, rows: Bytes, faults: dict[int, str]
 ) -> tuple[_Group | None, NDArray[np.bool_]]:
-    """Return the group of the first of some rows (n, L), or None, and (n,) the rows that it settles."""
+    """Return the group of all rows (n, L) with the layout of the first, and (n,) whether a row is settled.
+
+    The group is None if the first row is not a valid message; then only that row is settled.
+    """
     alone = np.zeros(len(rows), np.bool_)
     alone[0] = True
     try:
@@ -258,13 +262,13 @@ def _first_group(
     if is_same_layout[0]:
         matching_rows = rows if is_same_layout.all() else rows[is_same_layout]
         return _Group(first.samples, layout, _pad(template.words(matching_rows))), is_same_layout
-    # another encoder's order of fields: the library's own bytes mean the same
+    # another encoder wrote the fields in another order, so the library encodes the message again
     row = rows_of([message.SerializeToString(deterministic=True)])
     return _Group(first.samples, layout, _pad(template.words(row))), alone
 
 
 def _fields(payload: bytes) -> list[bytes] | None:
-    """Split a message into its fields, each a message of its own; None if a field is unknown or repeated."""
+    """Split a message into its fields, each a valid message; None for an unknown field or a second time."""
     pieces: list[bytes] = []
     begin, end, times = 0, len(payload), 0
     while begin < end:
@@ -273,6 +277,7 @@ def _fields(payload: bytes) -> list[bytes] | None:
             position += 8
             times += 1
         elif tag in (_OBJECT_TAG, _SIGNAL_TAG):
+            # a varint: https://protobuf.dev/programming-guides/encoding/#varints
             length = shift = 0
             while position < end:
                 length |= (payload[position] & 0x7F) << shift
@@ -316,7 +321,7 @@ def _late_reports(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str
 
 
 def _whole(group: _Group, slot: int) -> Integers:
-    """Return (K,) what is in a slot of whole numbers."""
+    """Return (K,) int64, the integers in a slot."""
     return np.ascontiguousarray(group.numbers[:, slot]).view(np.int64)
 
 
@@ -381,7 +386,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
 
 
 def _report_times(groups: Sequence[_Group], times_ns: Integers) -> Integers | None:
-    """Return when each observation was reported, (R,); None where all have the times of their samples."""
+    """Return the report time of each observation, (R,); None if all equal the times of their samples."""
     if all((group.layout.reported == UNKNOWN).all() for group in groups):
         return None
     columns = [np.empty(0, np.int64)]
@@ -402,7 +407,7 @@ def _signal_report_times(groups: Sequence[_Group], times_ns: Integers) -> dict[s
 
 
 def _invalid(group: _Group) -> NDArray[np.bool_]:
-    """Return (K * J,) where an orientation or a height is stated, but not finite."""
+    """Return (K * J,) whether an orientation or a height is given but not finite."""
     layout = group.layout
     invalid = np.zeros((len(group.samples), len(layout.names)), np.bool_)
     for slots in (layout.yaw, layout.bottom, layout.top):
@@ -419,16 +424,17 @@ def _signal(name: str, groups: Sequence[_Group], count: int) -> Floats:
 
 
 def sample_messages(trace: Trace, first: int) -> Messages:
-    """Return the samples of a trace as messages, numbered from `first`."""
+    """Return the samples of a trace as messages, with sequence numbers from `first`."""
     return messages_of(OBJECTS_CHANNEL, trace.times_ns, encode_objects(trace), first)
 
 
 def encode_objects(trace: Trace) -> Payloads:
     """Encode each sample of a trace as one ObjectStates message.
 
-    Two encodings side by side are the encoding of both messages' fields. So a sample is joined from pieces:
-    its time, each of its objects and each of its signals, and all pieces of one layout are encoded at once.
+    In protobuf, concatenated encodings are the encoding of one message with the fields of both. So a sample
+    is joined from pieces: its time, its objects and its signals. Pieces of one layout are encoded together.
     """
+    # https://protobuf.dev/programming-guides/encoding/#last-one-wins
     count = len(trace)
     times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
     signals = [_signal_pieces(trace, name) for name in trace.signals]
@@ -440,9 +446,10 @@ def encode_objects(trace: Trace) -> Payloads:
 
 
 def _object_pieces(trace: Trace) -> Payloads:
-    """Encode every object of every sample, by sample and name."""
+    """Encode every object of every sample, in the order of sample and name."""
     present = trace.rows != ABSENT
     marked = trace.rows[present]
+    # the row number -2 - row marks an unreadable observation, see `Trace`
     rows = np.where(marked < 0, -2 - marked, marked)
     name = np.nonzero(present)[1]
     pieces = list[tuple[Integers, Payloads]]()
@@ -463,7 +470,7 @@ def _object_pieces(trace: Trace) -> Payloads:
 
 
 def _signal_pieces(trace: Trace, name: str) -> Payloads:
-    """Encode a signal in every sample: nothing where its value is not known."""
+    """Encode a signal of every sample; an unknown value gives an empty piece."""
     message, values = ObjectStates(), trace.signals[name]
     signal = message.signals.add(name=name, value=0.0)
     pieces = _pieces(message, values[:, None])
@@ -478,12 +485,12 @@ def _signal_pieces(trace: Trace, name: str) -> Payloads:
 
 
 def _pieces(message: Message, numbers: Floats) -> Payloads:
-    """Encode a message with other numbers (n, W)."""
+    """Encode n copies of a message with the numbers (n, W)."""
     return WireTemplate.of(message).encode(np.ascontiguousarray(numbers).view(np.uint64))
 
 
 def _row_layout(trace: Trace) -> Integers:
-    """Return (R,) a number that is equal for observations whose messages differ only in numbers and name."""
+    """Return (R,) codes; observations of one code have messages that differ only in numbers and name."""
     shapes = trace.footprints
     counts = np.diff(shapes.part_start)
     vertex_counts = np.diff(shapes.vertex_start)
@@ -497,9 +504,9 @@ def _row_layout(trace: Trace) -> Integers:
 
 
 def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectStates:
-    """Return a message of one observation with everything but its numbers.
+    """Return the message of one observation, with all its numbers 0.
 
-    An unreadable one always has orientation and height: either may be what is not finite.
+    An unreadable observation gets orientation and height, because either may be the value that is not finite.
     """
     shapes = trace.footprints
     message = ObjectStates()

@@ -21,14 +21,14 @@ _CREATE = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
 
 @contextmanager
 def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
-    """Open a stream to write `output`: under another name, moved into place when all went well.
+    """Open a stream to a temporary file, which replaces `output` when the block ends without an error.
 
-    If the block ends early, even by an interruption, there is neither a partial file nor a changed one.
-    Errors of the block itself pass through unchanged.
+    After an error or an interruption, `output` is unchanged and no partial file is left. Errors of the block
+    itself pass through unchanged.
 
     Raises:
-        UsageError: the output is one of the inputs, a folder, or in none.
-        OutputError: the machine cannot write it.
+        UsageError: the output is an input or a folder, or its folder does not exist.
+        OutputError: the file cannot be written.
     """
     refuse_inputs(output, inputs)
     if output.exists() and not output.is_file():
@@ -36,9 +36,9 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
         with open_output(output) as stream:
             yield stream
         return
-    # a link stays a link, to the new content
+    # a symbolic link stays, and its target is replaced
     output = output.resolve()
-    # named before it is made: an interruption at whatever step finds it
+    # named before it is created, so that `finally` removes it after an interruption at any step
     partial = output.with_name(f".{output.name}.{secrets.token_hex(8)}.partial")
     try:
         with _writing(output):
@@ -48,25 +48,25 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
         with _writing(output):
             partial.replace(output)
     finally:
-        # a file that could not be made, or has its own name now, needs no removal
+        # the partial file is missing if it was not created or is renamed already
         with suppress(OSError):
             partial.unlink()
 
 
 Durability: TypeAlias = Literal["process", "disk"]
-"""Durability of a flushed file: it survives the end of the process, or of the machine, too."""
+"""Failure that a flushed file survives: a crash of the process, or also of the machine ("disk")."""
 
 
 def open_output(output: Path, durability: Durability = "process", *, overwrite: bool = True) -> BinaryIO:
-    """Open a file to write in place; opening, writing and closing it fail with an OutputError.
+    """Open a file to write in place. Failures to open, write or close it are OutputErrors.
 
     Args:
-        durability: "disk" for a file whose every flush waits until the disk has it.
+        durability: "disk" makes every flush wait until the disk has the data.
         overwrite: whether a file with content may be replaced.
 
     Raises:
-        UsageError: another durability; a file that must not be replaced.
-        OutputError: it cannot be written, or another program, or another part of this one, is writing it.
+        UsageError: an unknown durability, or a file that must not be overwritten.
+        OutputError: it cannot be written, or is open for writing in this or another program.
     """
     if durability not in get_args(Durability):
         raise UsageError(f"durability is {durability!r}; give 'process' or 'disk'")
@@ -87,7 +87,7 @@ def open_output(output: Path, durability: Durability = "process", *, overwrite: 
 
 
 def _lock(descriptor: int, output: Path) -> None:
-    """Lock a file for as long as it is open; the lock dies with its process."""
+    """Lock a file until it is closed; the lock ends with its process."""
     if sys.platform == "win32":
         return
     import fcntl
@@ -99,7 +99,7 @@ def _lock(descriptor: int, output: Path) -> None:
             f"{output} is being written by another recorder or program; give this log another name"
         ) from None
     except OSError:
-        # some file systems of networks have no locks
+        # some network file systems have no locks
         return
 
 
@@ -110,7 +110,7 @@ def _stream(file: int, output: Path, durability: Durability = "process") -> Bina
 
 
 class _DurableWriter(io.BufferedWriter):
-    """A stream whose every flush, the one that closing it makes included, waits for the disk."""
+    """A stream that waits for the disk at every flush, also at the flush when it is closed."""
 
     def flush(self) -> None:
         super().flush()
@@ -121,9 +121,9 @@ class _DurableWriter(io.BufferedWriter):
 
 
 class _OutputFile(io.FileIO):
-    """An unbuffered file whose failures become OutputErrors, also under a library that writes to it.
+    """An unbuffered file whose failures are OutputErrors, also if a library writes to it.
 
-    A process that was forked from its own writes nothing to it: what the two buffer would be there twice.
+    A forked process writes nothing to it; otherwise bytes in the shared buffer would be written twice.
     """
 
     def __init__(self, file: int, output: Path) -> None:
@@ -155,13 +155,13 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     """Check that an output may be written.
 
     Raises:
-        UsageError: it is one of the inputs or in one, a folder, or in none.
+        UsageError: it is an input or a folder, lies in an input folder, or its own folder does not exist.
     """
     refuse_addresses(output)
     try:
         output.lstat()
     except (FileNotFoundError, NotADirectoryError, PermissionError):
-        # said below, or when it is opened
+        # reported below, or when the file is opened
         pass
     except (OSError, ValueError) as error:
         raise UsageError(
@@ -179,10 +179,10 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
 
 
 def refuse_ending(output: Path) -> None:
-    """Check that the name of a log is not that of a file of another kind.
+    """Check that the name of a log does not end like a file of another kind, such as .csv.
 
     Raises:
-        UsageError: it is.
+        UsageError: it does.
     """
     commands = {".csv": "export", ".parquet": "export", ".html": "report", ".json": "", ".jsonl": ""}
     command = commands.get(output.suffix.lower())
@@ -192,10 +192,10 @@ def refuse_ending(output: Path) -> None:
 
 
 def refuse_existing(output: Path) -> None:
-    """Check that an output replaces no recording, which nothing could make again.
+    """Check that an output overwrites no recording, because a recording cannot be repeated.
 
     Raises:
-        UsageError: it is a file with content.
+        UsageError: the file exists and has content.
     """
     if output.is_file() and output.stat().st_size:
         remedy = "give another name, or --overwrite (`overwrite=True`) to replace it"
@@ -214,6 +214,6 @@ def refuse_addresses(output: Path, remedy: str = "write to this machine, and cop
 
 
 def output_error(output: Path, error: OSError) -> OutputError:
-    """Return the error of an output that the machine could not write."""
+    """Return the OutputError of a failed write, with its reason."""
     reason = "no space left on the device" if error.errno == errno.ENOSPC else error.strerror or str(error)
     return OutputError(f"{output} could not be written: {reason}")

@@ -17,13 +17,13 @@ from spatial_replay.text import named_arguments
 from spatial_replay.trace.trace import LATEST_NS
 
 Lost = Literal["drop", "keep"]
-"""Whether rows marked as out of the picture are dropped."""
+"""Handling of rows that are marked as out of the picture."""
 
 OnTimeJump = Literal["error", "split"]
-"""Whether a clock that jumps back, as when a simulation restarts, is an error or ends the log."""
+"""Handling of a clock that jumps back, such as after a restart of a simulation: error, or end of the log."""
 
 FASTEST_RATE = 10**9
-"""Frames a second; at a higher rate, frames would share a nanosecond."""
+"""Highest frame rate, Hz: above it, two frames would share a nanosecond."""
 
 _CHOICES = {"lost": get_args(Lost), "on_time_jump": get_args(OnTimeJump), "concave": get_args(Concave)}
 
@@ -42,7 +42,7 @@ class Reading(TypedDict, total=False):
 
 
 KEYS: Final = tuple(key for key in Reading.__annotations__ if key != "mapping")
-"""Keys of suites and of metadata; a mapping file has a key of its own there."""
+"""Read options in suites and metadata, where `mapping` is a separate key."""
 
 
 @named_arguments
@@ -52,16 +52,15 @@ class ReadOptions:
 
     Attributes:
         concave: how polygons that are not convex are handled: "decompose" or "hull".
-        mapping: a mapping file, which says which topics of an external log carry which objects.
-        on_time_jump: whether a clock of an external log that jumps back is an "error", or ends the log
-            ("split").
-        rate: frames a second of annotations that count frames; 30 unless given.
+        mapping: path of a mapping file, which assigns topics of an external log to objects.
+        on_time_jump: "error", or "split" to end an external log where its clock jumps back.
+        rate: frames per second of annotations that count frames; 30 by default.
         lost: "drop" or "keep" annotations that are marked as lost.
         y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
             default, it points down in drone annotations, and up in all other files.
-        max_lateness: how late messages of an external log may come, such as "2s"; "all" sorts the whole log,
-            which is then in memory.
-        max_gap: longer pauses of samples, or of a mapped topic, are unknown, such as "1s".
+        max_lateness: largest lateness of messages in an external log, such as "2s"; "all" sorts the whole log
+            in memory.
+        max_gap: longest pause, such as "1s"; objects are unknown in longer pauses of samples or their topic.
 
     Raises:
         UsageError: an invalid value.
@@ -91,7 +90,7 @@ class ReadOptions:
             _check_rate(self.rate)
 
     def non_defaults(self) -> dict[str, object]:
-        """Return the options that differ from their defaults, but for `concave`, which every format takes."""
+        """Return the options that differ from their defaults, except `concave`, which all formats accept."""
         return {
             field.name: getattr(self, field.name)
             for field in fields(self)
@@ -99,10 +98,10 @@ class ReadOptions:
         }
 
     def refuse_except(self, accepted: frozenset[str], kind: str, log: str) -> None:
-        """Refuse options that mean nothing to a format.
+        """Refuse options that do not apply to a format.
 
         Raises:
-            UsageError: an option was given that is not in `accepted`.
+            UsageError: an option that is not in `accepted` differs from its default.
         """
         for name, value in self.non_defaults().items():
             if name not in accepted:
@@ -116,10 +115,10 @@ _LATENESS = re.compile(r"(\d{1,9}(?:\.\d{1,9})?)(ms|s)", re.ASCII)
 
 
 def late_ns(text: object) -> int:
-    """Return how late messages may come, from "2s", "500ms" or "all".
+    """Parse a largest lateness, such as "2s", "500ms" or "all", to nanoseconds.
 
     Raises:
-        UsageError: anything else.
+        UsageError: another text.
     """
     late = LATEST_NS if text == "all" else _nanoseconds(text)
     if late is None:
@@ -128,10 +127,10 @@ def late_ns(text: object) -> int:
 
 
 def gap_ns(text: object) -> int | None:
-    """Return the longest pause in which things are known, from "2s" or "500ms"; None for no limit.
+    """Parse a longest pause, such as "2s" or "500ms", to nanoseconds; None for no limit.
 
     Raises:
-        UsageError: anything else.
+        UsageError: another text, or 0.
     """
     gap = _nanoseconds(text)
     if text is not None and not gap:
@@ -161,7 +160,7 @@ _REASONS = {
 
 
 def _option(name: str, value: object) -> str:
-    """Return an option as given on the command line, and as an argument in Python."""
+    """Return an option as written on the command line and in Python."""
     if name == "mapping":
         return f"--mapping {value} (mapping={value!r})"
     return f"--read {name}={str(value).lower()} ({name}={value!r})"
@@ -175,20 +174,20 @@ def _check_rate(rate: object) -> None:
 
 
 def frame_times(rate: float) -> Fraction:
-    """Return nanoseconds from one frame to the next, exactly; a rate of 29.97 is taken as it is written."""
+    """Return the exact frame period in nanoseconds. The rate counts as written: 29.97 is 2997/100."""
     return Fraction(10**9) / Fraction(repr(float(rate)))
 
 
 MOST_FAULTS = 100
+"""Number of faults of one log that are reported one by one; later faults are only counted."""
 _NUMBER: Final = re.compile(r"\d[\d.,]*")
 _FURTHER: Final = "something else"
-"""How many faults of one log are reported one by one; the others are counted."""
 
 _MORE = re.compile(r"… and (\d+) more faults? of")
 
 
 def count_of(faults: Sequence[str]) -> int:
-    """Count faults, with those that a last line only counts."""
+    """Count faults, including the later faults that the last line counts."""
     uncounted = _MORE.match(faults[-1]) if faults else None
     return len(faults) + (int(uncounted[1]) - 1 if uncounted else 0)
 
@@ -211,7 +210,7 @@ class FaultList:
             self._waiting.append(fault)
 
     def move_to(self, target: FaultList) -> None:
-        """Move the faults not taken yet to another list, with the count of those beyond the limit."""
+        """Move pending faults to another list; add the number of faults beyond the limit to its count."""
         for fault in self.take():
             target.add(fault)
         beyond = max(0, self._count - MOST_FAULTS)
@@ -219,7 +218,7 @@ class FaultList:
         self._moved = beyond
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return the faults since the last call; with `last`, a line that counts those beyond the limit."""
+        """Return the faults since the last call. With `last`, add a line that counts the later faults."""
         faults, self._waiting = self._waiting, []
         if last and self._count > MOST_FAULTS:
             more = self._count - MOST_FAULTS
@@ -228,9 +227,9 @@ class FaultList:
 
 
 class FaultKinds(FaultList):
-    """Faults of a run that goes on: the first of each kind is a line, the others are counted for the end.
+    """Faults of a live run. The first fault of a kind is a line; its repetitions are counted until the end.
 
-    Remarks are of one kind if they are of one topic and their texts differ in numbers alone.
+    Two faults are of one kind if their topics are equal and their texts differ only in numbers.
     """
 
     def __init__(self) -> None:
@@ -251,7 +250,7 @@ class FaultKinds(FaultList):
             self._more[_FURTHER] += 1
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return the first faults of kinds since the last call; with `last`, also how many more."""
+        """Return the first fault of each new kind. With `last`, add a count of repetitions for each kind."""
         faults = super().take()
         if not last:
             return faults

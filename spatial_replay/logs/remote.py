@@ -1,4 +1,4 @@
-"""Logs at addresses: ranges of their bytes, whole copies on this machine, and folders in buckets."""
+"""Logs at addresses: byte ranges, downloads, and folders in buckets."""
 
 from __future__ import annotations
 
@@ -38,17 +38,18 @@ from spatial_replay.errors import (
 from spatial_replay.logs.output_file import output_error
 
 Range: TypeAlias = tuple[int, int]
-"""Bytes from the first up to, not including, the second."""
+"""Byte range [begin, end)."""
 
 _BATCH_BYTES: Final = 2**26
-"""Largest amount that is read at once. Longer reads begin with smaller batches, and read one ahead."""
+"""Largest batch, bytes. Longer reads are split into batches that grow from a 32nd to half of this size."""
 MOST_HELD_BYTES: Final = 2**28
+"""Size of the cache of a remote file, bytes."""
 _WASTE: Final = 0.08
-"""The share of bytes that may be read between ranges, unused, to save requests."""
+"""Largest share of unused bytes, which are read between ranges to save requests."""
 
 
 class RangeStream(io.RawIOBase):
-    """A position in a file, and the ranges that are going to be read from it, in batches."""
+    """A stream of a remote file, which fetches planned ranges in batches."""
 
     def __init__(self, file: RemoteFile) -> None:
         super().__init__()
@@ -60,14 +61,15 @@ class RangeStream(io.RawIOBase):
         self._thread: ThreadPoolExecutor | None = None
 
     def plan(self, ranges: Iterable[Range]) -> None:
-        """Announce which ranges are going to be read, in this order.
+        """Announce the next ranges to be read, in their order.
 
-        They are fetched in batches when the first of them is read, and one batch ahead.
+        A batch is fetched when one of its ranges is read. From the second batch on, the next batch is fetched
+        in advance.
         """
         batch, size, most = list[Range](), 0, _BATCH_BYTES
         in_order = list(ranges)
         if sum(end - begin for begin, end in in_order) > _BATCH_BYTES:
-            # the reader may stop after the first messages
+            # a small first batch, because the reader may stop after the first messages
             most = _BATCH_BYTES // 32
         for begin, end in in_order:
             batch.append((begin, end))
@@ -106,7 +108,7 @@ class RangeStream(io.RawIOBase):
     def _fetch(self, batch: int) -> None:
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "remote-batches")
-        # not ahead of the first one: a search for the first sample needs no other
+        # the first batch is fetched alone, because a search for the first sample needs no other
         for number in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
             if number not in self._fetching:
                 self._fetching[number] = self._thread.submit(self._file.fetch, self._batches[number])
@@ -124,10 +126,10 @@ def each_ahead(
     most: int = 0,
     size: Callable[[_Item], int] = lambda _: 1,
 ) -> Iterator[_Read]:
-    """Yield what a function reads for each item, in order, while threads read the next ones.
+    """Yield `read(item)` of each item, in order, while threads read the next items.
 
-    As many as there are threads are always read ahead. More are as long as their sizes together are neither
-    above `most` nor above twice what was yielded: a caller that takes only the first item reads few.
+    One item per thread is always read ahead. Further items are read ahead while their total size is at most
+    `most`, and at most twice the yielded size. So a caller that takes only the first item reads few items.
     """
     threads = ThreadPoolExecutor(at_once, "reading-ahead")
     waiting: deque[tuple[int, Future[_Read]]] = deque()
@@ -144,18 +146,18 @@ def each_ahead(
         while waiting:
             yield waiting.popleft()[1].result()
     finally:
-        # garbage collection may end this within the start of any thread, which must not wait for another one
+        # garbage collection may close this generator while a thread starts, which must not wait for threads
         threads.shutdown(wait=False, cancel_futures=True)
 
 
 def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
-    """Announce the ranges that are going to be read from a stream, if it is of a remote file."""
+    """Announce the next ranges to be read from a stream of a remote file; do nothing for other streams."""
     if isinstance(stream, RangeStream):
         stream.plan(ranges)
 
 
 def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
-    """Return ranges in order, joined over the smallest gaps as long as these add up to little."""
+    """Return sorted ranges, joined over the smallest gaps, whose sum is at most `_WASTE` of the ranges."""
     ordered = sorted(span for span in ranges if span[1] > span[0])
     needed_bytes = sum(end - begin for begin, end in ordered)
     gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
@@ -175,7 +177,7 @@ def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
 
 
 class HeldBytes:
-    """Parts of a file that do not overlap; the oldest are dropped when there are too many."""
+    """Cached parts of a file, without overlap; the oldest are evicted above `MOST_HELD_BYTES`."""
 
     def __init__(self) -> None:
         self._begins: list[int] = []
@@ -192,13 +194,13 @@ class HeldBytes:
         return [*gaps, (begin, end)] if begin < end else gaps
 
     def read(self, begin: int, end: int) -> bytes:
-        """Return a range that is held."""
+        """Return the bytes of a range that is held."""
         return b"".join(
             data[max(begin - start, 0) : end - start] for start, data in self._overlapping(begin, end)
         )
 
     def add(self, begin: int, data: bytes) -> None:
-        """Take in what is not held of a part."""
+        """Store the bytes of a part that are not held yet."""
         for start, end in self.missing(begin, begin + len(data)):
             self._begins.insert(bisect_right(self._begins, start), start)
             self._parts[start] = data[start - begin : end - begin]
@@ -209,7 +211,7 @@ class HeldBytes:
             self._begins.remove(oldest)
 
     def _overlapping(self, begin: int, end: int) -> list[tuple[int, bytes]]:
-        """Return the parts that reach into a range, in order, with where they begin."""
+        """Return the parts that overlap a range, in order, each with its offset in the file."""
         first = max(bisect_right(self._begins, begin) - 1, 0)
         parts = (
             (start, self._parts[start]) for start in self._begins[first : bisect_left(self._begins, end)]
@@ -227,25 +229,27 @@ _CREDENTIALS: Final = {
 """Remedies for denied access, by the scheme of an address."""
 
 _SETTINGS: Final = ("AWS_", "GOOGLE_", "AZURE_")
-"""How the names of the environment variables begin that the services' libraries read."""
+"""Prefixes of the environment variables that configure access to buckets."""
 
 BAG_METADATA: Final = "metadata.yaml"
-"""The file that makes a folder a ROS 2 bag, and lists its other files."""
+"""Metadata file in the folder of a ROS 2 bag, which lists the other files."""
 _REASONS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "request or response body error": "the connection breaks off",
         "error sending request": "the server does not answer",
     }
 )
-"""Plain words for the library's messages."""
+"""Plain words for messages of obstore."""
 WEB_SCHEMES: Final = ("http", "https")
 
 _TAIL_BYTES: Final = 2**19
-"""Bytes at the end of a file that are read first: the index of a log of a gigabyte mostly fits."""
+"""First read at the end of a file, bytes; mostly holds the whole index of a log of a gigabyte."""
 _HEAD_BYTES: Final = 2**16
-"""Bytes at its beginning that are read at the same time: the format, and what was written first."""
+"""First read at the beginning of a file, bytes: its format and first records."""
 _LEAST_BYTES: Final = 2**16
+"""Smallest read, bytes, except at the end of the file."""
 _PIECE_BYTES: Final = 2**23
+"""Largest request, bytes."""
 _AT_ONCE: Final = 32
 _ATTEMPTS: Final = 3
 _RETRIES: Final[Any] = {
@@ -257,7 +261,7 @@ _CLIENT: Final[Any] = {"allow_http": True, "connect_timeout": "10s", "timeout": 
 
 
 def is_address(path: object) -> bool:
-    """Return whether a path is an address of another machine."""
+    """Return whether a path is an address, such as s3://bucket/run.mcap."""
     return isinstance(path, RemoteFile) or (
         isinstance(path, str) and path.partition("://")[0] in _CREDENTIALS
     )
@@ -269,7 +273,7 @@ def is_web(file: PathLike[str]) -> bool:
 
 
 def log_file(path: str | PathLike[str]) -> LogFile:
-    """Return the file of a path or an address; a folder at an address is a ROS 2 bag, known by its metadata.
+    """Return the file of a path or an address; an address that ends with "/" is the folder of a ROS 2 bag.
 
     Raises:
         UsageError: an address without a name, or obstore is not installed.
@@ -283,12 +287,12 @@ def log_file(path: str | PathLike[str]) -> LogFile:
 
 
 def sendable(path: str | PathLike[str]) -> Path | str:
-    """Return a file as other processes take it: the text of an address opens nothing."""
+    """Return a file in a form for other processes: an address is sent as text, without a connection."""
     return fspath(path) if is_address(path) else Path(path)
 
 
 def local_files(paths: Iterable[str | PathLike[str]]) -> list[Path]:
-    """Return the paths among some that are on this machine."""
+    """Return the paths that are on this machine, without addresses."""
     return [Path(path) for path in paths if not is_address(path)]
 
 
@@ -297,9 +301,9 @@ class FileVersion:
     """Identity of the content of a remote file.
 
     Attributes:
-        size: in bytes.
-        tag: changes with the content; None if the server gives none.
-        has_ranges: whether the server gives parts of it.
+        size: size in bytes.
+        tag: entity tag or date of the content; None if the server gives neither.
+        has_ranges: whether the server answers range requests.
     """
 
     size: int
@@ -308,27 +312,28 @@ class FileVersion:
 
     @property
     def is_exact(self) -> bool:
-        """Whether an equal version has equal bytes: a date or a weak tag does not promise that."""
+        """Whether equal versions have equal bytes, which only a strong entity tag guarantees."""
+        # a weak tag begins with W/: https://www.rfc-editor.org/rfc/rfc9110#section-8.8.3
         return self.tag is not None and self.tag.startswith('"')
 
 
 class RemoteFile(PathLike[str]):
-    """A file at an address. Holds its version and, up to 256 MiB, what was read of it lately.
+    """A file at an address, with its version and a cache of at most 256 MiB.
 
-    A change after the first read is an error, never a mixture of two versions. Several threads may use it.
+    A change of the file after the first read is an error; two versions are never mixed. It is thread-safe.
     """
 
     def __init__(self, address: str) -> None:
-        """Take an address; nothing is read yet.
+        """Store an address; nothing is read yet.
 
         Raises:
-            UsageError: it has no name, or obstore is not installed.
+            UsageError: the address names no file, or obstore is not installed.
         """
         parts = urlsplit(address)
         self._scheme = parts.scheme
         self._address = address
         if self._scheme in WEB_SCHEMES:
-            # what follows the path may be a signature, which is a secret
+            # the query after the path may be a signature, which is a secret
             self._shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
             self._key, bucket, name = "", address, unquote(parts.path).rpartition("/")[2]
         else:
@@ -358,7 +363,7 @@ class RemoteFile(PathLike[str]):
 
     @property
     def version(self) -> FileVersion:
-        """Its version, known from the first read on: one of its end, and of its beginning at the same time.
+        """Version at the first read, which reads the end and the beginning of the file in parallel.
 
         Raises:
             MissingFileError: there is no such file, or access is denied.
@@ -371,11 +376,11 @@ class RemoteFile(PathLike[str]):
 
     @property
     def size(self) -> int:
-        """In bytes; see `version` for what is raised."""
+        """Size in bytes; raises the errors of `version`."""
         return self.version.size
 
     def current_version(self) -> FileVersion:
-        """Return the version, without a look at the content where the server can.
+        """Request the version without the content; return `version` if the server refuses that.
 
         Raises:
             MissingFileError, RemoteError: it cannot be read.
@@ -383,15 +388,15 @@ class RemoteFile(PathLike[str]):
         try:
             return self._version_of(self._get({"head": True}).meta)
         except SpatialReplayError:
-            # a signed address is for reading alone
+            # a signed address may allow GET only, not HEAD
             return self.version
 
     def open(self) -> BinaryIO:
-        """Open it for reading, from any number of streams."""
+        """Open a new stream for reading."""
         return cast(BinaryIO, RangeStream(self))
 
     def read(self, begin: int, end: int) -> bytes:
-        """Return a range of its bytes, less where it ends before that.
+        """Return the bytes of a range; fewer at the end of the file.
 
         Raises:
             MissingFileError, RemoteError: it cannot be read, or has changed.
@@ -409,7 +414,7 @@ class RemoteFile(PathLike[str]):
             self.fetch([(first, min(max(last, first + _LEAST_BYTES), self.version.size))])
 
     def fetch(self, ranges: Iterable[Range]) -> None:
-        """Read ranges that are not held yet: joined where they are near, all at the same time."""
+        """Read the missing parts of ranges in parallel; nearby parts are joined."""
         with self._lock:
             missing = [gap for begin, end in ranges for gap in self._held.missing(begin, end)]
         pieces = [
@@ -422,11 +427,11 @@ class RemoteFile(PathLike[str]):
                 self._held.add(begin, data)
 
     def iter_pieces(self, pieces: Sequence[Range], at_once: int = _AT_ONCE) -> Iterator[bytes]:
-        """Read ranges at the same time, and yield the bytes of each in their order; none of them is held."""
+        """Read ranges in parallel, and yield their bytes in order, without caching them."""
         return each_ahead(self._range, pieces, at_once)
 
     def iter_whole(self) -> Iterator[bytes]:
-        """Read the file from its beginning to its end, in parts."""
+        """Read the whole file in parts, in order."""
         version = self.version
         if version.has_ranges:
             bounds = range(0, version.size, _PIECE_BYTES)
@@ -439,7 +444,7 @@ class RemoteFile(PathLike[str]):
             raise store_failure(self._shown, self._scheme, error) from None
 
     def _read_ends(self) -> FileVersion:
-        """Read the end and the beginning."""
+        """Read the end and the beginning in parallel; return the version."""
         with ThreadPoolExecutor(1, "remote-reading") as thread:
             head = thread.submit(self._part, {"range": (0, _HEAD_BYTES)})
             try:
@@ -454,7 +459,7 @@ class RemoteFile(PathLike[str]):
         return version
 
     def _without_suffix(self, head: Future[tuple[FileVersion, int, bytes]]) -> FileVersion:
-        """Return the version where the end cannot be asked for (Azure), or no range at all."""
+        """Return the version from a server that refuses suffix ranges (Azure), or all ranges."""
         try:
             version, _, beginning = head.result()
         except self._obstore.exceptions.NotSupportedError:
@@ -465,9 +470,10 @@ class RemoteFile(PathLike[str]):
         return version
 
     def _range(self, requested: Range) -> bytes:
-        """Read a range of the version that is known."""
+        """Read a range of the version of the first read."""
         version_before = self._version
-        # a weak tag never fits; then the answer's own tag is compared
+        # If-Match refuses weak tags, so the tag of the answer is compared too:
+        # https://www.rfc-editor.org/rfc/rfc9110#section-13.1.1
         strong = {"if_match": version_before.tag} if version_before and version_before.is_exact else {}
         version, _, data = self._part({"range": requested, **strong})
         if version != version_before or len(data) != requested[1] - requested[0]:
@@ -475,7 +481,7 @@ class RemoteFile(PathLike[str]):
         return data
 
     def _part(self, options: dict[str, Any]) -> tuple[FileVersion, int, bytes]:
-        """Return the version of an answer, where its bytes begin, and these."""
+        """Request a part; return the version, the offset of its bytes, and the bytes."""
         for attempt in range(1, _ATTEMPTS + 1):
             answer = self._get(options)
             try:
@@ -485,7 +491,7 @@ class RemoteFile(PathLike[str]):
                 error: Exception = EOFError("the connection breaks off")
             except self._obstore.exceptions.BaseError as failure:
                 error = failure
-            # requests are repeated by the library, answers that break off here
+            # obstore repeats failed requests, but not answers that break off
             if attempt == _ATTEMPTS:
                 raise store_failure(self._shown, self._scheme, error) from None
         raise AssertionError
@@ -504,7 +510,7 @@ class RemoteFile(PathLike[str]):
     @staticmethod
     def _version_of(meta: Any, *, has_ranges: bool = True) -> FileVersion:
         modified = meta["last_modified"]
-        # without a date, the library gives the epoch
+        # obstore gives the epoch for an answer without a date
         dated = modified.isoformat() if modified and modified.timestamp() > 0 else None
         return FileVersion(meta["size"], meta["e_tag"] or dated, has_ranges)
 
@@ -540,12 +546,12 @@ def obstore_library() -> Any:
 
 
 def open_store(scheme: str, bucket: str) -> Any:
-    """Return the store of a bucket or container, or of the address of a web server; nothing is read yet.
+    """Return the store of a bucket, a container or a web address; nothing is read yet.
 
-    A process has one store for each bucket, whose connections are used again.
+    A process has one store for each bucket, to reuse its connections.
 
     Raises:
-        RemoteError: it cannot be one.
+        RemoteError: obstore refuses the name or the settings.
     """
     settings = tuple(sorted(setting for setting in os.environ.items() if setting[0].startswith(_SETTINGS)))
     return _store(scheme, bucket, settings)
@@ -553,7 +559,7 @@ def open_store(scheme: str, bucket: str) -> Any:
 
 @lru_cache(maxsize=32)
 def _store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> Any:
-    """Return the store of a bucket, which reads these settings from the environment."""
+    """Return the store of a bucket; it reads the environment, so `settings` are only a cache key."""
     stores = obstore_library().store
     options: dict[str, Any] = {"client_options": _CLIENT, "retry_config": _RETRIES}
     open_bucket = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)
@@ -569,7 +575,7 @@ _EMPTY_PART: Final = "cannot be read: // or a leading / in its key; copy it to a
 
 
 def _refuse_empty_parts(address: str, key: str) -> None:
-    """Refuse a key that the library cannot read, or reads as another one.
+    """Refuse a key that obstore cannot read or reads as another key.
 
     Raises:
         UsageError: the key has an empty part.
@@ -579,7 +585,7 @@ def _refuse_empty_parts(address: str, key: str) -> None:
 
 
 def store_failure(address: str, scheme: str, error: Exception, action: str = "read") -> SpatialReplayError:
-    """Return the error for an address that cannot be read or written, with what helps."""
+    """Return the error for a failed read or write at an address, with a remedy."""
     exceptions = obstore_library().exceptions
     if isinstance(error, FileNotFoundError):
         return MissingFileError(f"{address}: there is no such file; check the address")
@@ -606,13 +612,13 @@ _DEFAULT_GIGABYTES: Final = 20.0
 
 
 Show: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
-"""Shows some work, given what it is called and how many steps it has; what comes out counts them."""
+"""Progress factory: (label, total) → context manager that yields `advance(steps)`."""
 _shows: Final[ContextVar[Show | None]] = ContextVar("shows", default=None)
 
 
 @contextmanager
 def showing_downloads(show: Show) -> Iterator[None]:
-    """Show the bytes of downloads, while this lasts, in the thread that asks for it."""
+    """Show the progress of downloads of this thread, as a context."""
     before = _shows.set(show)
     try:
         yield
@@ -621,41 +627,40 @@ def showing_downloads(show: Show) -> Iterator[None]:
 
 
 def local_copy(path: str | PathLike[str]) -> Path:
-    """Return a path as it is, and of a small file at an address, such as a specification, a copy.
+    """Return a local path unchanged, or a local copy of a small file at an address, such as a specification.
 
     Raises:
         UsageError: an address that names no file, or obstore is not installed.
-        LogError: it is larger than all copies may be.
+        LogError: the file exceeds the limit of all copies.
         MissingFileError, RemoteError: it cannot be read.
-        OutputError: the disk cannot take it.
+        OutputError: the copy cannot be written.
     """
     file = log_file(path)
     return download(file) if isinstance(file, RemoteFile) else file
 
 
 def download(file: RemoteFile, reason: str = "") -> Path:
-    """Return a copy of a remote file on this machine, which is made once for each version of it.
+    """Return a local copy of a remote file; each version is downloaded once.
 
-    The oldest copies are removed when all together exceed 20 GB, or SPATIAL_REPLAY_DOWNLOADS gigabytes.
+    The least recently used copies are removed above 20 GB, or SPATIAL_REPLAY_DOWNLOADS gigabytes.
 
     Args:
-        reason: why it is not read in parts, for the message that says that it is downloaded; without one,
-            there is none.
+        reason: reason for the download, for a warning; "" for no warning.
 
     Raises:
-        LogError: it is larger than all copies may be.
+        LogError: the file exceeds the limit of all copies.
         MissingFileError, RemoteError: it cannot be read.
-        OutputError: the disk cannot take it.
+        OutputError: the copy cannot be written.
     """
     return download_files([file], str(file), reason) / _name(file)
 
 
 def download_files(files: Sequence[RemoteFile], address: str, reason: str, below: str = "") -> Path:
-    """Return the folder that holds copies of remote files; see `download`.
+    """Return a local folder with copies of remote files; see `download`.
 
     Args:
-        address: of the folder, for messages.
-        below: the name of the folder, if it matters.
+        address: address of the remote folder, for messages.
+        below: name of the local folder; "" for any name.
     """
     versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
@@ -717,7 +722,7 @@ def _write(file: RemoteFile, copy: Path, advance: Callable[[int], None]) -> None
 
 
 def _make_room(parent: Path, room: int) -> None:
-    """Remove the copies that were not used for longest, until the others fit."""
+    """Remove the least recently used copies until the others fit into `room` bytes."""
     copies = []
     for folder in parent.iterdir():
         with suppress(OSError):
@@ -732,23 +737,23 @@ def _make_room(parent: Path, room: int) -> None:
 
 
 def user_cache_folder(name: str) -> Path:
-    """Return the folder of this name among what the user's programs may keep.
+    """Return a folder in the cache of the user.
 
     Raises:
         RuntimeError: the user has no home folder.
     """
     if folder := os.environ.get("SPATIAL_REPLAY_CACHE"):
         return Path(folder).absolute() / name
-    # the XDG specification has a relative path ignored
+    # relative paths are ignored: https://specifications.freedesktop.org/basedir-spec/latest/
     parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (parent if parent.is_absolute() else Path.home() / ".cache") / "spatial-replay" / name
 
 
 def gigabytes(variable: str, otherwise: float) -> int:
-    """Return the bytes that a variable of the environment names in gigabytes.
+    """Return the bytes of an environment variable in gigabytes.
 
     Raises:
-        UsageError: it is not a number from 0 on.
+        UsageError: the variable is not a number of at least 0.
     """
     text = os.environ.get(variable, str(otherwise))
     try:
@@ -764,16 +769,16 @@ _FILES_AT_ONCE: Final = 32
 
 
 class RemoteFolder:
-    """A folder in a bucket. A file is written by one put, so it is whole or not there.
+    """A folder in a bucket. One request writes a whole file, so there are no partial files.
 
-    Names of files are relative to the folder. Several threads may use it.
+    Names of files are relative to the folder. It is thread-safe.
     """
 
     def __init__(self, address: str) -> None:
-        """Take an address such as "s3://bucket/folder/"; nothing is read yet.
+        """Store an address such as "s3://bucket/folder/"; nothing is read yet.
 
         Raises:
-            UsageError: a web server, no bucket, or obstore is not installed.
+            UsageError: a web address, an address without a bucket, or obstore is not installed.
         """
         self._scheme, _, rest = address.partition("://")
         if self._scheme in WEB_SCHEMES:
@@ -795,31 +800,32 @@ class RemoteFolder:
         return self.location
 
     def exists(self) -> bool:
-        """Return whether there is a file in it."""
+        """Return whether the folder holds a file."""
         return next(self._keys(""), None) is not None
 
     def names(self, below: str = "") -> list[str]:
-        """Return the names of all files in it, or in a folder below, in order.
+        """Return the sorted names of all files in the folder, or in its folder `below`.
 
         Raises:
-            MissingFileError, RemoteError: it cannot be listed.
+            MissingFileError, RemoteError: the folder cannot be listed.
         """
         return sorted(key.removeprefix(self._prefix) for key in self._keys(below))
 
     def read(self, names: Sequence[str]) -> Iterator[bytes]:
-        """Read files, several at the same time, and yield the content of each in their order.
+        """Read files in parallel, and yield their contents in order.
 
         Raises:
-            MissingFileError: one is not there; it may have been joined with others by another batch.
-                UsageError, RemoteError: one cannot be read.
+            MissingFileError: a file is missing; another batch may have joined it with others.
+            UsageError: access is denied, or there is no such bucket.
+            RemoteError: a file cannot be read.
         """
         return each_ahead(self._read, names, _FILES_AT_ONCE)
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, which is whole or, where that fails, as before.
+        """Write a file; after a failure, its previous content is unchanged.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         try:
             self._library.put(self._store, self._prefix + name, data)
@@ -828,10 +834,10 @@ class RemoteFolder:
             raise OutputError(str(store_failure(address, self._scheme, error, "written"))) from None
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files; one that is gone already is no error.
+        """Remove files; a missing file is no error.
 
         Raises:
-            OutputError: one cannot be removed.
+            OutputError: a file cannot be removed.
         """
         keys = [self._prefix + name for name in names]
         try:
@@ -859,10 +865,10 @@ class RemoteFolder:
 
 
 def matching_addresses(pattern: str) -> list[str]:
-    """Return the addresses of a bucket or container that fit a pattern, in order.
+    """Return the sorted addresses of files in a bucket or container that match a pattern.
 
     Args:
-        pattern: such as "s3://fleet/2026-11/*.mcap"; an end in "/" stands for everything below.
+        pattern: such as "s3://fleet/2026-11/*.mcap"; a pattern that ends with "/" matches all files below.
 
     Raises:
         UsageError: a web server cannot list its files.

@@ -21,19 +21,19 @@ from spatial_replay.trace.track_evidence import TrackEvidence
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 BLOCK_SAMPLES = 12_288
-"""A block holds at most this many samples, so that memory stays bounded whatever the log's length."""
+"""Most samples of a block; the limit bounds memory for logs of any length."""
 
 
 SAMPLES_A_GAP: Final = 10
-"""Samples that fill a gap of the length that is allowed."""
+"""Number of samples inserted in a gap, per `max_gap_ns`."""
 _MOST_IN_GAP = 10_000
-"""Samples that fill one gap."""
+"""Number of samples inserted in one gap, about at most."""
 
 IterBlocks = Callable[..., Iterator[Block]]
 
 
 def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
-    """Let `iter_blocks` of a source remark pauses and steps back, and fill pauses beyond its `max_gap_ns`."""
+    """Decorate `iter_blocks`: fill pauses beyond `max_gap_ns`, remark on pauses and on steps back in time."""
 
     @wraps(iter_blocks)
     def wrapper(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
@@ -60,7 +60,7 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
     """Fill gaps between samples with samples in which every object and signal is unknown.
 
     Args:
-        before: the sample before those of `trace`, or none.
+        before: the last sample before `trace`; empty at the beginning of the log.
     """
     times = np.concatenate([before.times_ns, trace.times_ns])
     gaps = np.flatnonzero(np.diff(times) > max_gap_ns).tolist()
@@ -70,7 +70,7 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
         last = trace.slice(begin - 1, begin) if begin else before
         first_ns, next_ns = times[gap : gap + 2].tolist()
         step_ns = max(max_gap_ns // SAMPLES_A_GAP, (next_ns - first_ns) // _MOST_IN_GAP, 1)
-        # right after the last sample, and right before the next one
+        # also 1 ns from both neighbours, so that objects are unknown in the whole gap
         steps = np.union1d(np.arange(first_ns + step_ns, next_ns, step_ns), [first_ns + 1, next_ns - 1])
         rows = np.repeat(np.where(last.rows >= 0, -2 - last.rows, last.rows), len(steps), axis=0)
         signals = {name: np.full(len(steps), np.nan) for name in last.signals}
@@ -104,45 +104,45 @@ class Source:
 
     @property
     def kind(self) -> str:
-        """The format, in a word."""
+        """Name of the format."""
         raise NotImplementedError
 
     @property
     def axes(self) -> Axes:
-        """Axes of the source, or of what a log was recorded from; its samples have ours."""
+        """Axes of the source, or of the source that a log was recorded from. Samples use `OUR_AXES`."""
         return OUR_AXES
 
     @property
     def options(self) -> Mapping[str, object]:
-        """The options of reading that are not the defaults, for a log's metadata."""
+        """Read options that differ from the defaults, for the metadata of a log."""
         return {}
 
     @property
     def max_gap_ns(self) -> int | None:
-        """Objects and signals are unknown in a longer pause; None for no limit."""
+        """Longest pause; objects and signals are unknown in a longer one. None for no limit."""
         return None
 
     @property
     def begin_ns(self) -> int | None:
-        """A time before the first sample, close to it, if that is known without reading the samples."""
+        """A close lower bound of the first sample's time; None if that takes reading the samples."""
         return None
 
     def keeping(self, keep: tuple[str, ...] = ()) -> Source:
-        """Return a source that reads its samples and, beside them, only messages of some topics.
+        """Return a source that reads its samples, and other messages only on topics to keep.
 
         Args:
-            keep: as `is_kept` takes them.
+            keep: topic patterns, see `is_kept`.
         """
         return self
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """Return the samples from the first at or after `start_ns` to the last before `end_ns`.
+        """Iterate over the samples with times in [start_ns, end_ns).
 
-        Unreadable parts are in `trace.faults` of the blocks; the last block may hold nothing else.
+        Unreadable parts are in `trace.faults` of the blocks; the last block may hold faults only.
 
         Raises:
-            LogError: nothing in the log can be read as a sample.
-            UsageError: a log without damage that has no topic for samples.
+            LogError: the log has no readable sample.
+            UsageError: the log is undamaged, but has no topic of samples.
         """
         raise NotImplementedError
 
@@ -165,7 +165,7 @@ class MemorySource(Source):
 
     @property
     def axes(self) -> Axes:
-        """Ours, with the units that the trace declares."""
+        """`OUR_AXES` with the units of the trace."""
         return Axes.of_units(self.trace.units)
 
     @classmethod
@@ -219,7 +219,7 @@ class TrackSource(FileSource):
     """A track file.
 
     Attributes:
-        axes: those of the file; samples have ours.
+        axes: axes of the file; samples use `OUR_AXES`.
     """
 
     _: KW_ONLY
@@ -252,7 +252,7 @@ class TrackSource(FileSource):
 
 @dataclass(frozen=True)
 class SourceOf(Source):
-    """Attributes that a derived source takes from its original: everything but its blocks."""
+    """A derived source, which has the attributes of its original but other blocks."""
 
     source: Source
 
@@ -283,7 +283,7 @@ def read_blocks(
     """Yield the blocks of a source, as `Source.iter_blocks` does.
 
     Raises:
-        LogError: what that raises, and if the disk fails or is gone.
+        LogError: an error of `Source.iter_blocks`, or of the disk.
     """
     try:
         yield from source.iter_blocks(start_ns, end_ns)
@@ -293,9 +293,9 @@ def read_blocks(
 
 
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
-    """Yield the same blocks, from the third on each read while the previous one is processed.
+    """Yield the blocks unchanged. From the third on, a thread reads the next block in advance.
 
-    A short log has one or two, and starting a thread takes longer than reading them.
+    A short log has one or two blocks, and reading them takes less time than starting a thread.
     """
     for _ in range(2):
         first = next(blocks, None)

@@ -1,4 +1,4 @@
-"""Names in logs: topics, metadata records and attachments, and channels that have a meaning."""
+"""Names of topics, metadata records and attachments in logs; channels with these topics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 OWN_PREFIX = "/spatial/"
-"""Topics of ours; a log has them in chunks of their own."""
+"""Prefix of our topics, which a log stores in separate chunks."""
 
 OBJECTS = "/spatial/objects"
 OBJECTS_TYPE = "spatial_replay.ObjectStates"
@@ -44,28 +44,28 @@ _DERIVED_TYPES: Final = MappingProxyType(
     }
 )
 DERIVED = frozenset(_DERIVED_TYPES)
-"""Topics computed from the samples and a specification: a replay replaces them."""
+"""Topics computed from the samples and a specification; a replay replaces them."""
 
 
 def has_our_type(channel: Channel) -> bool:
-    """Return whether a channel has the messages that we write on its topic, one of `OBJECTS` or `DERIVED`."""
+    """Return whether a channel on `OBJECTS` or a `DERIVED` topic has the message type that we write there."""
     type_name = OBJECTS_TYPE if channel.topic == OBJECTS else _DERIVED_TYPES.get(channel.topic)
     schema = channel.schema.name if channel.schema else ""
     return (channel.encoding, schema) == ("protobuf", type_name)
 
 
 ORIGINAL_PREFIX = "/original"
-"""Begins the topic on which a copy has the messages that others wrote on one of our topics."""
+"""Topic prefix in copies, for messages of other programs on one of our topics."""
 
 
 def copied_channel(channel: Channel) -> Channel:
-    """Return the channel on which a copy has messages that others wrote: not on a topic of ours."""
+    """Return the channel of another program's messages in a copy: our topics get `ORIGINAL_PREFIX`."""
     is_ours = channel.topic == OBJECTS or channel.topic in DERIVED
     return replace(channel, topic=ORIGINAL_PREFIX + channel.topic) if is_ours else channel
 
 
 def remarks_on_copies(name: str, channels: Iterable[Channel]) -> list[str]:
-    """Return remarks on channels of a log that a copy has on another topic."""
+    """Return remarks on channels of a log whose topics are renamed in a copy."""
     topics = {channel.topic for channel in channels if copied_channel(channel) != channel}
     return [
         f"{name}: a copy has its messages on {topic} on {ORIGINAL_PREFIX}{topic},"
@@ -86,17 +86,17 @@ REDONE_MAP = "/plan/redone/gradient_map"
 REDONE_PATH = "/plan/redone/path"
 REDONE_DRAWING = "/plan/redone/map_drawing"
 BEHAVIOUR_TREE = "/plan/behaviour_tree"
-"""Topics that a planner writes, what it would have decided otherwise, and the robot; a replay copies them."""
+"""Topics of a planner, of its recomputed decisions, and of the robot; a replay copies them."""
 
 CAMERA_VIDEO = "/camera/video"
 CAMERA_ANNOTATIONS = "/camera/annotations"
 CAMERA_CALIBRATION = "/camera/calibration"
 CAMERA_FRAMES = "/tf"
-"""Topics of a run that a camera saw; a replay copies them."""
+"""Topics of a run with a camera; a replay copies them."""
 
 
 def topic_of_camera(topic: str, number: int) -> str:
-    """Return the topic of one of several cameras, from 1: `/camera/video`, `/camera2/video`."""
+    """Return a topic for the number of a camera, from 1: `/camera/video`, `/camera2/video`."""
     return topic if number == 1 else topic.replace("/camera/", f"/camera{number}/", 1)
 
 
@@ -104,40 +104,40 @@ MAGIC = b"\x89MCAP0\r\n"
 """The first bytes of an MCAP file, and the last."""
 
 LIBRARY = "spatial-replay"
-"""How our writer names itself in the header of a log."""
+"""Library name in the header of our logs."""
 
 METADATA = "spatial_replay"
-"""The metadata record that comes first: who wrote the log, from what, with which options."""
+"""The first metadata record: writer, source and options of the log."""
 
 ZERO = "zero_ns"
-"""Its entry of the time that texts about the log count from; without it, they count from the first sample."""
+"""Key in `METADATA`: time zero of texts about the log; by default, the time of the first sample."""
 
 ENDING = "spatial_replay_ending"
-"""The metadata record at the end of a recording: how many samples it holds, and how it ended."""
+"""The metadata record at the end of a recording: number of samples, and how it ended."""
 
 TRIGGER = "spatial_replay_trigger"
-"""The metadata record of a clip: what fired, when, and how much around it was asked for and held."""
+"""The metadata record of a clip: its trigger and time, and the requested and available time around it."""
 
 CERTIFICATE = "spatial_replay_certificate"
-"""The metadata record that comes last: hashes of inputs and results."""
+"""The last metadata record: hashes of inputs and results."""
 
 PLAN_METADATA = "spatial_replay_plan"
-"""The metadata record with the settings and the specification that a planner's decisions depend on."""
+"""The metadata record with the settings and the specification of a planner."""
 
 RECOVERY = "spatial_replay_recovery"
-"""The metadata record of a log that was recovered from a damaged one: what is missing in it."""
+"""The metadata record of a log that was recovered from a damaged one: source and losses."""
 
 VERDICTS = "spatial_replay_verdicts"
 """The metadata record with the verdict and robustness of each result of a replay."""
 
 DOUBTS = "spatial_replay_doubts"
-"""The metadata record with the assumptions that a log's source contradicts; see `Doubt`."""
+"""The metadata record with assumptions that the source of the log contradicts; see `Doubt`."""
 
 AUTOMATA = "spatial_replay_automata"
-"""The metadata record with the sizes of automata, and why a specification has none."""
+"""The metadata record with the sizes of automata, or the reason why a specification has none."""
 
 AUTOMATA_PREFIX = "automata/"
-"""Attachments with automata; the prefix of their specification comes next."""
+"""Prefix of attachments with automata; the prefix of their specification follows."""
 
 LAYOUT = "layout.json"
 """The attachment that arranges a viewer's panels; a replay replaces it."""
@@ -171,15 +171,15 @@ def image_topics(channels: Iterable[Channel]) -> set[str]:
 
 
 ALL, MAPPED = "all", "mapped"
-"""Values of `is_kept` besides patterns: every topic, or the topics of the samples."""
+"""Special patterns of `is_kept`: every topic, or the topics of the samples."""
 
 
 def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
     """Return whether a copy of a log keeps the messages of a topic.
 
     Args:
-        keep: "all", "mapped", or patterns of topics such as "/camera/*"; one that says so is enough.
-        mapped: the topics that the samples are made of.
+        keep: "all", "mapped", or topic patterns such as "/camera/*"; one match is enough.
+        mapped: topics of the samples.
     """
     return any(
         pattern == ALL or (pattern == MAPPED and topic in mapped) or fnmatchcase(topic, pattern)
@@ -188,8 +188,8 @@ def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
 
 
 def protobuf_channel(topic: str, message: type[Message]) -> Channel:
-    """Return the channel of a topic with messages of one protobuf type, with all it takes to decode them."""
-    # imported here since readers need none of it
+    """Return the channel of a topic of one protobuf type, with all descriptors that decoding needs."""
+    # imported here because readers do not need it
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     descriptors = FileDescriptorSet()
@@ -200,7 +200,7 @@ def protobuf_channel(topic: str, message: type[Message]) -> Channel:
 
 
 def _with_dependencies(file: Any, files: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
-    """Return a file of message types and all that it imports, each behind its own imports."""
+    """Return the descriptors of a file and its imports; each file follows its own imports."""
     for dependency in file.dependencies:
         if dependency.name not in files:
             _with_dependencies(dependency, files)

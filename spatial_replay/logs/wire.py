@@ -1,8 +1,8 @@
 """Many messages of one layout at once.
 
-In protobuf's encoding, numbers of a fixed width are at the same place in every message that has the same
-fields, texts and list lengths. One message, encoded by the protobuf library, therefore is a template for all
-of its layout. Only the slots differ; slots of many messages are filled or read together.
+Messages with equal fields, texts and list lengths have a common layout: in protobuf, their numbers of fixed
+width have equal offsets. One message, encoded by the protobuf library, is the template of its layout. Other
+messages of a layout differ only in these slots, which are filled or read for many messages together.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers, combined_
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.uint64]
 
-# fields of one width for every number, so that a message keeps its length with other numbers in them
+# field types of fixed width: other numbers do not change the length of a message
 _WIDE = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64)
 _NARROW = FieldDescriptor.TYPE_ENUM
 
-# Two sets of sentinels that differ in every byte, and are finite as doubles: where two encodings differ,
-# there is a slot.
+# Two sets of sentinels that differ in every byte and are finite as doubles. A message is encoded with each
+# set: the bytes that differ are its slots.
 _SENTINELS = ((0x40404040 << 32, 1), (0xBFBFBFBF << 32 | 0xFFFFFFFF, 2))
 
 
@@ -38,7 +38,7 @@ class LayoutError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class WireTemplate:
-    """The layout that some messages share.
+    """Layout of messages that differ only in their slots.
 
     Slots are numbered in the order of the fields. A word is a slot of 8 bytes, little-endian: a double or
     a fixed64. A mark is an enumeration with values from 1 to 127, a slot of one byte.
@@ -55,7 +55,7 @@ class WireTemplate:
 
     @classmethod
     def of(cls, message: Message) -> WireTemplate:
-        """Return the layout of a message; numbers that shall be slots must be present in it.
+        """Return the layout of a message. Each number that is present in the message becomes a slot.
 
         Raises:
             LayoutError: a message with fields that the schema does not have.
@@ -91,13 +91,13 @@ class WireTemplate:
     def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""
         rows = np.empty((len(words), len(self)), np.uint8)
-        # in the processor's cache the same rows are written twice in half the time
+        # rows are written twice, which takes half the time if they stay in the processor's cache
         step = max(1, _CACHED_BYTES // max(len(self), 1))
         for begin in range(0, len(rows), step):
             part, own_words = rows[begin : begin + step], words[begin : begin + step]
             part[:] = self.payload
             if words.size:
-                # any 8 bytes of a row, as a word
+                # a view of the 8 bytes from each offset of a row, since words are not aligned
                 anywhere = np.ndarray((len(part), len(self) - 7), "<u8", part, 0, (len(self), 1))
                 anywhere[:, self.word_offsets] = own_words
             if marks is not None:
@@ -121,12 +121,12 @@ class WireTemplate:
 
 
 class Payloads(Sequence[bytes]):
-    """M encoded messages as stretches of a few buffers. One becomes bytes only when it is asked for.
+    """M encoded messages as slices of a few buffers. A message is copied to bytes only on access.
 
     Attributes:
-        buffers: (B,) uint8 each.
-        buffer: (M,) int64, the buffer that each message is in.
-        start, size: (M,) int64, its place there and its length, in bytes.
+        buffers: uint8 arrays of any length.
+        buffer: (M,) int64, index of each message's buffer.
+        start, size: (M,) int64, offset in the buffer and length of each message, bytes.
     """
 
     __slots__ = ("buffer", "buffers", "size", "start")
@@ -136,14 +136,14 @@ class Payloads(Sequence[bytes]):
 
     @classmethod
     def from_rows(cls, rows: Bytes) -> Payloads:
-        """Return (n, L) uint8 as n messages."""
+        """Return the rows (n, L) uint8 as n messages."""
         count, length = rows.shape
         start = np.arange(count, dtype=np.int64) * length
         return cls((rows.reshape(-1),), np.zeros(count, np.int64), start, np.full(count, length))
 
     @classmethod
     def of(cls, payloads: Sequence[bytes]) -> Payloads:
-        """Return messages as they are, or small ones joined and large ones each as a buffer."""
+        """Convert messages: small ones are joined into one buffer, large ones keep a buffer each."""
         if isinstance(payloads, Payloads):
             return payloads
         count = len(payloads)
@@ -157,7 +157,7 @@ class Payloads(Sequence[bytes]):
 
     @classmethod
     def concatenate(cls, parts: Sequence[Sequence[bytes]]) -> Payloads:
-        """Join messages, one part after the other. Small buffers become one, so that few remain."""
+        """Concatenate messages. Small buffers are merged into one, to keep the number of buffers low."""
         groups = [cls.of(part) for part in parts if len(part)]
         small = [buffer for group in groups for buffer in group.buffers if len(buffer) < _JOINED_BYTES]
         buffers = [np.concatenate(small)] if small else []
@@ -186,7 +186,7 @@ class Payloads(Sequence[bytes]):
     @overload
     def __getitem__(self, place: slice) -> Payloads: ...
     def __getitem__(self, place: int | slice) -> bytes | Payloads:
-        """Return one message, or a stretch of them."""
+        """Return one message, or a slice of the messages."""
         if isinstance(place, slice):
             return self.select(place)
         start = int(self.start[place])
@@ -198,15 +198,15 @@ class Payloads(Sequence[bytes]):
         return int(self.size.sum())
 
     def select(self, places: Integers | slice) -> Payloads:
-        """Return some messages, in the order given."""
+        """Return the messages at some places, in their order."""
         return Payloads(self.buffers, self.buffer[places], self.start[places], self.size[places])
 
     def without(self, is_empty: Booleans) -> Payloads:
-        """Return the messages with nothing in some of them, (M,)."""
+        """Replace the messages that `is_empty` (M,) marks by empty ones."""
         return Payloads(self.buffers, self.buffer, self.start, np.where(is_empty, 0, self.size))
 
     def join(self, counts: Integers) -> Payloads:
-        """Return (n,) messages, each joined from the next `counts` (n,) of these."""
+        """Join runs of consecutive messages; `counts` (n,) has the number of messages in each run."""
         ends = np.append(0, np.cumsum(self.size))
         target = np.empty(ends[-1], np.uint8)
         self.copy_into(target, ends[:-1])
@@ -214,7 +214,7 @@ class Payloads(Sequence[bytes]):
         return Payloads((target,), np.zeros(len(counts), np.int64), edges[:-1], np.diff(edges))
 
     def copy_into(self, target: Bytes, starts: Integers) -> None:
-        """Copy the messages into a buffer, each to its start there."""
+        """Copy each message into a buffer, at its offset in `starts` (M,)."""
         for places in equal_places(combined_code([self.buffer, self.size], len(self))):
             source, size = self.buffers[self.buffer[places[0]]], int(self.size[places[0]])
             if len(places) < _FEW:
@@ -228,17 +228,18 @@ class Payloads(Sequence[bytes]):
 
 
 def stretches(buffer: Bytes, size: int) -> NDArray[np.void]:
-    """Return all stretches of some bytes in a buffer as a view: the element at a place begins there."""
+    """Return a view of all slices of `size` bytes; element i begins at byte i of the buffer."""
     return np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer, 0, (1,))
 
 
 _CACHED_BYTES: Final = 2**17
-"""Rows that are written to more than once at a time: half a processor core's cache."""
+"""Size of the parts in which rows are written, bytes: half the cache of a processor core."""
 _LARGE_BYTES: Final = 2**12
-"""Mean size of messages from which joining them costs more than a buffer each."""
+"""Mean message size, bytes, above which joining messages costs more than a buffer each."""
 _JOINED_BYTES: Final = 2**20
+"""Size below which buffers are merged, bytes."""
 _FEW: Final = 4
-"""Messages of one size that are copied one by one."""
+"""Number of messages of one size below which they are copied one by one."""
 
 
 def rows_of(payloads: Sequence[bytes]) -> Bytes:
@@ -247,12 +248,12 @@ def rows_of(payloads: Sequence[bytes]) -> Bytes:
 
 
 def words_of(columns: Sequence[NDArray[Any]]) -> Words:
-    """Return columns of 8-byte numbers, (n, k) each, side by side: (n, W)."""
+    """Concatenate columns of 8-byte numbers, (n, k) each, to words (n, W)."""
     return np.concatenate([np.ascontiguousarray(column).view(np.uint64) for column in columns], axis=1)
 
 
 def join_in_order(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
-    """Return messages in the order of their places, which are given for each group."""
+    """Join groups of messages, sorted by the places that each group gives for its messages."""
     places = np.concatenate([np.empty(0, np.int64), *(places for places, _ in groups)])
     return Payloads.concatenate([payloads for _, payloads in groups]).select(np.argsort(places))
 
@@ -262,13 +263,13 @@ _POWERS.flags.writeable = False
 
 
 def round_numbers(numbers: Floats) -> Floats:
-    """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
+    """Round numbers to four digits, which viewers print short; below 1e-15 and from 1e15 on, they stay."""
     size = np.abs(numbers)
     is_usual = (size >= 1e-15) & (size < 1e15)
     usual = np.where(is_usual, numbers, 1.0)
     digits = (3.0 - np.floor(np.log10(np.abs(usual)))).astype(np.int64)
     power = _POWERS[np.abs(digits)]
-    # quotients and products of whole numbers, so that the result is the number nearest to those digits
+    # products and quotients of integers, so that the result is the double nearest to the decimal number
     short_numbers = np.where(digits < 0, np.round(usual / power) * power, np.round(usual * power) / power)
     return np.where(is_usual, short_numbers, numbers)
 
