@@ -1,7 +1,7 @@
-"""HDF5 files read with care: no data of other files, and no shapes larger than the file can hold.
+"""Safe reading of HDF5 files: no data of other files, and no shapes larger than the file can hold.
 
-HDF5 follows links into other files and allocates the shape that a file claims. Every object is looked at
-before its numbers are read.
+The HDF5 library follows links into other files and allocates any shape that a file claims. So every object
+is checked before its numbers are read.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.formats.episodes import MOST_BYTES
 
 _BEST_RATIO: Final = 1100
-"""Bytes of data that one byte of a file holds at most: deflate reaches 1,032."""
+"""Largest compression ratio; deflate reaches 1,032."""
 _SMALL: Final = 2**26
-"""Bytes of an array that need no look at the size of the file."""
+"""Array size that is accepted in a file of any size, bytes."""
 _LARGEST_ATTRIBUTE: Final = 2**24
-"""Bytes of an attribute."""
+"""Largest attribute, bytes."""
 _DEEPEST: Final = 12
-"""Groups inside each other, and soft links one after the other."""
+"""Deepest nesting of groups, and longest chain of soft links."""
 _WIDEST: Final = 4096
-"""Numbers a frame; more are an image."""
+"""Most numbers per frame; more numbers are an image."""
 _COPY: Final = "copy its data into the file"
 
 
@@ -46,7 +46,7 @@ def open_archive(path: Path) -> Iterator[Group]:
         with h5py.File(path, "r") as file:
             yield Group(file)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        # damaged names, types and encodings are all of these in h5py
+        # h5py raises any of these for damaged names, types and encodings
         raise LogError(
             f"{path.name} cannot be read: {_first_line(error)}; close its writer or copy it again"
         ) from None
@@ -57,7 +57,7 @@ def _first_line(error: Exception) -> str:
 
 
 class Group:
-    """A group of an HDF5 file. No link to another file is followed, and no soft link that leaves `top`.
+    """A group of an HDF5 file. Links to other files, and soft links out of `top`, are refused.
 
     Methods that take a path raise LogError for such a link.
     """
@@ -67,7 +67,7 @@ class Group:
 
     @property
     def names(self) -> list[str]:
-        """The names in the group; h5py gives names that are not UTF-8 as bytes."""
+        """Names in the group, except names that are not UTF-8, which h5py gives as bytes."""
         return [name for name in self._group if isinstance(name, str)]
 
     def group(self, path: str) -> Group | None:
@@ -76,12 +76,12 @@ class Group:
         return Group(node, self._top) if hasattr(node, "keys") else None
 
     def array(self, path: str) -> Any | None:
-        """Return the array with a shape at a path, without its numbers; None if there is none."""
+        """Return the unread array at a path; None for a single value, or if there is none."""
         node = self._node(path)
         return node if getattr(node, "shape", None) else None
 
     def episode(self, path: str, place: str) -> Group:
-        """Return the group of an episode, which soft links do not leave.
+        """Return the group of an episode, whose soft links must not leave it.
 
         Raises:
             LogError: there is none.
@@ -92,7 +92,7 @@ class Group:
         return Group(node)
 
     def arrays(self) -> Iterator[tuple[str, Any]]:
-        """Yield the arrays below the group with their paths; links that are not followed are left out."""
+        """Yield the arrays below the group with their paths; refused links are left out."""
         import h5py
 
         visited: set[bytes] = set()
@@ -106,7 +106,7 @@ class Group:
                 if isinstance(node, h5py.Dataset):
                     yield f"{prefix}{name}", node
                 elif isinstance(node, h5py.Group) and depth < _DEEPEST:
-                    # hard links may make circles
+                    # hard links may form cycles
                     address = h5py.h5o.get_info(node.id).addr
                     if address not in visited:
                         visited.add(address)
@@ -141,7 +141,7 @@ class Group:
         """Return an attribute with one value; None if there is none.
 
         Raises:
-            LogError: it claims to be very large.
+            LogError: the attribute claims more than 16 MiB.
         """
         if name not in self._group.attrs:
             return None
@@ -156,17 +156,17 @@ class Group:
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
     def text(self, name: str) -> str:
-        """Return an attribute that is a text; "" for any other."""
+        """Return a text attribute; "" for an attribute of another type."""
         value = self.attribute(name)
         return str(value) if isinstance(value, str) else ""
 
     def integer(self, name: str) -> int | None:
-        """Return an attribute that is an integer; None for any other."""
+        """Return an integer attribute; None for an attribute of another type."""
         value = self.attribute(name)
         return int(value) if isinstance(value, (int, np.integer)) and not isinstance(value, bool) else None
 
     def json(self, name: str) -> Mapping[str, Any]:
-        """Return an attribute that is a JSON object; an empty one for any other."""
+        """Return the JSON object in a text attribute; an empty one for another attribute."""
         try:
             value = json.loads(self.text(name) or "{}")
         except (ValueError, RecursionError):
@@ -175,7 +175,7 @@ class Group:
 
 
 def width_of(array: Any) -> int:
-    """Return the numbers a frame of an array; 0 for images, texts and objects."""
+    """Return how many numbers an array has per frame; 0 for images, texts and objects."""
     if array.dtype.kind not in "fiub" or not array.shape:
         return 0
     width = math.prod(array.shape[1:])
@@ -187,7 +187,7 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
     """Read an array as (T,) or (T, W) float64.
 
     Raises:
-        LogError: it holds no numbers, or cannot be read without risk.
+        LogError: the array holds no numbers, fails the checks of `row_count`, or cannot be read.
     """
     row_count(array)
     if width_of(array) == 0:
@@ -201,10 +201,10 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
 
 
 def row_count(array: Any) -> int:
-    """Return the number of rows of an array that can be read without risk.
+    """Return the number of rows of an array after checking that reading it is safe.
 
     Raises:
-        LogError: its data are elsewhere, larger than the file can hold, or behind a missing filter.
+        LogError: its data are in another file, larger than the file can hold, or need a missing filter.
     """
     import h5py
 

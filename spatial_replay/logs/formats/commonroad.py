@@ -1,7 +1,7 @@
-"""CommonRoad scenarios: XML of obstacles, read as samples.
+"""Read CommonRoad scenarios, XML files of obstacles, as samples.
 
-Entities could fetch other files or expand without bound, so a file that declares a document type is refused,
-and size, depth and number of elements are limited.
+A file with a document type is refused, because its entities could fetch other files or expand without bound.
+Size, depth and number of elements are limited.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 LARGEST_FILE = 512 * 2**20
-"""Bytes, decompressed."""
+"""Largest file, decompressed, bytes."""
 MOST_ELEMENTS = 500_000
-"""Elements inside one that is wanted."""
+"""Most elements inside one obstacle."""
 DEEPEST = 64
 LONGEST_TEXT = 4096
 _PIECE = 2**16
@@ -35,8 +35,8 @@ class Element:
     """An element with its content.
 
     Attributes:
-        line: where it begins, counted from 1.
-        text: its own text; texts beyond `LONGEST_TEXT` are cut.
+        line: line of its start tag, from 1.
+        text: its own text; a text longer than `LONGEST_TEXT` is cut.
     """
 
     name: str
@@ -46,21 +46,21 @@ class Element:
     text: str = ""
 
     def child(self, name: str) -> Element | None:
-        """Return the first child of a name."""
+        """Return the first child with a name; None if there is none."""
         return next(self.all(name), None)
 
     def all(self, name: str) -> Iterator[Element]:
-        """Return every child of a name."""
+        """Iterate over the children with a name."""
         return (child for child in self.children if child.name == name)
 
 
 def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iterator[Element]:
-    """Yield the root, without its content, then each of its children that has a wanted name.
+    """Yield the root without its content, then its children with wanted names.
 
-    A broken file yields the children before the damage, and `faults` has the rest.
+    A damaged file yields the children before the damage, which goes to `faults`.
 
     Raises:
-        LogError: there is no root, the file declares a document type, or it exceeds the limits above.
+        LogError: the file has no root, declares a document type, or exceeds the limits above.
     """
     collector = _Collector(path.name, wanted)
     with open_text(path) as stream:
@@ -77,7 +77,7 @@ def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iter
 
 
 def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
-    """Parse one piece each step; the last step may yield what is wrong with the file."""
+    """Parse the file in pieces; yield None after each piece, or the fault that ends the parsing."""
     read = 0
     while True:
         try:
@@ -166,12 +166,12 @@ class _Collector:
 Points = list[tuple[float, float]]
 
 ReportFault = Callable[[int, str], None]
-"""Takes what is wrong, with its line."""
+"""Receiver of faults: (line, text)."""
 
 _LONGEST_STEP = 15
-"""Digits of the number of a time step."""
+"""Most digits of a time step."""
 _LONGEST_INTERVAL = 100_000
-"""Time steps."""
+"""Longest interval, time steps."""
 _SHAPES = "<rectangle>, <circle> or <polygon>"
 _TRUCK_LENGTHS = ("wheelbase", "distFromRearToRearAxle", "cabinLength", "distFromRearAxleToHitch")
 
@@ -182,10 +182,11 @@ class ScenarioError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class OutlinePart:
-    """A polygon, or (one vertex and a radius) a disc, in metres.
+    """A polygon, or a disc with one vertex and a radius, in metres.
 
     Attributes:
-        hitch_x: distance of a trailer's hitch ahead of the origin; its vertices are relative to the hitch.
+        hitch_x: distance of a trailer's hitch ahead of the origin; a trailer's vertices are relative to the
+            hitch. None for other parts.
     """
 
     vertices: Points
@@ -193,7 +194,7 @@ class OutlinePart:
     hitch_x: float | None = None
 
     def turn(self, hitch_angle: float) -> Points:
-        """Return the vertices in the obstacle's frame, at an angle of the hitch in radians."""
+        """Return the vertices in the obstacle's frame; `hitch_angle` is in radians."""
         if self.hitch_x is None:
             return self.vertices
         along_x, along_y = cos(hitch_angle), sin(hitch_angle)
@@ -204,16 +205,16 @@ class OutlinePart:
 
 @dataclass(frozen=True, slots=True)
 class ObstacleState:
-    """Where an obstacle is at a time step.
+    """Pose of an obstacle at a time step.
 
     Attributes:
-        x, y: in metres.
-        angle: of its outline, in radians.
-        hitch_angle: of its trailer, if it has one, in radians.
-        oriented: whether its orientation is that angle, rather than unknown.
-        uncertainty: how far, in metres, its true outline may be from the one given.
-        region: an outline in the world that takes the place of the obstacle's own.
-        known: whether anything but its presence is known.
+        x, y: position, metres.
+        angle: rotation of its outline, radians.
+        hitch_angle: angle of its trailer, radians; 0 without a trailer.
+        oriented: whether `angle` is its orientation; False if the orientation is unknown.
+        uncertainty: largest distance between the true and the stated outline, metres.
+        region: outline in the world frame that replaces the obstacle's own.
+        known: whether its place is known; False if only its presence is known.
     """
 
     x: float = 0.0
@@ -226,7 +227,7 @@ class ObstacleState:
     known: bool = True
 
     def report(self, name: str, class_name: str | None, outline: Sequence[OutlinePart]) -> ObjectReport:
-        """Return the obstacle with its own outline, around its own centre, as it stands here."""
+        """Return the report of the obstacle in this state; `outline` is relative to its centre."""
         if not self.known:
             return ObjectReport(name, class_name, [nan, nan], [1], [0.0], invalid=True)
         parts = self.region if self.region is not None else outline
@@ -243,12 +244,12 @@ UNKNOWN = ObstacleState(known=False)
 
 
 _OBSTACLES = frozenset(
-    # `obstacle`, with its role inside, is how versions before 2020a write the first two
+    # versions before 2020a write static and dynamic obstacles as `obstacle` with a role inside
     ["staticObstacle", "dynamicObstacle", "obstacle", "environmentObstacle", "phantomObstacle"]
 )
 
 _BLOCK_REPORTS = 2**14
-"""A block is closed when it holds this many obstacles, however few time steps it has."""
+"""Number of obstacle reports at which a block is closed."""
 
 
 @dataclass(slots=True)
@@ -256,9 +257,9 @@ class _Obstacle:
     """One obstacle of a scenario.
 
     Attributes:
-        parts: its outline, around its own centre.
-        moving: where it is, by time step.
-        fixed: where it is at every time step, if it does not move.
+        parts: its outline, relative to its centre.
+        moving: states by time step.
+        fixed: state at every time step; None for a moving obstacle.
     """
 
     name: str
@@ -271,8 +272,8 @@ class _Obstacle:
 def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
     """Yield the time steps of a CommonRoad scenario in blocks.
 
-    A sample is a time step that some moving obstacle has a state for; obstacles that do not move are in each
-    of them. Roads, planning problems and goals are not objects. Errors go to `faults`.
+    Each time step with a state of a moving obstacle is a sample. Static obstacles are in every sample. Roads,
+    planning problems and goals are not objects. Errors go to `faults`.
 
     Raises:
         LogError: the file is not a scenario.
@@ -345,7 +346,7 @@ def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
     kind = element.child("type")
     class_name = (kind.text or None) if kind is not None else None
     if element.name == "phantomObstacle":
-        # it may be there or not: an object of every open group, about which nothing is known
+        # a phantom may be present or not, so it is an object of unknown place in every open group
         return _Obstacle(name, class_name, [], dict.fromkeys(_moving_states(element, [], report), UNKNOWN))
     outline = _outline_of(_required_child(element, "shape"))
     if element.name == "environmentObstacle":
@@ -360,10 +361,10 @@ def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
 def _moving_states(
     obstacle: Element, outline: Sequence[OutlinePart], report: ReportFault
 ) -> dict[int, ObstacleState]:
-    """Return the states of an obstacle that moves, by time step.
+    """Return the states of a moving obstacle by time step.
 
     Args:
-        report: takes what is wrong with one of the states.
+        report: receiver of the faults of single states.
     """
     states: dict[int, ObstacleState] = {}
     initial, trajectory = obstacle.child("initialState"), obstacle.child("trajectory")
@@ -395,10 +396,10 @@ def _state_or_unknown(element: Element, outline: Sequence[OutlinePart], report: 
 
 
 def _outline_of(shape: Element) -> list[OutlinePart]:
-    """Return the outline of an obstacle around the position of its states.
+    """Return the outline of an obstacle, relative to the position of its states.
 
     Raises:
-        ScenarioError: there is none, or something else.
+        ScenarioError: the shape is empty or unknown.
     """
     if not shape.children:
         raise ScenarioError(
@@ -428,7 +429,7 @@ def _truck(element: Element) -> OutlinePart:
 
 
 def _hitch_x(truck: Element) -> float:
-    """Return how far the hitch of a truck is ahead of the origin, in metres."""
+    """Return the distance of a truck's hitch ahead of the origin, in metres."""
     dimensions = _required_child(truck, "truckDims")
     rear_axle = _size(dimensions, "distFromRearToRearAxle") - _size(dimensions, "length") / 2
     return _number(dimensions, "distFromRearAxleToHitch") + rear_axle - _number(truck, "originXShift")
@@ -442,10 +443,10 @@ def _trailer(dimensions: Element, hitch_x: float) -> OutlinePart:
 
 
 def _parts_of(region: Element) -> list[OutlinePart]:
-    """Return the rectangles, circles and polygons of a region in the world.
+    """Return the rectangles, circles and polygons of a region in the world frame.
 
     Raises:
-        ScenarioError: there is none, or something else.
+        ScenarioError: the region is empty, or has another shape.
     """
     if not region.children:
         raise ScenarioError(f"<{region.name}> is empty; give {_SHAPES}")
@@ -491,7 +492,7 @@ def _center(element: Element) -> tuple[float, float]:
 
 
 def _refuse_unknown(element: Element, *names: str) -> None:
-    """Refuse a child of another name, because it may place the outline elsewhere."""
+    """Refuse children with other names, because they could move the outline."""
     for child in element.children:
         if child.name not in names:
             children = ", ".join(f"<{name}>" for name in names)
@@ -499,14 +500,14 @@ def _refuse_unknown(element: Element, *names: str) -> None:
 
 
 def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
-    """Return a state from position and orientation, each exact or somewhere in a region or interval."""
+    """Return a state whose position is exact or in a region, and whose angles are exact or in intervals."""
     position = _required_child(element, "position")
     point = position.child("point")
     place_uncertainty = 0.0
     if point is not None:
         x, y = _point(point)
     elif position.child("lanelet") is not None:
-        # somewhere on a lane; roads are not read
+        # the position is somewhere on a lane, and roads are not read
         return UNKNOWN
     else:
         x, y, place_uncertainty = _around(_parts_of(position))
@@ -524,14 +525,14 @@ def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
 
 
 def _turned_away(outlines: Sequence[Points], angle: float) -> float:
-    """Return how far a vertex can be from its place if the outlines turn within an angle around it."""
-    # a vertex at a distance r of the origin moves by 2 r sin(h/2) when that turns by h
+    """Return the largest shift of a vertex if outlines turn by up to half of `angle` in either direction."""
+    # a turn by h moves a vertex at a distance r from the origin by 2 r sin(h / 2), and h is angle / 2
     reach = max((hypot(*vertex) for outline in outlines for vertex in outline), default=0.0)
     return 2 * reach * sin(min(angle, 2 * pi) / 4)
 
 
 def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[float, float]:
-    """Return the least and the greatest value of an angle in radians."""
+    """Return the interval of an angle, in radians; both ends are equal for an exact angle."""
     angle = state.child(name)
     if angle is None:
         return default
@@ -545,11 +546,11 @@ def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[flo
 
 
 def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[int, ObstacleState]]:
-    """Yield the time steps at which the obstacle is somewhere in a region, each with that state."""
+    """Yield the time steps of an occupancy, each with the state of an obstacle somewhere in its region."""
     try:
         steps = _steps(_required_child(occupancy, "time"))
         parts = _parts_of(_required_child(occupancy, "shape"))
-        # the true outline is inside the region, so no point of the region is farther from it than the width
+        # the true outline is inside the region, so it is at most the region's diameter from any of its points
         region = _hull(parts)
         _, _, reach = _around([region])
         state = ObstacleState(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN

@@ -19,7 +19,7 @@ from spatial_replay.logs.formats.minari import open_minari
 from spatial_replay.logs.formats.steps import open_npz
 
 DATA_SET_ENDINGS: Final = (".hdf5", ".h5", ".npz")
-"""Endings of the names of data sets that are files."""
+"""File name endings of data sets."""
 _ADDRESS: Final = re.compile(r"(.+)#(?:([0-9]{1,9})|[^#]*)", re.DOTALL)
 FORMATS: Final[tuple[Callable[[Path], DataSet | None], ...]] = (
     open_lerobot,
@@ -27,22 +27,22 @@ FORMATS: Final[tuple[Callable[[Path], DataSet | None], ...]] = (
     open_hdf5,
     open_minari,
 )
-"""Each opens a data set of its format, and returns None for anything else."""
+"""Functions that open a data set of one format, and return None for other formats."""
 
 
 def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
-    """Split `push_v3#17` into the path of a data set and a number; None if it is no such address.
+    """Split an address such as `push_v3#17` into the path of a data set and a number; None for other texts.
 
-    A file with that very name is no address.
+    The name of an existing file is no address.
 
     Raises:
-        UsageError: the data set has something else than a number behind it.
+        UsageError: the text after the data set is not a number.
     """
     match = _ADDRESS.fullmatch(fspath(text))
     if match is None or "://" in match[1]:
         return None
     try:
-        # as texts: paths would take most of the time
+        # texts, because paths of pathlib would take most of the time
         is_address = os.path.exists(match[1]) and not os.path.exists(match[0])  # noqa: PTH110
     except (OSError, ValueError):
         return None
@@ -52,9 +52,9 @@ def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
 
 
 def open_data_set(path: str | PathLike[str]) -> DataSet | None:
-    """Open the data set in a folder or a file; None if it is none.
+    """Open the data set in a folder or a file; None if it is not a data set.
 
-    The last few stay open while their files do not change.
+    The last four data sets are cached until their files change.
 
     Raises:
         UsageError: a library is not installed, or the format is of an unknown version.
@@ -77,12 +77,12 @@ _DESCRIBING: Final = (
     *("", "/meta", "/meta/info.json", "/meta/episodes", "/meta/episodes.jsonl"),
     *("/metadata.json", "/data/metadata.json", "/data/main_data.hdf5"),
 )
-"""Files of a data set that say what is in it."""
+"""Files that describe a data set: suffixes of its path."""
 
 
 def _file_states(path: Path) -> tuple[object, ...]:
-    """Return what changes with the files that say what is in a data set."""
-    # as texts: paths would take most of the time
+    """Return a cache key: identity, size and modification time of the files that describe a data set."""
+    # texts, because paths of pathlib would take most of the time
     files = [*(f"{path}{name}" for name in _DESCRIBING), f"{path.with_suffix('.json')}"]
     states = []
     for file in files:

@@ -1,4 +1,4 @@
-"""Episodes of robot-learning data sets as values: features and bodies as arrays, labels, and the data set."""
+"""Robot-learning data sets and their episodes: features and bodies as arrays, and labels."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Feature(NamedTuple):
     """A column of a data set.
 
     Attributes:
-        places: the names of its numbers; () where they have none.
-        width: numbers a frame; 0 for images, videos and texts.
+        places: names of its numbers; () if they have no names.
+        width: how many numbers it has per frame; 0 for images, videos and texts.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Label(NamedTuple):
 
     Attributes:
         field: its name in the data set.
-        is_about_next: whether it is about the state after the action of its frame.
+        is_about_next: whether it labels the state after the action of its frame.
         is_stored: whether the data set stores the state after the last action.
     """
 
@@ -51,9 +51,9 @@ class Episode(NamedTuple):
     """An episode of a data set.
 
     Attributes:
-        number: as in `push_v3#17`.
-        key: its name in the data set, such as `demo_10`; its number where it has no other.
-        frames: their number, where known without reading the episode.
+        number: number in the address, such as 17 in `push_v3#17`.
+        key: name in the data set, such as `demo_10`; the number if it has no name.
+        frames: number of frames; None if counting them takes reading the episode.
     """
 
     number: int
@@ -65,12 +65,12 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A body that the data set names itself.
+    """A body with a name in the data set, which needs no mapping.
 
     Attributes:
         positions: (T, 3) float64.
         quaternions: (T, 4) float64, x y z w; None for a place.
-        shapes: T footprints with heights in the frame of the world; None for a point.
+        shapes: T footprints with heights, in the world frame; None for a point.
     """
 
     name: str
@@ -85,12 +85,12 @@ class EpisodeColumns:
 
     Attributes:
         times_ns: (T,) int64, increasing.
-        features: by name, each (T,) or (T, W) float64.
-        bodies: those that the data set names itself.
-        success: (T,) the label of each frame; () that of the episode; None without a label.
+        features: arrays by name, (T,) or (T, W) float64.
+        bodies: bodies with a name in the data set.
+        success: (T,) label of each frame, or () label of the episode; None without a label.
         faults: messages about lost frames.
         remarks: other messages, each without the name of the data set.
-        unjudged: why the episode has no verdict, such as two runs in one episode; "" otherwise.
+        unjudged: reason why the episode gets no verdict, such as two runs in one episode; "" otherwise.
     """
 
     times_ns: Integers
@@ -103,19 +103,19 @@ class EpisodeColumns:
 
     @property
     def label(self) -> bool | None:
-        """Whether the episode is labelled a success, in any frame; None without a label."""
+        """Whether any frame, or the episode, is labelled a success; None without a label."""
         return None if self.success is None else bool(self.success.any())
 
 
 class EpisodeReading(NamedTuple):
-    """Keys of a mapping about how a data set is read; None leaves it to the data set.
+    """Keys of a mapping for reading a data set; None stands for the value of the data set.
 
     Attributes:
-        fps: frames a second.
-        label: the name of the field with the label.
-        model: a MuJoCo model, for data sets without one.
-        order: of the quaternions of bodies that the data set names.
-        assets: a folder with the meshes of models.
+        fps: frames per second.
+        label: name of the field with the label.
+        model: path of a MuJoCo model, for data sets without one.
+        order: order of the bodies' quaternions, "xyzw" or "wxyz".
+        assets: folder with the meshes of models.
     """
 
     fps: float | None = None
@@ -132,9 +132,9 @@ class Run(NamedTuple):
     """An episode while it is read.
 
     Attributes:
-        group: what `DataSet.open_episode` gives.
-        arrays: by name, those without numbers left out.
-        label: the name of the label.
+        group: value of `DataSet.open_episode`.
+        arrays: arrays of numbers by name.
+        label: name of the label; None without one.
     """
 
     episode: Episode
@@ -150,14 +150,14 @@ class DataSet:
     A format reads the arrays of an episode (`open_episode`, `read`, `count_states`) and finds its `poses`.
 
     Attributes:
-        path: of the folder or file.
+        path: path of the folder or file.
         kind: its format with the version, such as `LeRobot v3.0`.
-        fps: frames a second; None where the data set does not say.
-        has_times: whether its frames have times of their own, so that no frames a second are needed.
-        robot: its type; "" where the data set does not say.
+        fps: frames per second; None if the data set does not say.
+        has_times: whether its frames have times, so that `fps` is not needed.
+        robot: type of the robot; "" if the data set does not say.
         features: columns that a mapping can use, in the data set's order.
-        episodes: in the order of their numbers.
-        label: None without a label.
+        episodes: episodes in the order of their numbers.
+        label: success label; None without a label.
         remarks: messages about the whole data set.
         names_bodies: whether it names its bodies, so that no mapping is needed.
         always_read: arrays that `poses` needs.
@@ -186,11 +186,11 @@ class DataSet:
         """Read an episode.
 
         Args:
-            number: of the episode.
-            features: those that are read; None for all with numbers.
+            number: number of the episode.
+            features: names of the features to read; None for all features with numbers.
 
         Raises:
-            UsageError: no such episode, or the mapping has to say something, such as `fps`.
+            UsageError: no such episode, or the mapping lacks a key, such as `fps`.
             LogError: the data cannot be read.
         """
         names = [feature.name for feature in self.features if feature.width] if features is None else features
@@ -207,7 +207,7 @@ class DataSet:
         return replace(columns, features=values, success=success, remarks=tuple(remarks))
 
     def success(self, number: int, reading: EpisodeReading = AS_STORED) -> Booleans | None:
-        """Read the label of an episode, see `EpisodeColumns.success`; no pose is read.
+        """Read the label of an episode without its poses; see `EpisodeColumns.success`.
 
         Raises:
             UsageError, LogError: see `columns`.
@@ -224,7 +224,7 @@ class DataSet:
             yield Run(episode, group, arrays, reading, label)
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[Any]:
-        """Return what the arrays of an episode are read from, as a context.
+        """Open an episode as a context; its value is the `group` of `read`.
 
         Raises:
             LogError: it cannot be read.
@@ -232,7 +232,7 @@ class DataSet:
         raise NotImplementedError
 
     def read(self, group: Any, names: AbstractSet[str]) -> dict[str, Floats]:
-        """Return the arrays of some names, (T,) or (T, W) each; those without numbers are left out."""
+        """Return the arrays with these names, (T,) or (T, W); arrays without numbers are left out."""
         raise NotImplementedError
 
     def count_states(self, run: Run) -> int:
@@ -245,11 +245,11 @@ class DataSet:
         return EpisodeColumns(frame_times_ns(frames, self.required_fps(run.reading)))
 
     def whole_label(self, run: Run, label: str) -> bool | None:
-        """Return the label of an episode that has no array of labels; None without one."""
+        """Return the label of the whole episode, if no array has labels; None without a label."""
         return None
 
     def _success(self, run: Run, count: int) -> Booleans | None:
-        """Return the label of an episode: of each state, or of all; None without one."""
+        """Return the label of each state (T,), or of the episode (); None without a label."""
         label = run.label
         if label is None:
             return None
@@ -263,27 +263,27 @@ class DataSet:
         return None if value is None else np.array(value)
 
     def shared_files(self) -> list[Path]:
-        """Return the files that every episode depends on: all of them, unless the format knows better."""
+        """Return the files that every episode depends on; by default, all files."""
         if self.path.is_file():
             about = self.path.with_suffix(".json")
             return [self.path, *([about] if about.is_file() else [])]
         return sorted(file for file in self.path.rglob("*") if file.is_file())
 
     def files_of(self, number: int) -> list[Path]:
-        """Return the other files that an episode depends on.
+        """Return the files that only this episode depends on.
 
         Raises:
-            LogError: they cannot be found.
+            LogError: the files cannot be found.
         """
         return []
 
     def episode(self, number: int) -> Episode:
-        """Return the episode of a number.
+        """Return the episode with a number.
 
         Raises:
             UsageError: there is none.
         """
-        # numbers usually count from 0
+        # numbers usually count from 0, so this index is tried first
         nearest = self.episodes[number : number + 1]
         for episode in (*nearest, *self.episodes):
             if episode.number == number:
@@ -299,14 +299,14 @@ class DataSet:
         return f"it has {plural(len(self.episodes), 'episode')}, {self.name}#{first} to {self.name}#{last}"
 
     def feature(self, name: str) -> Feature | None:
-        """Return the feature of a name."""
+        """Return the feature with a name; None if there is none."""
         return next((feature for feature in self.features if feature.name == name), None)
 
     def required_fps(self, reading: EpisodeReading) -> float:
-        """Return the frames a second that a mapping or the data set says.
+        """Return the frames per second of the mapping, or else of the data set.
 
         Raises:
-            UsageError: neither does.
+            UsageError: neither says them.
         """
         fps = self.fps if reading.fps is None else reading.fps
         if fps is None:
@@ -318,12 +318,12 @@ class DataSet:
 
 
 MOST_BYTES: Final = 8 * 2**30
-"""Bytes of the numbers that are read at once, uncompressed."""
+"""Most bytes of numbers that are read at once, uncompressed."""
 SECOND_RUN: Final = "more than one run is in the episode, so it is not judged; record each run as an episode"
 
 
 def _with_last(values: Floats, count: int) -> Floats:
-    """Return an array of steps with a row of NaN in the state after the last step."""
+    """Append a row of NaN to an array of steps, for the state after the last step."""
     lost = count - len(values)
     return values if not lost else np.concatenate([values, np.full((lost, *values.shape[1:]), np.nan)])
 
@@ -332,7 +332,7 @@ def _success_of_states(labels: Floats, count: int, place: str) -> Booleans:
     """Return the label (T,) of each state; a label of a step is about the state after it.
 
     Raises:
-        LogError: there are neither as many labels as states, nor one less.
+        LogError: the number of labels is neither the number of states nor one less.
     """
     is_success = _as_label(labels, place)
     if len(labels) == count - 1:
@@ -346,7 +346,7 @@ def frame_times_ns(frames: Integers, fps: float) -> Integers:
     """Return the times of frames (T,), exact to the nearest nanosecond.
 
     Raises:
-        LogError: a frame before the first one, or one later than any time of a log.
+        LogError: a negative frame, or a frame later than the latest time of a log.
     """
     period = Fraction(10**9) / Fraction(repr(float(fps)))
     if len(frames) and (frames.min() < 0 or int(frames.max()) * period > LATEST_NS):
@@ -371,7 +371,7 @@ def _as_label(values: Floats, place: str) -> Booleans:
     """Return the label (T,) of each row of a column (T, …): whether it holds a number above 0.
 
     Raises:
-        UsageError: the column has negative numbers, or several above 0, as a shaped reward does.
+        UsageError: the column has negative or different positive numbers, such as a shaped reward.
     """
     rows = np.nan_to_num(values.reshape(len(values), -1))
     wrong = rows[(rows < 0) | (rows != rows.max(initial=0.0)) & (rows > 0)]
@@ -383,10 +383,10 @@ def _as_label(values: Floats, place: str) -> Booleans:
 
 
 def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
-    """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it does not show.
+    """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it is ambiguous.
 
     A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z. (0, 0, 0, 1) is
-    upright in both orders: no turn as x y z w, half a turn as w x y z. So it does not show x y z w.
+    upright in both orders: no turn as x y z w, half a turn as w x y z. So it is no evidence for x y z w.
     """
     is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
     begins_with_zeros = is_zero[:, 0] & is_zero[:, 1]

@@ -42,8 +42,8 @@ def open_hdf5(path: Path) -> DataSet | None:
     """Open a data set in an HDF5 file; None for any other file.
 
     Raises:
-        UsageError: its layout is none of those that are read, or h5py is not installed.
-        LogError: it cannot be read.
+        UsageError: the layout is unknown, or h5py is not installed.
+        LogError: the file cannot be read.
     """
     if not path.is_file():
         return None
@@ -65,14 +65,14 @@ class InGroups(DataSet):
     """A data set in HDF5 with a group for each episode.
 
     Attributes:
-        folder: the group that holds the episodes.
+        folder: path of the group that holds the episodes.
     """
 
     folder = ""
 
     @property
     def archive(self) -> Path:
-        """The file."""
+        """Path of the HDF5 file."""
         return self.path
 
     @contextmanager
@@ -91,7 +91,7 @@ class InGroups(DataSet):
         return name
 
     def whole_label(self, run: Run, label: str) -> bool | None:
-        """See `DataSet.whole_label`: an attribute."""
+        """Return the label from an attribute; see `DataSet.whole_label`."""
         value = run.group.attribute(label)
         return None if value is None else bool(value)
 
@@ -100,15 +100,15 @@ class _Demonstrations(InGroups):
     """A data set whose episodes are numbered groups.
 
     Attributes:
-        left_out: arrays that are no features, by the first part of their paths.
-        task: of episodes that name none.
+        left_out: first parts of the paths of arrays that are no features.
+        task: task of episodes that name no task.
     """
 
     left_out = frozenset[str]()
     task: str | None = None
 
     def list_episodes(self, path: Path, file: Group) -> Group:
-        """Find the episodes, and the features of the first one; return the group of that one."""
+        """Set `episodes`, and `features` from the first episode; return the group of the first episode."""
         self.path = path
         home = file.group(self.folder) or file
         keys = sorted((key for key in home.names if _NUMBERED.fullmatch(key)), key=natural_key)
@@ -130,7 +130,7 @@ class _Demonstrations(InGroups):
         try:
             return self.describe(home, number, key)
         except LogError:
-            # reading it says why
+            # reading the episode reports the damage
             return Episode(number, key)
 
     def describe(self, home: Group, number: int, key: str) -> Episode:
@@ -144,14 +144,14 @@ class _Demonstrations(InGroups):
 
 
 def _first_group(group: Group | None, prefix: str) -> Group | None:
-    """Return the first group whose name is a prefix and a number."""
+    """Return the first group with a name of a prefix and a number; None if there is none."""
     keys = [] if group is None else [key for key in group.names if _NUMBERED.fullmatch(key)]
     keys = [key for key in keys if key.startswith(prefix)]
     return group.group(min(keys, key=natural_key)) if group is not None and keys else None
 
 
 def _body(poses: Any | None, name: str, place: str, order: str) -> Body:
-    """Return a body from an array of poses, whose rows begin with a place and a quaternion.
+    """Return a body from an array of poses, whose rows begin with a position and a quaternion.
 
     Raises:
         LogError: the array is missing or too narrow, or the quaternions are not of unit length.
@@ -178,7 +178,7 @@ def _pose_rows(poses: Any | None, place: str, rows: slice = slice(None)) -> Floa
 
 
 def _object(value: object) -> Mapping[str, Any]:
-    """Return a value that is a JSON object; an empty one for any other."""
+    """Return a JSON object unchanged; an empty object for other values."""
     return value if isinstance(value, dict) else {}
 
 
@@ -209,7 +209,7 @@ class _ManiSkill(_Demonstrations):
         first = self.list_episodes(path, file)
         actors = first.group("env_states/actors")
         self.names_bodies = actors is not None and bool(actors.names)
-        # the first state has no label, and each other one that of the step before it
+        # the label of a step is moved to the state after it; the first state has no label
         if first.array("success") is not None or any("success" in row for row in self._rows.values()):
             self.label = Label("success")
         self.remarks = tuple(self._remarks(about))
@@ -259,7 +259,7 @@ class _ManiSkill(_Demonstrations):
         return EpisodeColumns(times_ns, bodies=tuple(bodies))
 
     def whole_label(self, run: Run, label: str) -> bool | None:
-        """See `DataSet.whole_label`: an attribute, or a key of the JSON file."""
+        """Return the label from an attribute or the JSON file; see `DataSet.whole_label`."""
         value = super().whole_label(run, label)
         row = self._rows.get(run.episode.key, {})
         return row["success"] if value is None and isinstance(row.get("success"), bool) else value
@@ -276,8 +276,8 @@ _MOST_EXAMINED: Final = 32
 class _IsaacLab(_Demonstrations):
     """Demonstrations of Isaac Lab, RoboLab and Arena: `data/demo_0/states/rigid_object`.
 
-    The states are those after each step. Quaternions are x y z w since 2026 and w x y z before, and the
-    files do not say which.
+    States are recorded after each step. Quaternions are x y z w since 2026 and w x y z before; the files do
+    not store their order.
     """
 
     kind = "Isaac Lab"
@@ -336,7 +336,7 @@ class _IsaacLab(_Demonstrations):
         """Return the order of the quaternions.
 
         Raises:
-            UsageError: the data do not show it.
+            UsageError: the quaternions are ambiguous.
         """
         if self._order is None:
             # objects stand still and upright at the start of most episodes
@@ -365,13 +365,13 @@ def _has_success(home: Group, episodes: tuple[Episode, ...]) -> bool:
 # -------------------------------------------------------------------------------------------------- robosuite
 
 _SUCCESSES_ONLY: Final = (1, 4)
-"""The version since which robosuite's recorder drops failed episodes."""
+"""First version of robosuite whose recorder drops failed episodes."""
 
 
 class _Robosuite(_Demonstrations):
     """Demonstrations of robosuite, robomimic and LIBERO: `data/demo_0` with `states` of a `model_file`.
 
-    A state is the one before the action of its step, so the state after the last action is not stored.
+    States are recorded before the action of each step, so the state after the last action is missing.
     """
 
     folder = "data"
@@ -439,7 +439,7 @@ class _Robosuite(_Demonstrations):
         return EpisodeColumns(times_ns, bodies=tuple(bodies), remarks=tuple(remarks), unjudged=unjudged)
 
     def whole_label(self, run: Run, label: str) -> bool | None:
-        """See `DataSet.whole_label`: an attribute, or true where failures are dropped."""
+        """Return the label from an attribute, or True if the recorder drops failures."""
         if self.label is not None and label == self.label.field == "successful":
             return True
         return super().whole_label(run, label)
