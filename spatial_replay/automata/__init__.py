@@ -1,6 +1,6 @@
 """Specifications as automata: which runs satisfy them, and what must still happen or be avoided.
 
-`spatial_replay.automaton` compiles one; this package has what goes with it.
+`spatial_replay.automaton` compiles an automaton; this package has its types, texts and drawings.
 """
 
 from __future__ import annotations

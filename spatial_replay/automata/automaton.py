@@ -1,4 +1,4 @@
-"""The automaton of a specification: its runs, its words, and its texts for other tools."""
+"""The automaton of a specification: its runs, its description, and its texts for other tools."""
 
 from __future__ import annotations
 
@@ -27,45 +27,47 @@ from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
 from spatial_replay.text import plural
 
 MAX_PROPOSITIONS = 64
-"""How many propositions an automaton reads at most."""
+"""Maximum number of propositions of an automaton."""
 
 MAX_ROWS = 300_000
-"""How many states an automaton has at most, and how many decisions."""
+"""Maximum number of states of an automaton, and maximum number of decisions."""
 
 _OF_MOVES = {"_moves", "_above", "distances", "can_accept", "can_reject", "transitions", "is_listable"}
-"""Properties of an automaton that depend on its moves alone."""
+"""Cached properties of an automaton that depend only on its moves."""
 
 MAX_LISTED = 100_000
-"""How many transitions are listed at most, and how many cubes their guards have together."""
+"""Maximum number of listed transitions, and maximum total number of cubes in their guards."""
 
 MOST_STATES = 60
-"""States that a drawing shows at most, and a text of an automaton whose transitions cannot all be listed."""
+"""Maximum number of states in a drawing, and in a text that cannot list all transitions."""
 MOST_MOVES = 300
+"""Maximum number of transitions in such a drawing or text."""
 LONGEST_GUARD = 300
-"""The most moves there, and characters of a guard."""
+"""Maximum length of a guard in such a drawing or text, characters."""
 _LONGEST_LABEL = 12
-"""Characters of a proposition that stands on an arrow as it is."""
+"""Maximum length of a proposition that is written on an arrow, characters."""
 _WIDTH = 20
-"""Characters after which a label of an arrow goes on in a new line."""
+"""Line length from which an arrow's label is wrapped, characters."""
 _LEGEND_WIDTH = 100
-"""Characters of a line below a drawing."""
+"""Line length of the legend below a drawing, characters."""
 
 
 @dataclass(frozen=True)
 class Automaton(Displayed):
-    """The least deterministic automaton of a formula over finite runs; equal ones accept the same runs.
+    """The minimal deterministic automaton of a formula over finite runs.
 
-    It has a move from every state for every symbol. State 0 stands before the first sample, and may be one
-    that later samples lead to, too; the others are numbered by their distance from it.
+    Equal automata accept the same runs. Every state has a move for every symbol. State 0 is the state before
+    the first sample; later samples may lead back to it. The other states are numbered by their distance from
+    state 0.
 
     Attributes:
-        name: what the specification calls it.
-        propositions: what it reads of a sample; a *symbol* says of each whether it is true.
-        accepting: the states in which a run that ends there satisfies the formula. No run ends before its
-            first sample, so of state 0 it says something only if samples lead there.
-        entries: for each state, the decision with which its moves begin; ~q leads to state q at once.
-        decisions: (proposition, next where it is false, next where it is true); the next are as `entries`,
-            and decide on later propositions.
+        name: name of the spec.
+        propositions: propositions that the automaton reads; a *symbol* has the value of each in a sample.
+        accepting: states in which a run must end to satisfy the formula. For state 0 this matters only if
+            samples lead back to it, because no run is empty.
+        entries: for each state, the index of its first decision, or ~q if every symbol leads to state q.
+        decisions: rows of a proposition, the next place if it is false, and the next place if it is true.
+            A place is an index or ~q, as in `entries`, and decides on a later proposition.
     """
 
     name: str
@@ -82,11 +84,11 @@ class Automaton(Displayed):
 
     @cached_property
     def transitions(self) -> tuple[Transition, ...]:
-        """All moves, by source and target; the guards of one source exclude each other.
+        """All transitions, sorted by source and target; the guards of one source are disjoint.
 
         Raises:
-            NoAutomatonError: more than 100 000 transitions, or cubes of their guards; `iter_transitions`,
-                `successors` and `transition` have them one by one.
+            NoAutomatonError: more than 100 000 transitions, or cubes in their guards. `iter_transitions`,
+                `successors` and `transition` compute them one by one.
         """
         transitions, cubes = [], 0
         for transition in self.iter_transitions():
@@ -103,8 +105,8 @@ class Automaton(Displayed):
 
     @cached_property
     def is_listable(self) -> bool:
-        """Whether `transitions` has them all, and raises no error."""
-        # counted before the guards are worked out, which takes longer
+        """Whether `transitions` raises no error."""
+        # the count of transitions needs no guards, which take longer to compute
         count = 0
         for state in self.states:
             count += len(self.successors[state])
@@ -116,7 +118,7 @@ class Automaton(Displayed):
             return False
 
     def iter_transitions(self) -> Iterator[Transition]:
-        """Iterate over all moves, by source and target; each is worked out when it is consumed."""
+        """Iterate over all transitions, sorted by source and target; each is computed when it is consumed."""
         moves = self._moves
         return (
             moves.transition(state, target) for state in self.states for target in moves.successors(state)
@@ -124,23 +126,23 @@ class Automaton(Displayed):
 
     @cached_property
     def successors(self) -> Sequence[tuple[int, ...]]:
-        """For each state, those that one sample can lead to, in order; worked out when they are asked for."""
+        """The successors of each state in ascending order, computed on demand."""
         return Successors(self._moves)
 
     @cached_property
     def has_returns(self) -> bool:
-        """Whether samples lead to the initial state, so that runs end there."""
+        """Whether samples lead back to the initial state, so that runs can end in it."""
         before = ~self.initial
         return before in self.entries or any(before in (low, high) for _, low, high in self.decisions)
 
     @cached_property
     def can_accept(self) -> frozenset[int]:
-        """The states from which acceptance has not been lost; the others are traps."""
+        """The states from which an accepting state can be reached; the others are traps."""
         return frozenset(self.distances)
 
     @cached_property
     def distances(self) -> Mapping[int, int]:
-        """For each state from which acceptance has not been lost, how many samples it takes at least."""
+        """The least number of samples to an accepting state, for each state that can reach one."""
         return self._distances(self._ends(self.accepting))
 
     @cached_property
@@ -152,7 +154,7 @@ class Automaton(Displayed):
         """Return the state after a sample.
 
         Args:
-            symbol: for each proposition, whether it is true.
+            symbol: value of each proposition.
 
         Raises:
             UsageError: no such state, or a symbol of another length.
@@ -165,10 +167,10 @@ class Automaton(Displayed):
         return ~place
 
     def step_set(self, states: Collection[int], symbol: Sequence[bool | None]) -> frozenset[int]:
-        """Return the states that may be reached after a sample from any of some states.
+        """Return the states that one sample may lead to from any of `states`.
 
         Args:
-            symbol: for each proposition, whether it is true; None where that is not known.
+            symbol: value of each proposition, None if it is unknown.
 
         Raises:
             UsageError: no such state, or a symbol of another length.
@@ -206,19 +208,19 @@ class Automaton(Displayed):
         return state in self.accepting
 
     def transition(self, source: int, target: int) -> Transition | None:
-        """Return the move from one state to another, if one sample can lead there."""
+        """Return the transition between two states; None if no sample leads from `source` to `target`."""
         is_move = source in self.states and target in self.successors[source]
         return self._moves.transition(source, target) if is_move else None
 
     def paths(
         self, state: int, without: Collection[tuple[int, int]] = ()
     ) -> Iterator[tuple[Transition, ...]]:
-        """Yield the shortest paths from a state to an accepting one, each worked out when it is consumed.
+        """Yield the shortest paths from a state to an accepting state; each is computed when it is consumed.
 
-        From an accepting state that is the empty path; there is none from a trap.
+        The path from an accepting state is empty. A trap has no path.
 
         Args:
-            without: moves (source, target) that cannot be taken.
+            without: transitions (source, target) to avoid.
 
         Raises:
             UsageError: no such state.
@@ -246,14 +248,14 @@ class Automaton(Displayed):
         """Return a transition's guard as a sentence of the specification language.
 
         Args:
-            longest: characters after which it is cut.
+            longest: maximum number of characters; None for no limit.
         """
         return guard_words(transition, self.propositions, longest)
 
     def with_propositions(self, propositions: Sequence[Proposition]) -> Automaton:
         """Return the automaton with other names for its propositions."""
         result = replace(self, propositions=tuple(propositions))
-        # names change no move: what was worked out is kept
+        # names change no move, so cached properties of the moves stay valid
         result.__dict__.update({name: self.__dict__[name] for name in _OF_MOVES & self.__dict__.keys()})
         return result
 
@@ -261,10 +263,10 @@ class Automaton(Displayed):
         return drawn_as_svg(self)
 
     def to_dot(self) -> str:
-        """Return the automaton for Graphviz, with guards in words and long propositions in a legend.
+        """Return the automaton as text for Graphviz, with guards in words and long propositions in a legend.
 
         Accepting states have a double outline. States that accept permanently are blue, traps are vermillion.
-        If not all transitions can be listed, it has the states nearest to the start.
+        If there are too many transitions to list, the text has only the states nearest to the start.
         """
         short = abbreviate(self)
         cut = () if self.is_listable else (_left_out(self),)
@@ -273,12 +275,12 @@ class Automaton(Displayed):
     def to_hoa(self) -> str:
         """Return the automaton in the Hanoi omega-automata format, version 1.
 
-        That format is about infinite runs and has no acceptance for finite ones. So the accepting states are
-        written as the acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a state
-        of that set. The header `finite-runs`, which readers may ignore, says so.
+        The format describes infinite runs and has no acceptance condition for finite runs. The accepting
+        states are therefore acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a
+        state of that set. The header `finite-runs` says so, and readers may ignore it.
 
         Raises:
-            UsageError: its transitions are too many to be listed.
+            UsageError: there are too many transitions to list.
         """
         if not self.is_listable:
             raise UsageError(
@@ -296,6 +298,7 @@ class Automaton(Displayed):
             "acc-name: Buchi",
             "Acceptance: 1 Inf(0)",
             "properties: trans-labels explicit-labels state-acc complete deterministic",
+            # readers skip unknown headers that begin with a small letter (https://adl.github.io/hoaf/)
             'finite-runs: "accepted iff they end in a state of set 0"',
             "--BODY--",
         ]
@@ -313,8 +316,8 @@ class Automaton(Displayed):
         return above_of(self.entries, self.decisions)
 
     def _distances(self, goal: Collection[int], without: Collection[tuple[int, int]] = ()) -> dict[int, int]:
-        """Return for each state that can reach a goal, how many samples that takes."""
-        # moves that cannot be taken are few: where one begins, those that are left are looked up one by one
+        """Return the least number of samples to a goal state, for each state that can reach one."""
+        # transitions to avoid are few, so the other transitions of their sources are followed one by one
         left_out: dict[int, set[int]] = {}
         for source, target in without:
             if source in self.states:
@@ -339,7 +342,7 @@ class Automaton(Displayed):
         return distances
 
     def _ends(self, states: frozenset[int]) -> frozenset[int]:
-        """Return those of some states in which a run can end."""
+        """Return these states without the initial state, unless a run can end in it."""
         return states if self.has_returns else states - {self.initial}
 
     def _check(self, state: int, symbol: Sequence[object]) -> None:
@@ -354,7 +357,7 @@ class Automaton(Displayed):
 
 
 def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition]) -> Automaton:
-    """Return a machine that is `least` as a value."""
+    """Convert a minimal machine, a result of `least`, into an automaton."""
     accepting = frozenset(np.flatnonzero(machine.accepting).tolist())
     decisions = tuple(map(tuple, machine.decisions.tolist()))
     return Automaton(name, tuple(propositions), accepting, tuple(machine.moves.tolist()), decisions)
@@ -364,12 +367,12 @@ FALSE, TRUE, UNKNOWN = 0, 1, -1
 """Values of propositions."""
 
 StateSet: TypeAlias = NDArray[np.bool_]
-"""(S,), which states a run may be in."""
+"""(S,), whether a run may be in each state."""
 
 
 @dataclass(frozen=True, eq=False)
 class TransitionTable:
-    """The moves of an automaton for the kernels.
+    """The moves of an automaton as arrays, for the kernels.
 
     Attributes:
         entries: (S,), as in `Automaton`.
@@ -386,10 +389,10 @@ class TransitionTable:
         return cls(np.array(automaton.entries, np.int64), decisions)
 
     def states(self, state: int, values: Flags) -> Integers:
-        """Return the state (T,) after each sample, where every proposition is known.
+        """Return the state after each sample, (T,), if every proposition is known.
 
         Args:
-            state: that before the first sample.
+            state: state before the first sample.
             values: (P, T), 0 or 1.
         """
         result = np.empty(values.shape[1], np.int64)
@@ -397,11 +400,11 @@ class TransitionTable:
         return result
 
     def state_sets(self, states: StateSet, values: Flags) -> NDArray[np.bool_]:
-        """Return the states (T, S) that are possible after each sample.
+        """Return the possible states after each sample, (T, S).
 
         Args:
-            states: (S,), those before the first sample.
-            values: (P, T), 0, 1 or -1 where it is not known.
+            states: (S,), possible states before the first sample.
+            values: (P, T), 0, 1, or -1 if unknown.
         """
         result = np.zeros((values.shape[1], len(self.entries)), np.bool_)
         _spread(self.entries, self.decisions, states, values, result)
@@ -423,7 +426,7 @@ def _walk(entries: Integers, decisions: Integers, state: int, values: Flags, res
 def _spread(
     entries: Integers, decisions: Integers, states: StateSet, values: Flags, result: NDArray[np.bool_]
 ) -> None:
-    # the sample at which each decision was last visited: states share decisions, each is followed once
+    # sample of the last visit of each decision: states share decisions, which are followed once per sample
     visited = np.full(decisions.shape[0], -1, np.int64)
     stack = np.empty(decisions.shape[0] + 2, np.int64)
     before = states
@@ -454,9 +457,9 @@ def _spread(
 
 
 def words_text(automaton: Automaton) -> str:
-    """Describe states, what they mean, and their moves in words.
+    """Describe the states, their meaning and their transitions in words.
 
-    If not all transitions can be listed, it has the states nearest to the start.
+    If there are too many transitions to list, the text has only the states nearest to the start.
     """
     lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
     lines += [
@@ -475,7 +478,7 @@ def words_text(automaton: Automaton) -> str:
 
 
 def size_words(automaton: Automaton) -> str:
-    """Return its size: "33 states, 6 propositions"."""
+    """Return the size of an automaton: "33 states, 6 propositions"."""
     return f"{plural(len(automaton.states), 'state')}, {plural(len(automaton.propositions), 'proposition')}"
 
 
@@ -493,14 +496,14 @@ def state_words(automaton: Automaton, state: int) -> str:
 
 
 def state_colour(automaton: Automaton, state: int) -> str:
-    """Return a state's fill: light blue if it accepts permanently, light vermillion if it is a trap."""
+    """Return a state's fill: light blue if it accepts permanently, light vermillion for a trap, or white."""
     if state not in automaton.can_reject:
         return hexadecimal(light(POSITIVE))
     return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
 
 
 def abbreviate(automaton: Automaton) -> Automaton:
-    """Return the automaton with short names for long propositions, as fit on arrows."""
+    """Return the automaton with short names for propositions that are too long for arrows."""
     labels = {proposition.label for proposition in automaton.propositions}
     names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
     short = (
@@ -577,7 +580,7 @@ def _hoa_guard(transition: Transition) -> str:
 
 
 def _broken(text: str) -> list[str]:
-    """Return a sentence in lines, broken before `and` and `or`."""
+    """Wrap a sentence before `and` and `or`."""
     lines = [""]
     for word in text.split(" "):
         if word in ("and", "or") and len(lines[-1]) > _WIDTH:

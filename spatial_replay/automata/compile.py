@@ -1,4 +1,4 @@
-"""Formulas to automata: by progression, by products of operands, or by MONA."""
+"""Compilers from formulas to automata: by progression, by products of operands, or by MONA."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from spatial_replay.spec.load import require_specification
 from spatial_replay.text import named_arguments
 
 _MAX_DEPTH = 220
-"""Nested operators at most: ltlf2dfa recurses, and fails beyond 243."""
+"""Maximum depth of nested operators: ltlf2dfa recurses, and fails beyond 243."""
 _MAX_SIZE = 20_000
-"""Subformulas translated at most, each as often as it is written: about two seconds of work."""
+"""Maximum number of written subformulas to translate, which takes about two seconds."""
 
 _SIGNS: MappingProxyType[Kind, str] = MappingProxyType({"and": "&", "or": "|", "U": "U", "R": "R"})
 
@@ -44,7 +44,7 @@ def require_translatable(skeleton: Skeleton) -> None:
     """Refuse a formula that is too large for ltlf2dfa.
 
     Raises:
-        NoAutomatonError: it is not.
+        NoAutomatonError: the formula is too deep or has too many subformulas.
     """
     depth, size = _depth_and_size(skeleton)
     formula = "with its bounds unrolled the formula"
@@ -55,17 +55,17 @@ def require_translatable(skeleton: Skeleton) -> None:
 
 
 def mona_program(skeleton: Skeleton) -> str:
-    """Return the program whose automaton accepts the runs that satisfy a formula that is small enough.
+    """Translate a formula that is small enough into a MONA program.
 
-    Proposition 3 is the set `P3`; one that the formula does not depend on is left out.
+    Proposition 3 becomes the set `P3`. Propositions that the formula does not depend on are left out.
     """
-    # a thread of its own has the whole depth of recursion left, however deep its caller is
+    # ltlf2dfa recurses: a new thread has the whole recursion depth left, however deep its caller is
     with ThreadPoolExecutor(max_workers=1) as thread:
         return thread.submit(_translate, skeleton).result()
 
 
 def _depth_and_size(skeleton: Skeleton) -> tuple[int, int]:
-    """Return the depth of a formula, and the number of subformulas that its program is made of."""
+    """Return the depth of a formula, and the number of subformulas in its program."""
     depths: list[int] = []
     sizes: list[int] = []
     for node in skeleton.nodes:
@@ -76,13 +76,14 @@ def _depth_and_size(skeleton: Skeleton) -> tuple[int, int]:
 
 
 def _operands(node: Node) -> tuple[int, ...]:
-    """Return the numbers of a node's operands, each as often as it occurs in a program."""
+    """Return the numbers of a node's operands, each as often as it occurs in the program."""
     match node.kind:
         case "false" | "true" | "literal":
             return ()
         case "X" | "WX":
             return (node.first,)
         case "R":
+            # ltlf2dfa writes the right operand of a release twice
             return node.first, node.second, node.second
     return node.first, node.second
 
@@ -92,12 +93,12 @@ def _translate(skeleton: Skeleton) -> str:
 
     formula = _parser()(_text(skeleton.nodes, skeleton.root))
     program: str = MonaProgram(formula).mona_program()
-    # its first line repeats the formula in a comment
+    # the first line is a comment that repeats the formula
     return program.partition("\n")[2]
 
 
 def _text(nodes: Sequence[Node], number: int) -> str:
-    """Return a subformula as ltlf2dfa reads LTLf: propositions are `p0`, `p1` …, operands in brackets."""
+    """Return a subformula in ltlf2dfa's syntax: propositions are `p0`, `p1` …, operands are in brackets."""
     kind, first, second = nodes[number]
     match kind:
         case "false" | "true":
@@ -111,7 +112,7 @@ def _text(nodes: Sequence[Node], number: int) -> str:
 
 @cache
 def _parser() -> Callable[[str], object]:
-    """Return the parser of LTLf, which takes longer to make than to use."""
+    """Return the cached parser of LTLf, because its construction takes longer than its use."""
     from ltlf2dfa.parser.ltlf import LTLfParser
 
     parser: Callable[[str], object] = LTLfParser()
@@ -119,14 +120,15 @@ def _parser() -> Callable[[str], object]:
 
 
 _TIMEOUT_S = 10.0
+"""Time limit of MONA, s."""
 _MAX_MEMORY = 4 * 2**30
-"""Bytes that MONA may use."""
+"""Memory limit of MONA, bytes."""
 _MAX_OUTPUT = 32 * 2**20
-"""Bytes that are read of what MONA prints."""
+"""Limit of MONA's output, bytes."""
 _MAX_MOVES = 100_000
-"""Moves that are taken of an automaton."""
+"""Maximum number of moves in MONA's output."""
 _MAX_PROGRAM = 1_000_000
-"""Characters of a program that are given to MONA."""
+"""Maximum length of a MONA program, characters."""
 
 _HEADER = re.compile(r"DFA for formula with free variables:(.*)")
 _ACCEPTING = re.compile(r"Accepting states:([ \d]*)")
@@ -135,19 +137,20 @@ _MOVE = re.compile(r"State (\d+): ([01X]*) -> state (\d+)")
 
 
 def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
-    """Return the automaton of a skeleton over so many propositions.
+    """Return MONA's automaton of a skeleton with this number of propositions.
 
     Raises:
-        NoAutomatonError: MONA is not installed, fails or takes too long; a formula too large for it.
+        NoAutomatonError: MONA or ltlf2dfa is not installed, MONA fails or takes too long, or the formula is
+            too large for them.
     """
     require_translatable(skeleton)
-    # looked for before ltlf2dfa is imported, which takes longer than all else here
+    # checked before ltlf2dfa is imported, which takes about a second
     executable = shutil.which("mona")
     if executable is None:
         raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
     if find_spec("ltlf2dfa") is None:
         raise NoAutomatonError(
-            "what writes its programs is not installed: pip install 'spatial-replay[mona]'"
+            "ltlf2dfa, which writes its programs, is not installed: pip install 'spatial-replay[mona]'"
         )
     program = mona_program(skeleton)
     if (length := len(program)) > _MAX_PROGRAM:
@@ -156,16 +159,16 @@ def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
 
 
 def _output(executable: str, program: str) -> str:
-    """Run MONA on a program and return what it prints.
+    """Run MONA on a program and return its output.
 
-    The program goes through a pipe, not through a shell or a file, so any number may run at once.
+    The program goes through a pipe instead of a file, so any number of processes may run at once.
     """
     command = [executable, "-q", "-u", "-w", "/dev/stdin"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     ) as process:
         with suppress(OSError):
-            # it may have ended already, or limits may not be allowed here
+            # MONA may have ended already, or the system may not allow limits
             resource.prlimit(process.pid, resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
         timer = Timer(_TIMEOUT_S, process.kill)
         timer.start()
@@ -185,14 +188,14 @@ def _output(executable: str, program: str) -> str:
 
 
 def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
-    """Send the program, which MONA reads to its end first, and read what it prints."""
+    """Send the program and read the output; MONA prints nothing before it has read the whole program."""
     if process.stdin is None or process.stdout is None:
         return b""
     try:
         process.stdin.write(program)
         process.stdin.close()
     except BrokenPipeError:
-        # it has ended; its exit code and output say why
+        # MONA has ended; its exit code and output tell the reason
         pass
     printed = process.stdout.read(_MAX_OUTPUT + 1)
     if len(printed) <= _MAX_OUTPUT:
@@ -201,14 +204,14 @@ def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
 
 
 class _Cube(NamedTuple):
-    """Moves of a state: by proposition, whether it must be false ("0") or true ("1") or is free ("X")."""
+    """Moves of a state: for each proposition, "0" if it must be false, "1" if it must be true, else "X"."""
 
     symbol: str
     target: int
 
 
 def _machine(printed: str, propositions: int) -> Machine:
-    """Return the automaton that MONA printed; its state 0 only leads to the one in which a run begins."""
+    """Parse the automaton that MONA printed; its state 0 only leads to the state in which a run begins."""
     header, accepting, count = (pattern.search(printed) for pattern in (_HEADER, _ACCEPTING, _COUNT))
     if header is None or accepting is None or count is None:
         raise NoAutomatonError(f"it printed no automaton: {printed.strip()[:200]!r}")
@@ -233,7 +236,7 @@ def _machine(printed: str, propositions: int) -> Machine:
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
-    """Return the diagram of disjoint cubes that together cover everything, from a variable on."""
+    """Return the diagram of disjoint cubes that cover all symbols, beginning with a variable."""
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
@@ -247,17 +250,17 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
 
 
 Obligation: TypeAlias = tuple[int, bool]
-"""A subformula's number, and whether there has to be a next sample."""
+"""Number of a subformula that must hold at the next sample, and whether there must be a next sample."""
 
 
 class Chain(NamedTuple):
-    """Obligations, each of which is implied by the one before.
+    """Obligations in an order in which each implies the next.
 
     Attributes:
         members: numbers of their subformulas.
-        strong: whether there has to be a next sample.
-        first: the first of the variables that hold, as a number in binary, how many members do not hold.
-        bits: how many variables these are; the most significant bit comes first.
+        strong: whether there must be a next sample.
+        first: first of the variables that encode the number of failing members in binary.
+        bits: number of these variables; the most significant bit comes first.
     """
 
     members: tuple[int, ...]
@@ -267,14 +270,14 @@ class Chain(NamedTuple):
 
 
 class Obligations:
-    """The variables of obligations, allotted to a chain when the first of its members is needed."""
+    """The variables of obligations; a chain receives its variables when a member is first needed."""
 
     def __init__(self, diagrams: Diagrams, first: int, longer: Mapping[Obligation, int]) -> None:
         """Begin without obligations.
 
         Args:
             first: the first variable to allot.
-            longer: as `chains` of a skeleton.
+            longer: `chains` of a skeleton.
         """
         self._diagrams = diagrams
         self._first = first
@@ -289,21 +292,21 @@ class Obligations:
         chain, index = self._places[obligation]
         node = YES
         for bit in range(chain.bits):
-            # it holds iff at most the members before it do not: the count in the bits is at most its index
+            # a member holds iff only earlier members fail, so iff their count is at most its index
             branches = (YES, node) if index >> bit & 1 else (node, NO)
             node = self._diagrams.decide(chain.first + chain.bits - 1 - bit, *branches)
         return node
 
     def chain(self, variable: int) -> Chain:
-        """Return the chain that a variable is one of."""
+        """Return the chain that a variable belongs to."""
         return self._chains[variable - self._first]
 
     def cases(self, chain: Chain, node: int) -> list[tuple[int, int]]:
-        """Split a function that decides on a chain first into cases.
+        """Split a function into cases by the number of failing members of its first chain.
 
         Returns:
-            Pairs of a count and a function. The function applies where fewer members of the chain fail than
-            the count, and at least as many as the count of the pair before.
+            Pairs of an ascending count and a function. A function applies if fewer members fail than its
+            count, and at least as many as the previous count.
         """
         cases: list[tuple[int, int]] = []
         below = 0
@@ -315,7 +318,7 @@ class Obligations:
         return cases
 
     def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
-        """Yield the functions that are left, each with the number of counts in a row that it holds for."""
+        """Yield the remaining functions, each with the number of consecutive counts to which it applies."""
         if self._diagrams[node].variable >= chain.first + chain.bits:
             yield 1 << (chain.bits - bit), node
             return
@@ -332,7 +335,7 @@ class Obligations:
 
 
 def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ...]]:
-    """Return for each obligation that is in a chain, the chain's members."""
+    """Return the members of its chain for each obligation that is in a chain."""
     later = {(number, strong) for (_, strong), number in longer.items()}
     chains: dict[Obligation, tuple[int, ...]] = {}
     for begin, strong in longer:
@@ -341,17 +344,17 @@ def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ..
         members = [begin]
         while (after := longer.get((members[-1], strong))) is not None and (after, strong) not in chains:
             members.append(after)
-        # until by a sooner deadline implies until by a later one; holding longer implies holding shorter
+        # an until with a sooner deadline implies a later one; a longer release implies a shorter one
         ordered = tuple(members if strong else reversed(members))
         chains.update({(member, strong): ordered for member in members})
     return chains
 
 
 MAX_STATES = 5000
-"""States explored at most, before equivalent ones are merged."""
+"""Maximum number of explored states, before equivalent states are merged."""
 
 MAX_DECISIONS = 150_000
-"""How many nodes the decision diagrams may have."""
+"""Maximum number of nodes in the decision diagrams."""
 
 
 def machine_by_progression(
@@ -362,14 +365,14 @@ def machine_by_progression(
     states: int = MAX_STATES,
     decisions: int = MAX_DECISIONS,
 ) -> Machine:
-    """Return an automaton of a skeleton over so many propositions.
+    """Return an automaton of a skeleton with this number of propositions.
 
     Args:
-        number: the subformula that it is of; without it, the whole formula.
-        states, decisions: how many it takes at most.
+        number: number of the subformula to compile; None for the whole formula.
+        states, decisions: maximum numbers of states and of decisions.
 
     Raises:
-        NoAutomatonError: it would take more.
+        NoAutomatonError: a maximum is exceeded, or decisions are nested too deeply.
     """
     root = skeleton.root if number is None else number
     try:
@@ -379,7 +382,7 @@ def machine_by_progression(
 
 
 class _Progression:
-    """The states of a skeleton, explored from the first one."""
+    """The states of a skeleton, explored from its initial state."""
 
     def __init__(self, skeleton: Skeleton, propositions: int, states: int, decisions: int) -> None:
         self._skeleton = skeleton
@@ -410,7 +413,7 @@ class _Progression:
         return machine_of(result, moves, [self._accepts(node) for node in waiting], start)
 
     def _read(self, number: int) -> int:
-        """Return what a subformula requires of this sample and, as obligations, of the next."""
+        """Return the condition of a subformula on this sample and, as obligations, on the next sample."""
         if number not in self._now:
             self._now[number] = self._reading(number)
         return self._now[number]
@@ -437,7 +440,7 @@ class _Progression:
         raise ValueError(kind)
 
     def _after(self, node: int) -> int:
-        """Return the states that follow a state, under decisions on propositions."""
+        """Return the diagram from propositions to the next state of a state."""
         if node not in self._next:
             chain = self._obligations.chain(self._diagrams[node].variable)
             *cases, (_, rest) = self._obligations.cases(chain, node)
@@ -449,7 +452,7 @@ class _Progression:
         return self._next[node]
 
     def _accepts(self, node: int) -> bool:
-        """Return whether nothing is left to hold if the run has ended."""
+        """Return whether a run that ends in a state satisfies the formula."""
         while node not in (NO, YES):
             variable, low, high = self._diagrams[node]
             # at the end strong obligations fail, and weak ones hold
@@ -458,17 +461,17 @@ class _Progression:
 
 
 MAX_PAIRS = 400_000
-"""Pairs of decisions that are visited at most to join two automata."""
+"""Maximum number of visited pairs of decisions in a product of two automata."""
 
 MAX_PRODUCT = 50_000
-"""States that two joined automata have at most, before equivalent ones are merged."""
+"""Maximum number of states of a product, before equivalent states are merged."""
 
 _FEW_STATES, _FEW_DECISIONS = 1_000, 20_000
-"""A formula that takes no more is compiled at once, without a look at its operands."""
+"""Maximum size of a formula that is compiled as a whole instead of operand by operand."""
 
 
 def machine_by_composition(skeleton: Skeleton, propositions: int) -> Machine:
-    """Return an automaton of a skeleton over so many propositions.
+    """Return an automaton of a skeleton with this number of propositions.
 
     Raises:
         NoAutomatonError: it would take more states or decisions than are explored.
@@ -477,7 +480,7 @@ def machine_by_composition(skeleton: Skeleton, propositions: int) -> Machine:
 
 
 class _Composition:
-    """The automata of parts of a skeleton."""
+    """The automata of subformulas of a skeleton."""
 
     def __init__(self, skeleton: Skeleton, propositions: int) -> None:
         self._skeleton = skeleton
@@ -511,6 +514,7 @@ class _Composition:
         machines = [merge_equivalent_states(self.machine(operand)) for operand in operands]
         waiting = [(machine.size, number) for number, machine in enumerate(machines)]
         heapify(waiting)
+        # the two smallest machines first, because the size of a product is up to the product of the sizes
         while len(waiting) > 1:
             first, second = (machines[heappop(waiting)[1]] for _ in range(2))
             machines.append(merge_equivalent_states(join_machines(first, second, both)))
@@ -519,25 +523,25 @@ class _Composition:
 
 
 def join_machines(first: Machine, second: Machine, both: bool) -> Machine:
-    """Return the automaton of the runs that both machines accept or, if not `both`, that one of them does.
+    """Return the product of two machines, which accepts the runs that both accept or, if not `both`, either.
 
     Args:
         first, second: machines without equivalent states.
 
     Raises:
-        NoAutomatonError: it takes more than `MAX_PAIRS` or `MAX_PRODUCT`.
+        NoAutomatonError: the product exceeds `MAX_PAIRS` or `MAX_PRODUCT`.
     """
     return _Joining(first, second, both).machine()
 
 
 class _Joining:
-    """The pairs of places that are visited."""
+    """The visited pairs of places of two machines."""
 
     def __init__(self, first: Machine, second: Machine, both: bool) -> None:
         self._machines = first, second
         self._both = both
         self._left, self._right = first.decisions.tolist(), second.decisions.tolist()
-        # a trap of one loses for both, and a state that always accepts wins for either
+        # a trap decides a conjunction, and a permanently accepting state decides a disjunction
         self._decided = _permanent_states(first, not both), _permanent_states(second, not both)
         self._rows: list[tuple[int, int, int]] = []
         self._known: dict[tuple[int, int], int] = {}
@@ -586,7 +590,7 @@ class _Joining:
         return len(self._rows) - 1
 
     def _state(self, one: int, other: int) -> int:
-        """Return the place of a pair of states; (-1, -1) are those in which one has decided already."""
+        """Return the place of a pair of states; (-1, -1) is any pair with a state that decides the result."""
         number = self._states.get((one, other))
         if number is None:
             number = self._states[one, other] = len(self._pairs)
@@ -597,18 +601,19 @@ class _Joining:
 
 
 def _permanent_states(machine: Machine, accepts: bool) -> frozenset[int]:
-    """Return the places of states that accept permanently, or never."""
+    """Return the places of states that accept permanently or, if not `accepts`, never."""
     stays = machine.moves == ~np.arange(len(machine.moves))
     return frozenset((~np.flatnonzero(stays & (machine.accepting == accepts))).tolist())
 
 
 _VERSION = 1
+"""Version of the format of stored automata."""
 _LONGEST = 16 * 2**20
-"""Bytes of a stored automaton that are read at most."""
+"""Maximum size of a stored automaton, bytes."""
 
 
 def stored_text(automaton: Automaton, specification: Specification, spec: NamedSpec) -> str:
-    """Return an automaton as JSON, with the formula that it was compiled from."""
+    """Return an automaton as JSON, with the formula from which it was compiled."""
     return json.dumps(
         {
             "version": _VERSION,
@@ -624,7 +629,7 @@ def stored_text(automaton: Automaton, specification: Specification, spec: NamedS
 
 
 def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -> Automaton | None:
-    """Return the automaton of a spec from its JSON; None if that is of another formula, or is not one."""
+    """Read the automaton of a spec from JSON; None if the JSON is invalid or is for another formula."""
     if len(data) > _LONGEST:
         return None
     try:
@@ -667,7 +672,7 @@ def _decisions(value: object) -> tuple[tuple[int, int, int], ...] | None:
 
 
 def _is_sound(automaton: Automaton) -> bool:
-    """Return whether every decision leads on to later ones and, in the end, to states that there are."""
+    """Return whether every decision leads to decisions on later propositions, and finally to valid states."""
     rows, states, propositions = automaton.decisions, len(automaton.entries), len(automaton.propositions)
 
     def leads(place: int, row: int, after: int) -> bool:
@@ -701,16 +706,16 @@ def automaton(
 ) -> Automaton:
     """Return the automaton of a spec: which runs satisfy it, sample by sample.
 
-    It accepts a run that is fully observed and has a robustness above 0, and none with one below 0.
+    It accepts every fully observed run with a robustness above 0, and no run with a robustness below 0.
 
     Args:
-        name: which spec of the file; without it, its only result.
-        rate_hz: how many samples a second has. Bounds in seconds become bounds in samples with it, which mean
-            the same only in runs of that rate.
-        compiler: "own" or "mona"; both give equal automata. Without it, that of this package, and where that
-            reaches its limits, MONA.
-        stored: automata as files; one of this spec is taken rather than asking MONA, unless it has bounds in
-            seconds.
+        name: name of the spec; None for the only result of the file.
+        rate_hz: sampling rate, which converts bounds in seconds into bounds in samples. The result is valid
+            only for runs of this rate.
+        compiler: "own" or "mona"; both give equal automata. None tries this package first, and MONA if the
+            formula exceeds its limits.
+        stored: contents of automaton files. A stored automaton of this spec replaces a call of MONA, unless
+            the spec has bounds in seconds.
 
     Raises:
         NoAutomatonError: past operators, bounds in seconds without a rate, or too large.
@@ -743,10 +748,10 @@ def _compile_spec(
     compilers: Sequence[Compiler],
     stored: Iterator[Automaton],
 ) -> Automaton:
-    """Return the automaton of the first compiler that succeeds; a stored one rather than calling MONA.
+    """Return the automaton of the first compiler that succeeds; a stored automaton replaces a call of MONA.
 
     Raises:
-        NoAutomatonError: why none does.
+        NoAutomatonError: no compiler succeeds; the message has the reason of each.
     """
     count = len(propositions.all)
     if count > MAX_PROPOSITIONS:
@@ -769,7 +774,7 @@ def _compile_spec(
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """All that a machine follows from: a skeleton, without what its propositions say."""
+    """The key of a cached machine: a skeleton without the meaning of its propositions."""
 
     nodes: tuple[Node, ...]
     root: int
@@ -783,7 +788,7 @@ class _Shape:
         return cls(tuple(skeleton.nodes), skeleton.root, chains, propositions, skeleton)
 
 
-# a formula with another threshold has the same machine
+# cached, because a formula that differs only in a threshold has the same machine
 @lru_cache(maxsize=16)
 def _compose_least(shape: _Shape) -> Machine:
     """Return the least machine of a shape, by this package.
@@ -795,7 +800,7 @@ def _compose_least(shape: _Shape) -> Machine:
 
 
 def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:
-    """Yield those of files that are of a spec, read when they are asked for."""
+    """Yield the stored automata of a spec, read on demand."""
     for data in stored:
         automaton = automaton_from(data, specification, spec)
         if automaton is not None:
@@ -803,10 +808,10 @@ def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec
 
 
 def _check_size(automaton: Automaton) -> Automaton:
-    """Return an automaton that is small enough.
+    """Return the automaton, unless it has too many states or decisions.
 
     Raises:
-        NoAutomatonError: it is too large.
+        NoAutomatonError: it has more than `MAX_ROWS`.
     """
     rows = max(len(automaton.entries), len(automaton.decisions))
     if rows > MAX_ROWS:
@@ -815,7 +820,7 @@ def _check_size(automaton: Automaton) -> Automaton:
 
 
 def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
-    """Return the spec of a file that has a name; without one, its only result.
+    """Return the spec with a name; without a name, the only result of the specification.
 
     Raises:
         UsageError: no such spec, several to choose from.

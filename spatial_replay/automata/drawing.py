@@ -1,4 +1,4 @@
-"""Drawings of automata: by Graphviz, and as places of states and moves."""
+"""Drawings of automata: by Graphviz, and as positions of states and transitions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spatial_replay.automata.automaton import (
 from spatial_replay.errors import OutputError, UsageError
 
 _DRAWING_S = 120.0
-"""Seconds that Graphviz may take."""
+"""Time limit of Graphviz, s."""
 
 
 def svg_text(automaton: Automaton) -> str:
@@ -33,11 +33,12 @@ def svg_text(automaton: Automaton) -> str:
 
 
 def layout_text(automaton: Automaton) -> str:
-    """Return the places of states and arrows, without a legend, as JSON.
+    """Return Graphviz's positions of states and arrows as JSON, without a legend.
 
     Raises:
         UsageError, OutputError: as `svg_text`.
     """
+    # json0 leaves out the drawing operations of json (https://graphviz.org/docs/outputs/json/)
     return _graphviz(automaton, digraph_text(automaton), "json0")
 
 
@@ -65,16 +66,17 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
 
 
 _SWEEPS: Final = 4
+"""Passes over the columns that reorder their rows."""
 
 
 class DrawnState(NamedTuple):
     """A state in a drawing.
 
     Attributes:
-        about: the verdict of a run that ends there, in words.
-        is_lost: whether acceptance is out of reach from there.
-        is_won: whether rejection is.
-        distance: samples that it takes at least to reach acceptance; None if that is lost.
+        about: verdict of a run that ends in the state, in words.
+        is_lost: whether acceptance is unreachable.
+        is_won: whether rejection is unreachable.
+        distance: least number of samples to acceptance; None if acceptance is unreachable.
     """
 
     number: int
@@ -96,11 +98,11 @@ class DrawnMove(NamedTuple):
 
 
 class AutomatonDrawing(NamedTuple):
-    """An automaton as it is drawn.
+    """A drawing of an automaton.
 
     Attributes:
-        summary: its size in words.
-        left_out: how many states are not drawn.
+        summary: size of the automaton, in words.
+        left_out: number of states that are not drawn.
     """
 
     summary: str
@@ -110,10 +112,13 @@ class AutomatonDrawing(NamedTuple):
 
 
 def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> AutomatonDrawing:
-    """Place the states of an automaton; of a large one the visited ones, then those nearest to the start.
+    """Place the states of an automaton.
+
+    A large automaton is cut to `MOST_STATES` states: first the visited states, then the states nearest to
+    the start.
 
     Args:
-        visited: states whose moves come first, where there are too many.
+        visited: states that are drawn first, with their transitions, if there are too many.
     """
     first = {automaton.initial, *visited}
     others = [state for state in automaton.states if state not in first]
@@ -147,13 +152,17 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
 
 
 def guard_of(automaton: Automaton, move: DrawnMove) -> str:
-    """Return the guard of a move in words, as this automaton names its propositions; it has the move."""
+    """Return the guard of a drawn transition, with this automaton's names of the propositions."""
     transition = automaton.transition(move.source, move.target)
     return "" if transition is None else automaton.guard_words(transition, LONGEST_GUARD)
 
 
 def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
-    """Return column and row of each state: columns follow the transitions, rows make few of them cross."""
+    """Return the column and row of each state.
+
+    Columns follow the transitions. The barycentre heuristic orders the rows, so that few transitions cross
+    (Sugiyama, Tagawa and Toda, 1981).
+    """
     state_set = set(shown)
     successors = {
         state: [successor for successor in automaton.successors[state] if successor in state_set]
@@ -173,7 +182,7 @@ def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[in
 
 
 def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
-    """Return the length of the longest path to each state, without transitions that lead back."""
+    """Return the length of the longest path to each state, without back edges."""
     ended: list[int] = []
     on_way: set[int] = set()
     back: set[tuple[int, int]] = set()
@@ -201,13 +210,13 @@ def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[i
 
 
 def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
-    """Yield the states of a column with their rows, around the middle."""
+    """Yield the states of a column with rows centred on 0."""
     for place, state in enumerate(layer):
         yield state, place - (len(layer) - 1) / 2.0
 
 
 def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
-    """Return the mean row of the states that lead to one, or its own."""
+    """Return the mean row of a state's predecessors; its own row if it has none."""
     rows_before = [
         row[source] for source, targets in successors.items() if source != state and state in targets
     ]

@@ -27,14 +27,14 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import is_spatial, without_variables
 
 LEAF = 1 << 60
-"""The variable of a leaf: it orders after all others."""
+"""Variable of leaves, which sorts after all others."""
 
 
 class Decision(NamedTuple):
-    """A node; of a leaf, `low` is its number.
+    """A node of a decision diagram; `low` of a leaf is the leaf's number.
 
     Attributes:
-        low, high: the nodes where the variable is false, and true.
+        low, high: nodes for a false and for a true variable.
     """
 
     variable: int
@@ -43,17 +43,17 @@ class Decision(NamedTuple):
 
 
 NO, YES = 0, 1
-"""The nodes of the Boolean constants, which are leaves 0 and 1."""
+"""Nodes of the Boolean constants, which are leaves 0 and 1."""
 
 
 class Diagrams:
-    """Nodes, each once."""
+    """Reduced ordered binary decision diagrams with shared nodes (Bryant, 1986)."""
 
     def __init__(self, limit: int = LEAF) -> None:
-        """Begin with the constants.
+        """Add the nodes of the constants.
 
         Args:
-            limit: more nodes are an error.
+            limit: maximum number of nodes; one more raises NoAutomatonError.
         """
         self._nodes: list[Decision] = []
         self._numbers: dict[Decision, int] = {}
@@ -72,15 +72,15 @@ class Diagrams:
         return self._add(Decision(LEAF, number, number))
 
     def decide(self, variable: int, low: int, high: int) -> int:
-        """Return the node that decides on a variable, which orders before those of `low` and `high`."""
+        """Return the node that decides on a variable; `low` and `high` may only decide on later variables."""
         return low if low == high else self._add(Decision(variable, low, high))
 
     def variable(self, variable: int) -> int:
-        """Return the function that is true where a variable is."""
+        """Return the function that equals a variable."""
         return self._add(Decision(variable, NO, YES))
 
     def choose(self, condition: int, then: int, otherwise: int) -> int:
-        """Return the function that is `then` where a condition holds, and `otherwise` elsewhere."""
+        """Return the function "if `condition` then `then` else `otherwise`"."""
         if condition == YES or then == otherwise:
             return then
         if condition == NO:
@@ -109,7 +109,10 @@ class Diagrams:
         return self.choose(node, NO, YES)
 
     def branches(self, node: int, variable: int) -> tuple[int, int]:
-        """Return the cofactors of a function: with a variable false, and true. None before it may matter."""
+        """Return the cofactors of a function: with a variable false, and with it true.
+
+        The function may not depend on earlier variables.
+        """
         decision = self._nodes[node]
         return decision[1:] if decision.variable == variable else (node, node)
 
@@ -126,11 +129,11 @@ class Diagrams:
 def node_copier(
     source: Diagrams, target: Diagrams, variables: int, leaf: Callable[[int], int]
 ) -> Callable[[int], int]:
-    """Return a function that copies nodes from one collection into another, with other leaves.
+    """Return a function that copies nodes from `source` into `target`, with other leaves.
 
     Args:
-        variables: nodes that decide on none of the first so many variables count as leaves.
-        leaf: the number of the leaf in the target for such a node of the source.
+        variables: number of variables to copy; a node that decides on a later variable becomes a leaf.
+        leaf: function from such a node of the source to the number of its leaf in the target.
     """
     copies: dict[int, int] = {}
 
@@ -148,11 +151,11 @@ def node_copier(
 
 @dataclass(frozen=True)
 class Proposition:
-    """A subformula without temporal operators; true in a sample iff its robustness there is at least 0.
+    """A subformula without temporal operators; true in a sample iff its robustness is at least 0.
 
     Attributes:
-        text: its canonical text.
-        name: the name that the specification gives to it, or None.
+        text: canonical text of the formula.
+        name: name of the formula in the specification, or None.
     """
 
     formula: Formula
@@ -165,11 +168,11 @@ class Proposition:
         return self.name or self.text
 
     def literal(self, value: bool) -> str:
-        """Return the sentence that it is true, or that it is not."""
+        """Return the proposition or, if `value` is False, its negation as a sentence."""
         if self.name is not None:
             return self.name if value else f"not {self.name}"
         if isinstance(self.formula, Boolean) and self.formula.operator == "not":
-            # the opposite of a negation is what it negates
+            # the negation of `not a` is written as `a`
             return self.text if value else _bracket(self.formula.operands[0])
         return _bracket(self.formula) if value else f"not ({self.text})"
 
@@ -184,8 +187,8 @@ def _bracket(formula: Formula) -> str:
 class Propositions:
     """The propositions of a formula, numbered in the order of the text.
 
-    Equal ones, however they are written (`a and b`, `b and a`; `a leftof b`, `not (a rightof b)`), are one.
-    So are a proposition and its negation where a formula holds both: the second is the first, negated.
+    Equivalent subformulas are one proposition: `a and b` and `b and a`, `a leftof b` and
+    `not (a rightof b)`. A subformula and its negation are also one proposition: the one written first.
     """
 
     def __init__(self, formula: Formula) -> None:
@@ -197,16 +200,16 @@ class Propositions:
             self._add(proposition)
 
     def literal(self, formula: Formula) -> tuple[int, bool] | None:
-        """Return a maximal spatial subformula's proposition and whether it is that or its negation.
+        """Return the number of a maximal spatial subformula's proposition, and False if it is negated.
 
-        None for all other formulas, those that expansions are made of included.
+        None for all other formulas, including the formulas inside expansions.
         """
         return self._literals.get(id(formula))
 
     def _add(self, formula: Formula) -> None:
         shape = self._shapes.of(formula)
         if shape in (YES, NO):
-            # logic alone decides it, but where a relation and its opposite both are 0
+            # a tautology or contradiction, except where a relation and its opposite are both 0
             shape = self._shapes.of_text(formula)
         negated = self._shapes.negate(shape)
         if negated in self._numbers:
@@ -218,7 +221,10 @@ class Propositions:
         self._literals[id(formula)] = self._numbers[shape], True
 
     def _text(self, formula: Formula) -> str:
-        """Return the text of a proposition, which says how it treats a rate without a value if it has to."""
+        """Return the text of a proposition.
+
+        If another proposition has the same text, it also states the result for a rate without a value.
+        """
         text = format_formula(formula)
         if all(proposition.text != text for proposition in self.all):
             return text
@@ -227,7 +233,7 @@ class Propositions:
 
 
 def _maximal(formula: Formula) -> Iterator[Formula]:
-    """Yield the largest subformulas about one sample, in the order of the text; constants are none."""
+    """Yield the largest subformulas without temporal operators, in the order of the text; skip constants."""
     if isinstance(formula, Truth):
         return
     if is_spatial(formula):
@@ -238,7 +244,7 @@ def _maximal(formula: Formula) -> Iterator[Formula]:
 
 
 class Shapes:
-    """Spatial formulas as diagrams over their relations: equal ones, however written, are one node."""
+    """Spatial formulas as decision diagrams over their relations; equivalent formulas share a node."""
 
     def __init__(self) -> None:
         self._diagrams = Diagrams(MAX_SHAPES)
@@ -246,19 +252,19 @@ class Shapes:
         self._known: dict[int, tuple[Formula, int]] = {}
 
     def of(self, formula: Formula) -> int:
-        """Return the node of a formula about one sample."""
+        """Return the node of a formula without temporal operators."""
         if id(formula) not in self._known:
             try:
                 node = self._of(expand(formula))
             except (NoAutomatonError, RecursionError):
-                # too large to be compared with others by what it means
+                # too large for a comparison by meaning: only equal texts are recognized as equivalent
                 node = self.of_text(formula)
             # the formula is kept, so that its id stays its own
             self._known[id(formula)] = formula, node
         return self._known[id(formula)][1]
 
     def of_text(self, formula: Formula) -> int:
-        """Return a node that only a formula of the same text has."""
+        """Return a node that only formulas of the same text share."""
         return self._variable(format_formula(formula))
 
     def negate(self, node: int) -> int:
@@ -281,10 +287,10 @@ class Shapes:
             case Boolean():
                 join = self._diagrams.both if formula.operator == "and" else self._diagrams.either
                 nodes = [self.of(operand) for operand in formula.operands]
-                # the last ones first: their variables are below those of the others
+                # from the last operand on: its variables are the deepest, so each join adds nodes on top
                 return reduce(lambda below, operand: join(operand, below), reversed(nodes))
             case Quantified():
-                # "exists" is not "forall" of the negation
+                # `exists x: a` is stored as `not forall x: not a`
                 body, is_every = self.of(without_variables(formula)), formula.quantifier == "forall"
                 key = len(formula.variables), formula.group, body if is_every else self.negate(body)
                 every = self._variable(key)
@@ -297,13 +303,14 @@ class Shapes:
 
 
 MAX_SHAPES = 200_000
-"""How many nodes the diagrams have by which propositions are compared."""
+"""Maximum number of nodes in the diagrams that compare propositions."""
 
 
 def _split_sign(atom: Atom) -> tuple[Expression, bool]:
-    """Return an expression that says the same as a relation, or the opposite, and whether it is the same.
+    """Return the normalized expression of a relation, and False if it is the relation's negation.
 
-    Comparisons of signals are left as they are: signals are often equal to their limits, where both hold.
+    Comparisons of signals are not normalized: signals are often equal to their limits, and at the limit a
+    comparison and its negation both hold.
     """
     expression, is_positive = atom.expression, True
     while atom.relation not in ("signal", "sum"):
@@ -319,26 +326,26 @@ def _split_sign(atom: Atom) -> tuple[Expression, bool]:
 
 
 Literal: TypeAlias = tuple[int, bool]
-"""A proposition's number, and whether it has to be true."""
+"""Number of a proposition, and whether it must be true."""
 
 Cube: TypeAlias = tuple[Literal, ...]
-"""Literals that all have to hold, by proposition; without any, it always does."""
+"""Conjunction of literals, sorted by proposition; the empty cube is true."""
 
 Guard: TypeAlias = tuple[Cube, ...]
-"""Cubes of which one has to hold."""
+"""Disjunction of cubes."""
 
 
 MAX_CUBES = 100_000
-"""How many cubes a guard has at most."""
+"""Maximum number of cubes of a guard."""
 
 FEW_CUBES = 1_000
-"""How many cubes are kept of a guard that has more than `MAX_CUBES`."""
+"""Number of cubes that represent a guard of more than `MAX_CUBES`."""
 
 
 class Covers:
-    """Functions as irredundant disjunctions of cubes: no cube and no literal of one can be left out.
+    """Functions as irredundant disjunctions of cubes: no cube and no literal can be omitted.
 
-    The algorithm is that of Minato and Morreale (1992): equal functions have equal cubes.
+    The algorithm is by Minato and Morreale (1992). Equal functions have equal cubes.
     """
 
     def __init__(self, diagrams: Diagrams) -> None:
@@ -349,16 +356,16 @@ class Covers:
         """Return the cubes of a function.
 
         Raises:
-            NoAutomatonError: they are more than `MAX_CUBES`.
+            NoAutomatonError: the function takes more than `MAX_CUBES` cubes.
         """
         cover = self._between(node, node)
-        # counted before they are written out
+        # the size is known before the cubes are written out
         if cover.size > MAX_CUBES:
             raise NoAutomatonError(f"a guard takes more than {MAX_CUBES} cubes")
         return tuple(sorted(_cubes_of(cover)))
 
     def some(self, node: int) -> Guard:
-        """Return some cubes of a function, `FEW_CUBES` at most, of which no two hold at once."""
+        """Return up to `FEW_CUBES` disjoint cubes of a function."""
         cubes: list[Cube] = []
         stack: list[tuple[int, Cube]] = [(node, ())]
         while stack and len(cubes) < FEW_CUBES:
@@ -371,7 +378,7 @@ class Covers:
         return tuple(cubes)
 
     def _between(self, lower: int, upper: int) -> _Cover:
-        """Return cubes that hold where `lower` does and at most where `upper` does."""
+        """Return cubes whose disjunction is implied by `lower` and implies `upper`."""
         if lower == NO:
             return _Cover(0, NO)
         if upper == YES:
@@ -388,7 +395,7 @@ class Covers:
         high_0, high_1 = diagrams.branches(upper, variable)
         low = self._between(diagrams.both(low_0, diagrams.complement(high_1)), high_0)
         high = self._between(diagrams.both(low_1, diagrams.complement(high_0)), high_1)
-        # what the cubes with this variable leave open is left to cubes without it
+        # cubes without this variable cover the rest of `lower`
         open_0 = diagrams.both(low_0, diagrams.complement(low.covered))
         open_1 = diagrams.both(low_1, diagrams.complement(high.covered))
         rest = self._between(diagrams.either(open_0, open_1), diagrams.both(high_0, high_1))
@@ -398,13 +405,13 @@ class Covers:
 
 
 class _Cover(NamedTuple):
-    """Cubes that are not written out.
+    """A set of cubes that is not written out.
 
     Attributes:
-        size: how many there are.
-        covered: the function that they are together.
-        split: a variable, the cubes in which it is false and true, without it, and those that leave it out;
-            None for no cube, or the empty one alone.
+        size: number of cubes.
+        covered: disjunction of the cubes.
+        split: variable, then the cubes with it false, with it true, and without it. The variable itself is
+            omitted from the cubes. None for no cube, and for only the empty cube.
     """
 
     size: int
@@ -413,7 +420,6 @@ class _Cover(NamedTuple):
 
 
 def _cubes_of(cover: _Cover) -> Iterator[Cube]:
-    """Yield the cubes of a cover."""
     waiting: list[tuple[_Cover, Cube]] = [(cover, ())]
     while waiting:
         (size, _, split), cube = waiting.pop()
@@ -429,10 +435,10 @@ class Transition:
     """A move from one state to another.
 
     Attributes:
-        guard: cubes of literals (proposition's number, whether it is true), of which one has to hold; no cube
-            and no literal of one can be left out.
-        is_cut: whether the guard takes more than `MAX_CUBES`. Then it has only some of them, each of which
-            leads to the target, and no two of which hold at once.
+        guard: disjunction of cubes, which are conjunctions of literals (number of a proposition, whether it
+            must be true). No cube and no literal can be omitted.
+        is_cut: whether the guard takes more than `MAX_CUBES` cubes. Then `guard` has only some of them,
+            which are disjoint.
     """
 
     source: int
@@ -442,10 +448,10 @@ class Transition:
 
 
 def guard_words(move: Transition, propositions: Sequence[Proposition], longest: int | None = None) -> str:
-    """Return a guard as a sentence of the specification language; one that is cut ends in "…".
+    """Return a guard as a sentence of the specification language; a cut guard ends in "…".
 
     Args:
-        longest: characters after which it is cut.
+        longest: maximum number of characters; None for no limit.
     """
     if move.guard == ((),):
         return "true"
@@ -462,10 +468,10 @@ def guard_words(move: Transition, propositions: Sequence[Proposition], longest: 
 
 
 class Moves:
-    """The moves of an automaton as decision diagrams; what was asked for is remembered."""
+    """The moves of an automaton as decision diagrams, with a cache of successors and transitions."""
 
     def __init__(self, entries: Sequence[int], decisions: Sequence[tuple[int, int, int]]) -> None:
-        """Take over `entries` and `decisions` of an automaton."""
+        """Convert `entries` and `decisions` of an automaton."""
         self._diagrams = Diagrams()
         self._covers = Covers(self._diagrams)
         places: list[int] = []
@@ -484,14 +490,14 @@ class Moves:
         return len(self._nodes)
 
     def successors(self, source: int) -> tuple[int, ...]:
-        """Return the states that one sample can lead to from a state, in order."""
+        """Return the states that one sample can lead to from a state, in ascending order."""
         node = self._nodes[source]
         if node not in self._successors:
             self._successors[node] = tuple(sorted(self._leaves(node)))
         return self._successors[node]
 
     def transition(self, source: int, target: int) -> Transition:
-        """Return the move from one state to another that one sample can lead to."""
+        """Return the transition from a state to one of its successors."""
         key = (source, target)
         if key not in self._transitions:
             node = self._to(target, self._nodes[source], self._leading.setdefault(target, {}))
@@ -518,7 +524,7 @@ class Moves:
         return leaves
 
     def _to(self, target: int, node: int, known: dict[int, int]) -> int:
-        """Return the function that is true where a node leads to a state."""
+        """Return the condition under which a node leads to a state."""
         if node not in known:
             variable, low, high = self._diagrams[node]
             if variable == LEAF:
@@ -530,7 +536,7 @@ class Moves:
 
 
 class Successors(Sequence[tuple[int, ...]]):
-    """For each state, those that one sample can lead to; worked out when they are asked for."""
+    """The successors of each state, computed on demand."""
 
     def __init__(self, moves: Moves) -> None:
         self._moves = moves

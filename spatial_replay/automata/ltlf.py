@@ -1,6 +1,6 @@
-"""The temporal skeleton of a formula: LTLf over propositions, in negation normal form, bounds unrolled.
+"""The temporal skeleton of a formula: LTLf over propositions in negation normal form with unrolled bounds.
 
-A formula without an automaton is refused here, with the place of the operator that is to blame.
+A formula that has no automaton is refused with the place of the responsible operator.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from spatial_replay.spec.formula import (
 )
 
 _ROUNDING = 1e-6
-"""By how many samples a bound in seconds may miss one, since it is a decimal number and so is a rate."""
+"""Tolerance of bounds in seconds, samples: bounds and rates are decimal numbers, and are rounded."""
 
 
 def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
-    """Return a bound in samples, at so many a second; None if no sample is in the window."""
+    """Convert a bound into samples at a rate; None if no sample is in the window."""
     if bound.unit == "samples":
         return bound
     lower = math.ceil(bound.lower * rate_hz / 1e9 - _ROUNDING)
@@ -41,7 +41,7 @@ def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
 
 
 def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
-    """Return what bounds in seconds become: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without any."""
+    """Return a sentence on bounds in seconds: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without any."""
     sentences: dict[str, None] = {}
     for node in _temporal(formula):
         if node.bound is not None and _counts_seconds(node.bound):
@@ -56,10 +56,10 @@ def counts_seconds(formula: Formula) -> bool:
 
 
 def refuse_operators(formula: Formula, source: SourceText | None, rate_hz: float | None = None) -> None:
-    """Refuse operators that look back, or count seconds of which it is not known how many samples they have.
+    """Refuse past operators, and bounds in seconds if the rate is unknown or no sample is in the window.
 
     Raises:
-        NoAutomatonError: with every operator that does.
+        NoAutomatonError: names every such operator.
     """
     faults = []
     for node in _temporal(formula):
@@ -83,7 +83,10 @@ def refuse_operators(formula: Formula, source: SourceText | None, rate_hz: float
 
 
 def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoAutomatonError:
-    """Return the error for a spec that no compiler can compile, at its widest window or at all of it."""
+    """Return the error for a spec that no compiler can compile.
+
+    Its place is the operator with the widest window or, without windows, the whole formula.
+    """
     place = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(place):
         place = _without_names(spec.formula)
@@ -95,7 +98,7 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
 def obstacle(
     source: SourceText | None, node: Formula | None, message: str, remedy: str = ""
 ) -> NoAutomatonError:
-    """Return the error for a node, with its place if the source is known."""
+    """Return the error for a node, with its place in the source text if there is one."""
     hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
     if source is None or node is None:
         return NoAutomatonError(f"{message}; {hint}", message)
@@ -114,25 +117,25 @@ def _temporal(formula: Formula) -> Iterator[Temporal]:
 
 
 def _counts_seconds(bound: Bound) -> bool:
-    """Return whether the bound depends on times: not if it is only this sample, or all from this one on."""
+    """Return whether a bound depends on times: all bounds in seconds except [0s, 0s] and [0s, inf]."""
     return bound.unit == "ns" and (bound.lower > 0 or bound.upper not in (0, None))
 
 
 def _width(node: Formula) -> int:
-    """Return the number of samples ahead that a node's bound reaches."""
+    """Return the end of a node's window, or its begin if the window is unbounded; 0 without a window."""
     bound = node.bound if isinstance(node, Temporal) else None
     return 0 if bound is None else bound.upper or bound.lower
 
 
 def _without_names(formula: Formula) -> Formula:
-    """Return the formula that one that only names another spec stands for."""
+    """Return the formula behind a formula that is only the name of another spec."""
     while isinstance(formula, Boolean) and formula.operator == "spec":
         (formula,) = formula.operands
     return formula
 
 
 MAX_NODES = 10_000
-"""How many subformulas a skeleton has at most, once its bounds are unrolled."""
+"""Maximum number of subformulas of a skeleton, after its bounds are unrolled."""
 
 Kind = Literal["false", "true", "literal", "and", "or", "X", "WX", "U", "R"]
 
@@ -141,7 +144,8 @@ class Node(NamedTuple):
     """One subformula.
 
     Attributes:
-        first, second: numbers of its operands; of a literal, its proposition and whether it is true (1).
+        first, second: numbers of the operands. A literal has the number of its proposition, and 1 if the
+            proposition must be true or 0 if it must be false.
     """
 
     kind: Kind
@@ -154,13 +158,14 @@ FALSE, TRUE = 0, 1
 
 
 class Skeleton:
-    """The subformulas of a formula, equal ones once; operands come before what they are operands of.
+    """The distinct subformulas of a formula; an operator comes after its operands.
 
     Attributes:
-        nodes: by number.
-        root: the number of the whole formula.
-        chains: the same subformula over a window longer by one sample, by the number of the shorter one and
-            whether it is an until. A shorter until implies the longer one; for a release it is the reverse.
+        nodes: subformulas, indexed by number.
+        root: number of the whole formula.
+        chains: from the number of a subformula, and whether it is an until, to the number of the same
+            subformula over a window that is longer by one sample. A shorter until implies the longer until.
+            A longer release implies the shorter release.
     """
 
     def __init__(
@@ -173,8 +178,8 @@ class Skeleton:
         """Unroll a formula.
 
         Args:
-            source: where it stands, for messages.
-            rate_hz: how many samples a second has, for bounds in seconds.
+            source: text of the formula, for error messages.
+            rate_hz: sampling rate, for bounds in seconds.
 
         Raises:
             NoAutomatonError: past operators, bounds in seconds without a rate, more than `MAX_NODES`
@@ -196,10 +201,10 @@ class Skeleton:
         self.root = self._of(formula, True)
 
     def split(self, number: int) -> tuple[Literal["and", "or"], tuple[int, ...]]:
-        """Return subformulas whose conjunction or disjunction a subformula is; alone, if there are none.
+        """Split a subformula into the operands of a conjunction or disjunction.
 
-        `G (a and b)` is `(G a) and (G b)`, and so is whatever holds until released; `F` and until distribute
-        over `or`.
+        Release distributes over `and` in its right operand: `G (a and b)` is `(G a) and (G b)`. Until, and
+        so `F`, distributes over `or`. The result is the subformula alone if it cannot be split.
         """
         kind, first, second = self.nodes[number]
         match kind:
@@ -213,7 +218,7 @@ class Skeleton:
         return "and", (number,)
 
     def _operands(self, kind: Kind, number: int) -> tuple[int, ...]:
-        """Return the operands of a conjunction or disjunction, however it is bracketed."""
+        """Return the operands of a conjunction or disjunction, with nested ones flattened."""
         operands: dict[int, None] = {}
         stack = [number]
         while stack:
@@ -256,7 +261,7 @@ class Skeleton:
 
     def _temporal(self, formula: Temporal, operands: list[int], positive: bool) -> int:
         self._unrolled = self._operator
-        # in its polarity the node is an until (strong) or a release
+        # a negated until is a release, and a negated release is an until (strong)
         strong = (formula.operator != "G") == positive
         if formula.operator == "X":
             return self._next(operands[0], strong)
@@ -267,7 +272,7 @@ class Skeleton:
         return self._within(left, operands[-1], bound, strong)
 
     def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
-        """Unroll an until, or a release where not `strong`, over a window."""
+        """Unroll an until (`strong`) or a release over a window."""
         lower, upper = (0, None) if bound is None else (bound.lower, bound.upper)
         if max(lower, upper or 0) > MAX_NODES:
             raise self._too_large()
@@ -305,7 +310,7 @@ class Skeleton:
     def _node(self, kind: Kind, first: int = 0, second: int = 0) -> int:
         node = Node(kind, first, second)
         if kind in ("U", "R") and self.nodes[second][:2] == (kind, first):
-            # G G a is G a, and so on: `G a and G b` may well be read as G (a and G b)
+            # G G a is G a: the text `G a and G b` parses as G (a and G b), which splits into G a and G G b
             return second
         if node not in self._numbers:
             if len(self.nodes) == MAX_NODES:

@@ -1,4 +1,4 @@
-"""Machines that compilers produce, and the least of those that accept the same runs."""
+"""Machines that the compilers produce, and their minimization."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from spatial_replay.geometry.arrays import Flags, Integers
 class Machine:
     """A deterministic automaton with a move from every state for every symbol.
 
-    A *place* is a row of `decisions`, or ~q for state q.
+    A *place* is the index of a row of `decisions`, or ~q for state q.
 
     Attributes:
-        moves: (S,), the place with which the moves of each state begin.
-        decisions: (D, 3), a proposition and the places where it is false, and true. These decide on later
-            propositions and stand in earlier rows.
-        accepting: (S,), whether a run may end in each state.
-        start: the place with which the first sample of a run begins.
+        moves: (S,), place of each state's first decision.
+        decisions: (D, 3), rows of a proposition, the place if it is false, and the place if it is true.
+            Rows at these places decide on later propositions and have smaller indices.
+        accepting: (S,), whether each state accepts.
+        start: place of the first decision of a run.
     """
 
     moves: Integers
@@ -35,12 +35,12 @@ class Machine:
 
     @property
     def size(self) -> int:
-        """How many states and decisions it has."""
+        """Number of states plus number of decisions."""
         return len(self.moves) + len(self.decisions)
 
 
 def machine_of(diagrams: Diagrams, moves: Sequence[int], accepting: Sequence[bool], start: int) -> Machine:
-    """Return the machine whose moves are nodes of diagrams with states as leaves."""
+    """Return the machine of moves that are nodes of decision diagrams, with states as leaves."""
     places: list[int] = []
     rows: list[tuple[int, int, int]] = []
     for node in range(len(diagrams)):
@@ -61,7 +61,7 @@ def _machine(
 
 
 def merge_equivalent_states(machine: Machine) -> Machine:
-    """Return a machine that accepts the same runs, without equivalent states."""
+    """Return a machine that accepts the same runs and has no equivalent states."""
     _, firsts, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
     places, decisions = _relabel(machine, classes)
     moves = places[machine.moves[firsts]]
@@ -69,15 +69,15 @@ def merge_equivalent_states(machine: Machine) -> Machine:
 
 
 def least(machine: Machine) -> Machine:
-    """Return the automaton with the fewest states, one of them, 0, for a run that has not begun.
+    """Return the minimal automaton, whose state 0 is the state before the first sample.
 
-    Two machines that accept the same runs of at least one sample give equal ones: states are numbered by
-    their distance from the first one. No run is empty, so that may be any state with the same moves, and one
-    that does not accept if there is a choice.
+    Machines that accept the same non-empty runs give equal automata, because states are numbered by their
+    distance from state 0. Whether state 0 accepts is irrelevant, since no run is empty. So any state with
+    the start's moves serves as state 0, preferably one that does not accept.
     """
     machine = merge_equivalent_states(machine)
     reachable = _reachable(machine)
-    # compilers differ in states that no run is in
+    # compilers differ in their unreachable states, so these are dropped
     same = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
     if len(same):
         first = int(same[np.argmin(machine.accepting[same])])
@@ -89,11 +89,11 @@ def least(machine: Machine) -> Machine:
 
 
 def _reachable(machine: Machine) -> list[int]:
-    """Return the states that can be reached: nearer ones first, then false before true."""
+    """Return the reachable states by distance; at equal distance, false branches come before true ones."""
     moves, rows = machine.moves.tolist(), machine.decisions.tolist()
     order: dict[int, None] = {}
     waiting: list[int] = []
-    # a decision visited before leads to no new state
+    # a decision that was visited leads to no new state
     visited = [False] * len(rows)
     stack = [machine.start]
     expanded = 0
@@ -114,7 +114,10 @@ def _reachable(machine: Machine) -> list[int]:
 
 
 def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
-    """Return only some states, in the order given, and decisions in theirs; no move leads to another."""
+    """Return the machine of only these states, in this order.
+
+    No move of these states may lead to any other state.
+    """
     numbers = {state: number for number, state in enumerate(states)}
     rows = machine.decisions.tolist()
     places: dict[int, int] = {}
@@ -137,22 +140,24 @@ def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
 
 
 def _relabel(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
-    """Give the states other numbers, and merge decisions that have become equal.
+    """Renumber the states, and merge decisions that become equal.
 
     Returns:
-        For each place its new place, (D + S,), to be indexed by place: ~q is index D + S - 1 - q. And the new
-        decisions.
+        The new place of each old place, (D + S,), and the new decisions. A negative place ~q indexes the
+        array from its end.
     """
     decisions = machine.decisions
     places = np.concatenate([np.empty(len(decisions), np.int64), ~numbers[::-1]])
     span = len(places) + 1
     levels: list[Integers] = []
     count = 0
+    # rows of later propositions first, because rows of earlier propositions refer to them
     for rows in _levels(decisions):
         variable = decisions[rows[0], 0]
         low, high = places[decisions[rows, 1]], places[decisions[rows, 2]]
         places[rows] = low
         differ = low != high
+        # each pair of places as one integer; places of states are negative, hence the span
         keys = (low[differ] + span) * (2 * span) + high[differ] + span
         kinds, firsts, inverse = np.unique(keys, return_index=True, return_inverse=True)
         places[rows[differ]] = count + inverse.ravel()
@@ -164,7 +169,7 @@ def _relabel(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
 
 
 def _levels(decisions: Integers) -> Iterator[Integers]:
-    """Yield the rows that decide on each proposition, the last proposition first."""
+    """Yield the rows of each proposition, from the last proposition to the first."""
     if not len(decisions):
         return
     order = np.argsort(-decisions[:, 0], kind="stable")
@@ -173,10 +178,11 @@ def _levels(decisions: Integers) -> Iterator[Integers]:
 
 
 def _split_classes(machine: Machine) -> list[int]:
-    """Return the class of each state: states of one class accept the same runs, the empty one included.
+    """Return the equivalence class of each state.
 
-    Classes are split until the moves of all members of one lead to the same ones.
-    The largest part of a class keeps its number, so that few states are checked again (Hopcroft, 1971).
+    States of one class accept the same runs, including the empty run. Classes are split until the moves of
+    all members of a class lead to the same classes. The largest part of a class keeps its number, so that
+    few states are checked again (Hopcroft, 1971).
     """
     moves, rows = machine.moves.tolist(), machine.decisions.tolist()
     classes: list[int] = machine.accepting.astype(np.int64).tolist()
@@ -210,7 +216,10 @@ def _split_classes(machine: Machine) -> list[int]:
 
 
 def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterable[int]) -> list[int]:
-    """Make all parts of some classes but the largest classes of their own; gives the states in these."""
+    """Split classes into their parts, and return the states with a new class.
+
+    The largest part of a class keeps the number of the class.
+    """
     moved: list[int] = []
     for number in touched:
         parts_of_class = parts[number]
@@ -225,7 +234,7 @@ def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterab
 
 
 def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
-    """Return what leads to each place at once: numbers of rows, and ~q if state q begins there."""
+    """Return the parents of each place: indices of rows, and ~q for a state q whose moves begin there."""
     above: dict[int, list[int]] = {}
     for number, (_, low, high) in enumerate(rows):
         above.setdefault(low, []).append(number)
@@ -238,11 +247,11 @@ def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, l
 def sources_of(
     above: dict[int, list[int]], targets: Iterable[int], visited: set[int] | None = None
 ) -> dict[int, None]:
-    """Return the states from which one sample can lead to some states.
+    """Return the predecessors of the targets: the states from which one sample can lead to a target.
 
     Args:
-        above: as from `above_of`.
-        visited: rows that are not followed again; those that are followed are added.
+        above: result of `above_of`.
+        visited: rows to skip; rows that are followed are added to this set.
     """
     sources: dict[int, None] = {}
     seen = set() if visited is None else visited
