@@ -1,4 +1,4 @@
-"""Clips: parts of a run around a trigger, which a recorder writes, and the conditions of triggers."""
+"""Clips, the parts of a run that a recorder writes around a trigger, and conditions of triggers."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from spatial_replay.trace.trace import Sample, Trace
 from spatial_replay.trace.units import Axes
 
 MOST_BYTES: Final = 256 * 2**20
-"""The most bytes that a ring holds by default."""
+"""Default memory limit of a ring, bytes."""
 
 EVENT: Final = "event"
-"""The condition that any event fulfils."""
+"""Condition that any event fulfils."""
 
 MANUAL: Final = "manual"
-"""The condition that nothing fulfils: such a trigger fires by hand."""
+"""Condition that is never fulfilled, for triggers that only fire by hand."""
 
 _VERDICTS: Final = ("violated", "satisfied")
 _BELOW: Final = re.compile(
@@ -53,7 +53,7 @@ Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
 
 
 class _Below(NamedTuple):
-    """The number that a robustness falls below: certainly, or possibly."""
+    """Threshold below which a robustness falls: certainly, or possibly."""
 
     number: float
     is_possible: bool
@@ -62,16 +62,16 @@ class _Below(NamedTuple):
 @named_arguments
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """When a recorder writes a clip, and how much of what it holds.
+    """The condition at which a recorder writes a clip, and the length of the clip.
 
     Attributes:
-        when: "violated" or "satisfied" for any spec, "NAME violated" for one. "NAME < 0.2" fires when its
-            robustness is certainly below a number, "NAME < 0.2 possible" when it may be. "event" fires at any
-            change of a verdict or of a lasting sign. "manual" is for `Recorder.trigger` alone, which always
-            fires. Several are given as a sequence. Names are checked by the recorder, which has the
-            specifications.
-        before_s, after_s: how much time is kept, on the clock of the samples.
-        most_bytes: how much memory the ring takes; when that does not hold `before_s`, it is reported.
+        when: one condition, or a sequence of conditions. "violated" and "satisfied" are for any spec, "NAME
+            violated" for one spec. "NAME < 0.2" fires when the spec's robustness is certainly below a number,
+            "NAME < 0.2 possible" when it may be below. "event" fires at every change of a verdict or of a
+            lasting sign. "manual" never fires by itself; `Recorder.trigger` fires any trigger. The recorder,
+            which has the specifications, checks the names.
+        before_s, after_s: time before and after the trigger in the clip, on the clock of the samples.
+        most_bytes: memory limit of the ring. A ring that is too small for `before_s` is reported.
     """
 
     when: str | Sequence[str] = "violated"
@@ -91,18 +91,18 @@ class Trigger:
 
     @property
     def texts(self) -> list[str]:
-        """Its conditions; one is enough."""
+        """The conditions; each of them fires the trigger."""
         return [condition.strip() for condition in ([self.when] if isinstance(self.when, str) else self.when)]
 
 
 def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[Monitor]) -> Condition:
-    """Return a function of the updates with a sample that says why a trigger holds, or None.
+    """Return the function that checks a condition: from a sample's updates to the reason for firing, or None.
 
     Args:
-        monitors: of the files, which give the updates.
+        monitors: monitors of the specifications, which give the updates.
 
     Raises:
-        UsageError: it is none, or names no spec.
+        UsageError: the text is no condition, or names no spec.
     """
     name, what = _parse_condition(text)
     if what == MANUAL:
@@ -140,11 +140,10 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
 
 
 def _parse_condition(text: str) -> tuple[str, str | _Below]:
-    """Return the spec that a condition names, "" for none, and a verdict, `EVENT`, `MANUAL`, or the number
-    that its robustness falls below.
+    """Parse a condition into the name of a spec, "" for none, and a verdict, `EVENT`, `MANUAL` or threshold.
 
     Raises:
-        UsageError: it is none.
+        UsageError: the text is no condition.
     """
     name, _, verdict = text.rpartition(" ")
     if text in (*_VERDICTS, EVENT, MANUAL):
@@ -162,7 +161,7 @@ def _parse_condition(text: str) -> tuple[str, str | _Below]:
 
 
 def _verdict(updates: Sequence[Update], name: str) -> str:
-    """Return the verdict of a spec; "" while it has none."""
+    """Return the verdict of a spec; "" before it has one."""
     for update in updates:
         if name in update.places and update.specs[update.places[name][0]].numbers is not None:
             return str(update.node(name).verdict)
@@ -170,34 +169,37 @@ def _verdict(updates: Sequence[Update], name: str) -> str:
 
 
 _SLICE_BYTES: Final = 8 * 2**20
-"""About the most bytes that are written to a clip before what has come is taken in."""
+"""Approximate amount that is written to a clip between two reads of the queue, bytes."""
 
 _LATE_S: Final = 2.0
-"""How long a clip waits for samples, which may wait for a second at what may be the end of a run."""
+"""Time for which a clip waits for late samples, s; a source may delay samples for a second at its end."""
 
 _LATE_NS: Final = 10**9
-"""How far messages may come behind samples."""
+"""Maximum delay of messages behind samples, ns."""
 
 _MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES = 320, 400, 600
-"""Memory of a message without its payload, of a sample, and of each of its objects without corners, in
-bytes."""
+"""Memory of a message without its payload, of a sample, and of a sample's object without corners, bytes."""
 
 _MOST_STATIC: Final = 256
+"""Maximum number of static transforms in memory."""
 _MOST_EVENTS: Final = 256
+"""Maximum number of external events in memory."""
 _MOST_MISSED: Final = 2**18
+"""Maximum number of times of dropped samples in memory, and of dropped messages."""
 _STATIC: Final = "tf_static"
+"""Last part of the topics of static transforms, which each clip needs, however old they are."""
 
 
 @dataclass(frozen=True, slots=True)
 class TriggeredClip:
-    """One log that a trigger has left.
+    """A log that a trigger has written.
 
     Attributes:
-        path: its file.
-        reason: what fired, the first if several did while it was written.
-        time_ns: when it fired.
-        held_s: how much of the time before it the clip has.
-        dropped: samples of its time that were dropped before the recorder could keep them.
+        path: path of the log.
+        reason: condition that fired, the first one if several fired during the clip.
+        time_ns: time at which it fired.
+        held_s: time before the trigger that the clip has, s.
+        dropped: number of samples in the clip's time that were dropped because the queue was full.
     """
 
     path: Path
@@ -208,7 +210,7 @@ class TriggeredClip:
 
 
 class _Held(NamedTuple):
-    """A message, a sample or an occurrence of the run in the ring; `size` is what it takes in memory."""
+    """A message, sample or external event in the ring; `size` is its memory in bytes."""
 
     time_ns: int
     content: Row | Sample | RunEvent
@@ -216,7 +218,7 @@ class _Held(NamedTuple):
 
 
 class _ManualTrigger(NamedTuple):
-    """A trigger that was fired by hand, with the newest sample and message queued by then; -1 for none."""
+    """A trigger by hand, with the times of the newest queued sample and message, -1 for none."""
 
     reason: str
     sample_ns: int
@@ -224,7 +226,7 @@ class _ManualTrigger(NamedTuple):
 
 
 class _Open:
-    """A clip that is being written: some of the ring still waits, and what comes follows."""
+    """An unfinished clip: entries of the ring wait to be written, and later entries follow."""
 
     def __init__(
         self, path: Path, files: Sequence[Specification], about: Mapping[str, str], fired: str, at_ns: int
@@ -253,7 +255,7 @@ class _Open:
         self.last_s = time.monotonic()
 
     def write(self, most_bytes: float = _SLICE_BYTES) -> None:
-        """Write some of what waits."""
+        """Write waiting entries, up to about `most_bytes`."""
         samples: list[Sample] = []
         messages: list[Row] = []
         events: list[RunEvent] = []
@@ -281,7 +283,7 @@ class _Open:
         self._stream.flush()
 
     def finish(self, end: RunEnd, before_s: float, after_s: float) -> TriggeredClip:
-        """Write all that waits, and close the log."""
+        """Write all waiting entries, and close the log."""
         try:
             self.write(math.inf)
             held_s = 0.0 if self.first_ns is None else max(0.0, (self.at_ns - self.first_ns) / 1e9)
@@ -301,14 +303,14 @@ class _Open:
 
 
 class ClipLog(RecorderLog):
-    """The ring of a recorder with a trigger, and the clips that it leaves; see `RecorderLog`.
+    """The ring of a recorder with a trigger, and its clips; see `RecorderLog`.
 
-    A trigger that fires while a clip is open makes it longer, or begins another clip if the ring has already
-    evicted some of the time between.
+    A trigger that fires during a clip extends the clip. If the ring has already evicted entries of the time
+    between, it begins another clip instead.
 
     Attributes:
-        held_bytes: memory of the ring.
-        written: the clips that are complete.
+        held_bytes: memory of the ring, bytes.
+        written: completed clips.
     """
 
     gather_s = GATHER_S / 4
@@ -316,7 +318,7 @@ class ClipLog(RecorderLog):
     def __init__(
         self, folder: Path, files: Sequence[Specification], about: Mapping[str, str] | None, trigger: Trigger
     ) -> None:
-        """Compile everything, and make the folder."""
+        """Compile the specifications, and create the folder."""
         self._folder, self._files, self._about = folder, files, dict(about or {})
         self._trigger = trigger
         texts = trigger.texts
@@ -352,7 +354,7 @@ class ClipLog(RecorderLog):
 
     @property
     def is_busy(self) -> bool:
-        """Whether a clip waits to be written, or a trigger that was fired by hand."""
+        """Whether entries of a clip wait to be written, or a trigger by hand is due."""
         return self._is_due or (self._open is not None and bool(self._open.waiting))
 
     def fire(self, reason: str, sample_ns: int, message_ns: int) -> None:
@@ -360,12 +362,12 @@ class ClipLog(RecorderLog):
 
         Args:
             sample_ns, message_ns: times of the newest queued sample and message, -1 for none. The clip is
-                around the later one; around the first to come if there is none.
+                around the later time or, without one, around the next sample or message.
         """
         self._manual.append(_ManualTrigger(reason, sample_ns, message_ns))
 
     def take_remarks(self) -> tuple[str, ...]:
-        """Return what happened since the last call."""
+        """Return the remarks since the last call."""
         remarks: list[str] = []
         with suppress(queue.Empty):
             while True:
@@ -373,11 +375,11 @@ class ClipLog(RecorderLog):
         return tuple(remarks)
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
-        """Take the next samples and messages into the ring; write what belongs to an open clip."""
+        """Add the next samples and messages to the ring, and write entries of an open clip."""
         entries = [*self._held_messages(messages)]
         entries += [_Held(sample.time_ns, sample, _sample_bytes(sample)) for sample in samples]
         self._begin_due()
-        # in the order of time, so that the ring holds what is around the sample that fires
+        # in order of time, so that the ring holds the messages around the sample that fires
         for entry in sorted(entries, key=lambda entry: entry.time_ns):
             if self._zero_ns is None and isinstance(entry.content, Sample):
                 self._zero_ns = entry.time_ns
@@ -393,11 +395,11 @@ class ClipLog(RecorderLog):
                 self._finish(is_interrupted=False)
 
     def miss(self, time_ns: int, kind: Missed) -> None:
-        """Take note of what found no place: a clip of that time counts it."""
+        """Record the time of a dropped sample or message, which a clip of that time counts."""
         self._missed[kind].append(time_ns)
 
     def report(self, event: RunEvent) -> None:
-        """Take in what happens to the run; fire if any event does."""
+        """Add an external event to the ring; fire if the trigger has the condition `EVENT`."""
         held = _Held(event.time_ns, event)
         self._events.append(held)
         if self._open is not None and event.time_ns <= self._open.until_ns:
@@ -406,7 +408,7 @@ class ClipLog(RecorderLog):
             self._begin(event.what, event.time_ns)
 
     def flush(self) -> None:
-        """Hand what was written of a clip to the operating system; end one that nothing follows."""
+        """Hand written data to the operating system, and finish a clip if no more samples arrive."""
         if self._open is None:
             return
         self._open.flush()
@@ -414,7 +416,7 @@ class ClipLog(RecorderLog):
             self._finish(is_interrupted=True)
 
     def end(self, end: RunEnd) -> None:
-        """Finish the clip that is open."""
+        """Finish the open clip."""
         if self._open is not None:
             is_whole = self._newest_ns >= self._open.until_ns
             self._finish(is_interrupted=end.interrupted or not is_whole)
@@ -422,12 +424,12 @@ class ClipLog(RecorderLog):
     break_off = end
 
     def close(self) -> None:
-        """Let go of the ring."""
+        """Empty the ring."""
         self._samples.clear()
         self._messages.clear()
 
     def _evaluate(self, sample: Sample) -> None:
-        """Fire if a condition holds that did not hold before."""
+        """Fire for each condition that holds now and did not hold at the previous sample."""
         updates = [monitor.update(sample) for monitor in self._monitors]
         changes = list(self._changes.after(updates))
         has_changed = not all(change.is_first for change in changes)
@@ -439,21 +441,21 @@ class ClipLog(RecorderLog):
 
     @property
     def _is_due(self) -> bool:
-        """Whether the ring has come to the oldest trigger by hand; before anything came, it has not."""
+        """Whether the ring has the time of the oldest trigger by hand; False before the first entry."""
         if not self._manual or self._newest_ns < 0:
             return False
         evaluated_ns, _ = self._progress.get(Sample, (-1, 0.0))
         return self._manual[0].sample_ns <= evaluated_ns and self._manual[0].message_ns <= self._newest_ns
 
     def _begin_due(self) -> None:
-        """Open the clips of triggers by hand to which the ring has come."""
+        """Open the clips of all due triggers by hand."""
         while self._is_due:
             manual = self._manual.popleft()
             time_ns = max(manual.sample_ns, manual.message_ns)
             self._begin(manual.reason, self._newest_ns if time_ns < 0 else time_ns)
 
     def _is_past(self, time_ns: int) -> bool:
-        """Return whether neither samples nor messages up to a time are expected any more."""
+        """Return whether no more samples and messages up to a time are expected."""
         now_s = time.monotonic()
         return all(
             newest_ns > time_ns or now_s - came_s > _LATE_S for newest_ns, came_s in self._progress.values()
@@ -484,7 +486,7 @@ class ClipLog(RecorderLog):
             clip.put(entry)
 
     def _begin(self, reason: str, at_ns: int) -> None:
-        """Open a clip around a time, or make the open one longer if it is not past, and has no hole then."""
+        """Open a clip around a time, or extend the open clip if that leaves no gap in it."""
         if self._open is not None:
             until_ns = self._open.until_ns
             if self._evicted_ns > until_ns or (at_ns > until_ns and self._is_past(until_ns)):
@@ -517,8 +519,8 @@ class ClipLog(RecorderLog):
         return sorted(entries_within, key=lambda entry: entry.time_ns)
 
     def _evict(self) -> None:
-        """Let go of what is too old and of what is too much, the oldest first."""
-        # samples may come behind messages, and one of them may fire
+        """Evict entries that are too old, and then the oldest entries until the ring fits its limit."""
+        # a late sample may fire, so the age of entries counts from the newest sample
         reached_ns, arrived_s = self._progress.get(Sample, (self._newest_ns, 0.0))
         if time.monotonic() - arrived_s > _LATE_S:
             reached_ns = self._newest_ns

@@ -1,4 +1,4 @@
-"""Channels for messages of the caller: their encodings, schemas and payloads."""
+"""Channels for the caller's messages: encodings, schemas and payloads."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from spatial_replay.logs.topics import GRADIENT_MAP, MAP_DRAWING, PLAN_DECISION,
 from spatial_replay.text import listing
 
 SchemaLike: TypeAlias = Mapping[str, Any] | str | bytes | type[Message] | None
-"""A JSON schema, as a dict or its text; a protobuf class; a definition, as its text or bytes; or none."""
+"""A JSON schema (dict or text), a protobuf class, another definition (text or bytes), or None."""
 
 MessageData: TypeAlias = Mapping[str, Any] | Message | bytes | bytearray | memoryview
-"""A JSON object, a protobuf message, or a payload that is encoded already."""
+"""A JSON object, a protobuf message, or an encoded payload."""
 
 ENCODINGS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -33,13 +33,13 @@ ENCODINGS: Final[Mapping[str, str]] = MappingProxyType(
         "flatbuffer": "flatbuffer",
     }
 )
-"""The encodings of messages that the MCAP registry lists, each with the usual encoding of its schemas."""
+"""Message encodings of the MCAP registry (https://mcap.dev/spec/registry), each with its schema encoding."""
 
 _SELF_DESCRIBING: Final = frozenset({"json", "cbor", "msgpack"})
 """Encodings that can be decoded without a schema."""
 
 _OTHER_SCHEMAS: Final = {"cdr": ("ros2idl", "omgidl")}
-"""Further encodings of schemas."""
+"""Alternative schema encodings of a message encoding."""
 
 _OURS: Final = frozenset({PLAN_DECISION, GRADIENT_MAP, PLAN_PATH, MAP_DRAWING})
 
@@ -47,10 +47,10 @@ _OURS: Final = frozenset({PLAN_DECISION, GRADIENT_MAP, PLAN_PATH, MAP_DRAWING})
 def message_channel(
     topic: str, encoding: str | None, schema: SchemaLike, schema_name: str | None, schema_encoding: str | None
 ) -> Channel:
-    """Return the channel of a topic for a caller's own messages.
+    """Return the channel of a topic for the caller's messages.
 
     Raises:
-        UsageError: a topic of ours, an unknown encoding, a schema that does not fit.
+        UsageError: a topic of this package, an unknown encoding, or a schema that does not fit.
     """
     check_topic(topic)
     message = schema if isinstance(schema, type) and issubclass(schema, Message) else None
@@ -115,7 +115,7 @@ def check_topic(topic: object) -> None:
 def _schema(
     topic: str, encoding: str, schema: object, name: str | None, schema_encoding: str | None
 ) -> Schema:
-    """Return a schema that is not a class."""
+    """Return the schema of a definition that is not a class."""
     expected = (ENCODINGS[encoding], *_OTHER_SCHEMAS.get(encoding, ()))
     if schema_encoding is not None and schema_encoding not in expected:
         raise UsageError(
@@ -137,7 +137,7 @@ def _schema(
 
 
 def _text(topic: str, encoding: str, schema: object) -> bytes:
-    """Return the bytes of a schema that is not a class."""
+    """Return the bytes of a definition that is not a class."""
     if isinstance(schema, Mapping) and ENCODINGS[encoding] == "jsonschema":
         return _json(topic, schema)
     if isinstance(schema, str) and encoding not in ("protobuf", "flatbuffer"):
@@ -157,7 +157,7 @@ def _text(topic: str, encoding: str, schema: object) -> bytes:
 
 
 def _title(topic: str, text: bytes) -> str:
-    """Check a JSON schema, and return its title or, if it has none, the name of the topic."""
+    """Check a JSON schema, and return its title or, without a title, the name of the topic."""
     try:
         schema = json.loads(text)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Signals during a recording: the log is closed, or the step finished, before the program ends."""
+"""Signals during a recording: the log is closed, or a step is finished, before the program ends."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 from types import FrameType
 
 TERMINATED = 128 + signal.SIGTERM
-"""The exit code of a process that SIGTERM ended, as shells report it."""
+"""Exit code that shells report for a process that SIGTERM ended."""
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back during the block; the first one that arrived is raised after it.
+    """Delay SIGINT and SIGTERM during the block; the first signal that arrived is raised after the block.
 
-    Signals that are ignored, or end the process at once, stay as they are, and so does everything outside the
-    main thread, since only that may handle signals.
+    Ignored signals and signals without a handler are not delayed. Outside the main thread nothing is delayed,
+    because Python handles signals only in the main thread.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -27,7 +27,7 @@ def uninterrupted() -> Iterator[None]:
     arrived: list[int] = []
     for number, handler in handlers.items():
         if callable(handler):
-            # an exception in the handler would leave a record half written
+            # an exception in the handler would leave a partial record
             signal.signal(number, lambda number, frame: arrived.append(number))
     try:
         yield
@@ -55,8 +55,8 @@ def leaving(output: Path) -> Iterator[None]:
 def terminable() -> Iterator[None]:
     """Let SIGTERM raise SystemExit during the block, so that logs are closed before the process ends.
 
-    If the program handles or ignores SIGTERM, before or during the block, that stays; outside the main
-    thread, nothing changes.
+    A handler of the program, installed before or during the block, takes precedence. Outside the main thread
+    the block has no effect.
     """
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:

@@ -1,4 +1,4 @@
-"""A log as it is recorded: samples and the messages of an evaluation out, and changes of its verdicts."""
+"""A log during its recording: samples, messages of the evaluation, and changes of verdicts."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ if TYPE_CHECKING:
 
 
 class RunEvent(NamedTuple):
-    """An occurrence of a run besides its samples.
+    """An external event of a run, such as a lost connection.
 
     Attributes:
-        time_ns: on the clock of the samples.
-        what: in a few words: "connection lost".
-        sentence: with its consequence.
+        time_ns: time on the clock of the samples.
+        what: name of the event, such as "connection lost".
+        sentence: description of the event and its consequence.
     """
 
     time_ns: int
@@ -81,12 +81,12 @@ class RunEvent(NamedTuple):
 
 
 class RunEnd(NamedTuple):
-    """How a recording ended.
+    """The end of a recording.
 
     Attributes:
-        interrupted: whether early.
-        dropped, messages_dropped: how many samples, and messages beside them, found no place.
-        doubts: assumptions that its source contradicts.
+        interrupted: whether the recording ended early.
+        dropped, messages_dropped: numbers of dropped samples and messages.
+        doubts: assumptions that the source contradicts.
     """
 
     interrupted: bool = False
@@ -102,7 +102,7 @@ class Recording:
     """Write samples to a sink as they arrive, in blocks of any length.
 
     Attributes:
-        files: the specifications, as the log stores them.
+        files: specifications in the form that the log stores.
     """
 
     def __init__(
@@ -112,15 +112,15 @@ class Recording:
         about: Mapping[str, str] | None = None,
         known: Sequence[SpecAutomaton] = (),
     ) -> None:
-        """Write what comes before the first sample: metadata and specifications.
+        """Write the records before the first sample: metadata and specifications.
 
         Args:
-            files: specifications to evaluate and write beside the samples.
-            about: further metadata: where the samples come from, a seed, the zero of a part of a run.
-            known: automata of specs of these files, which are not compiled again.
+            files: specifications to evaluate and to store in the log.
+            about: further metadata, such as the origin of the samples, a seed, or the time zero of a clip.
+            known: compiled automata of specs of these files, which are not compiled again.
 
         Raises:
-            UsageError: a template, since its objects are not known yet.
+            UsageError: a specification has a template, whose objects are not yet known.
         """
         refuse_templates(files)
         self._axes = Axes.from_metadata(about or {})
@@ -159,18 +159,18 @@ class Recording:
 
     @property
     def verdicts(self) -> Mapping[str, Verdict]:
-        """The verdict of each result, by its name, if the log ends here."""
+        """The verdict of each result by name, if the log ended now."""
         reported = zip(self._evaluation.trees, self._evaluation.streams, strict=True)
         return {tree.name: stream.verdict for tree, stream in reported}
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """The channels of the messages that annotate a sample."""
+        """The channels of the evaluation's messages."""
         return self._evaluation.channels
 
     def layout_ahead(self) -> Attachment:
-        """Return the layout for viewers before there are samples: all that may come has its place."""
-        # imported here since a log that is written has its layout at its end
+        """Return the layout for viewers before the first sample, with panels for all possible contents."""
+        # imported late, because a written log needs its layout only at its end
         from spatial_replay.annotate.foxglove_layout import layout_attachment
 
         return layout_attachment(self._evaluation.contents(None, (), self._axes))
@@ -179,11 +179,11 @@ class Recording:
         """Write the next samples, with the messages of their evaluation.
 
         Args:
-            beside: messages of other topics that are not derived from samples, those of each topic in the
-                order of time; a replay keeps them.
+            beside: messages of other topics that are not derived from samples, sorted by time within each
+                topic. A replay copies them.
 
         Raises:
-            TraceError: samples that are not after those before.
+            TraceError: samples that are not after the earlier samples.
         """
         stretches = self._evaluation.extend(trace)
         messages = self._count_messages(trace, beside)
@@ -191,28 +191,28 @@ class Recording:
         self._hashes.add_results(stretches)
 
     def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
-        """Write the next samples alone; `evaluate` them later, in any pieces, before more than these."""
+        """Write the next samples without an evaluation; `evaluate` must later receive them in their order."""
         self._sink.write_messages(self._count_messages(trace, beside))
 
     def evaluate(self, trace: Trace) -> None:
-        """Write the messages of the evaluation of samples that were added before."""
+        """Write the messages of the evaluation of samples from `add_samples`."""
         stretches = self._evaluation.extend(trace)
         self._sink.write_messages(merge(self._evaluation.annotator.messages(trace, stretches)))
         self._hashes.add_results(stretches)
 
     def report(self, event: RunEvent) -> None:
-        """Write what happens to the run beside its samples.
+        """Write an external event of the run.
 
-        A replay, which knows nothing of it, has only what it makes unknown.
+        A replay does not reproduce the event, only its effect on the samples: unknown values.
         """
         self._sink.write_messages(merge(self._evaluation.annotator.occurrence(*event)))
 
     def _count_messages(self, trace: Trace, beside: Messages | None) -> Messages:
-        """Return samples and messages beside them as they are written; count and hash them."""
+        """Return samples and other messages in the form in which they are written; count and hash them."""
         replayable = sample_messages(trace, self._samples)
         messages = replayable
         if beside is not None and len(beside):
-            # a replay does not keep messages on our topics, such as planning times
+            # a replay does not copy messages on topics of this package, such as planning times
             copied = beside.of_topics({channel.topic for channel in beside.channels.values()} - DERIVED)
             replayable, messages = merge([replayable, copied]), merge([replayable, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
@@ -226,7 +226,7 @@ class Recording:
         return messages
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Write a metadata record; the certificate covers that of a plan, and of doubts."""
+        """Write a metadata record; the certificate covers records of a plan and of doubts."""
         self._sink.add_metadata(name, data)
         if name == DOUBTS:
             self._doubts = tuple(data)
@@ -234,7 +234,7 @@ class Recording:
             self._plan = dict(data)
 
     def end(self, end: RunEnd = _WHOLE) -> None:
-        """Write what follows the last sample; the certificate is that of a replay of the log."""
+        """Write the records after the last sample; the certificate equals the certificate of a replay."""
         ending = self._ending(end)
         if end.doubts:
             self.add_metadata(DOUBTS, metadata_from_doubts(end.doubts))
@@ -262,7 +262,7 @@ class Recording:
         self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self.files, self._plan, self._doubts))
 
     def break_off(self, end: RunEnd) -> None:
-        """Write the end of a log whose last samples could not be written: it has no certificate."""
+        """Write the end of a log whose last samples could not be written; it has no certificate."""
         self._sink.add_metadata(ENDING, self._ending(end._replace(interrupted=True)) | {"failed": "true"})
 
     def _ending(self, end: RunEnd) -> dict[str, str]:
@@ -302,25 +302,28 @@ def refuse_templates(files: Sequence[Specification]) -> None:
 
 
 GATHER_S: Final = 0.2
-"""How long samples are gathered before they are encoded. A few together cost hardly more than one, and while
-none are encoded, the caller's thread need not wait for the interpreter lock."""
+"""Time for which samples are gathered before they are encoded, s.
+
+A few samples cost hardly more than one sample. While no sample is encoded, the caller's thread does not wait
+for the interpreter lock.
+"""
 
 
 _EVALUATING_S: Final = 0.05
-"""About how long samples are evaluated before those that have come are written."""
+"""Target duration of an evaluation between two writes, s."""
 _AT_FIRST, _MOST_AT_ONCE = 16, 1024
-"""How many samples are evaluated at first before that time is known, and at most."""
+"""Initial and maximum number of samples that are evaluated at once."""
 
 
 Missed: TypeAlias = Literal["sample", "message"]
 
 
 class RecorderLog:
-    """Log of a recorder's thread. Only that thread calls it, except for `miss` and `close`.
+    """Log of a recorder's writing thread. Other threads call only `miss` and `close`.
 
     Attributes:
-        gather_s: how long to gather samples before the next call of `add`.
-        backlog: how many of the samples given so far wait for their evaluation.
+        gather_s: time to gather samples before the next call of `add`, s.
+        backlog: number of added samples that wait for their evaluation.
     """
 
     gather_s = GATHER_S
@@ -328,37 +331,37 @@ class RecorderLog:
 
     @property
     def is_busy(self) -> bool:
-        """Whether to call `add` again at once, whatever has come."""
+        """Whether `add` should be called again at once, even without new samples."""
         return False
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
-        """Write the next samples, given in both forms, and messages."""
+        """Write messages and the next samples; `samples` and `trace` are the same samples."""
         raise NotImplementedError
 
     def miss(self, time_ns: int, kind: Missed) -> None:
-        """Take note of what found no place; the threads that write call it."""
+        """Record the time of a dropped sample or message; the caller's threads call it."""
 
     def report(self, event: RunEvent) -> None:
-        """Write what happens to the run beside its samples."""
+        """Write an external event of the run."""
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system."""
+        """Hand all written data to the operating system."""
 
     def end(self, end: RunEnd) -> None:
-        """Write what follows the last sample."""
+        """Write the records after the last sample."""
 
     def break_off(self, end: RunEnd) -> None:
-        """Write the end after a failure, as far as that is possible."""
+        """Write the end of the log after a failure, if possible."""
 
     def close(self) -> None:
-        """Let go of files, whatever happened before."""
+        """Close files, also after a failure."""
 
 
 class FileLog(RecorderLog):
     """One log in one file, written in place.
 
-    Samples are written before they are evaluated, a few at a time: an evaluation can be repeated from the
-    log, samples cannot.
+    Samples are written before they are evaluated. An evaluation can be repeated from the log; lost samples
+    cannot be recovered.
     """
 
     def __init__(
@@ -370,7 +373,7 @@ class FileLog(RecorderLog):
         *,
         overwrite: bool = True,
     ) -> None:
-        """Begin the file, with everything compiled that writing to it takes."""
+        """Begin the file, and compile all code that later writes need."""
         self._unevaluated: deque[Trace] = deque()
         self._plans: deque[Mapping[str, str]] = deque()
         self._at_once = _AT_FIRST
@@ -403,7 +406,11 @@ class FileLog(RecorderLog):
         self._recording.report(event)
 
     def add_plan(self, planner: Planner, number: int) -> None:
-        """Write the settings of a planner of a specification with what is added next; from any thread."""
+        """Write the settings of a planner with the next `add`; any thread may call it.
+
+        Args:
+            number: index of the planner's specification.
+        """
         from spatial_replay.planning.decision_log import plan_metadata
 
         self._plans.append(plan_metadata(planner, self._recording.files[number].filename))
@@ -414,7 +421,7 @@ class FileLog(RecorderLog):
         return bool(self._unevaluated)
 
     def _evaluate_some(self) -> None:
-        """Evaluate the next samples, as many as take the time that there is."""
+        """Evaluate the next samples, about as many as take `_EVALUATING_S`."""
         trace = self._unevaluated.popleft()
         count = min(self._at_once, len(trace))
         if count < len(trace):
@@ -448,7 +455,7 @@ class FileLog(RecorderLog):
 
 
 def encodable(samples: Sequence[Sample]) -> list[Sample]:
-    """Return the samples before the first that cannot be encoded."""
+    """Return the samples before the first one that cannot be encoded."""
     sound: list[Sample] = []
     with suppress(Exception):
         for sample in samples:
@@ -458,12 +465,12 @@ def encodable(samples: Sequence[Sample]) -> list[Sample]:
 
 
 def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
-    """Record some samples into memory, so that the code for the specifications is loaded.
+    """Record some samples into memory, so that the compiled code for the specifications is loaded.
 
     With an empty compiler cache, code is interpreted until a child process has compiled it.
 
     Args:
-        automata: those of the specifications, which are not compiled again.
+        automata: automata of the specifications, which are not compiled again.
     """
     compiled.start("record and replay", partial(_record_trial, files, automata))
 
@@ -486,11 +493,11 @@ def _record_trial(files: Sequence[Specification], automata: Sequence[SpecAutomat
     ]
     recording.add(Trace.from_samples(samples[:1]))
     recording.add(Trace.from_samples(samples[1:]))
-    # without objects: intervals of unknown atoms run code of their own
+    # a sample without objects, because intervals of unknown atoms run separate code
     recording.add(Trace.from_samples([Sample(10**10, {})]))
     recording.end()
     writer.close()
-    # the arrow at a violation, of which these samples may have none
+    # the code of arrows at violations, because these samples may have no violation
     shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
     contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
 
@@ -511,16 +518,16 @@ _WORDS: Final = {
 
 
 class VerdictChange(NamedTuple):
-    """The verdict of a spec, or the sign of its value while it is pending, is another than before.
+    """A change of a spec's verdict or, while it is pending, of the sign of its robustness.
 
-    A verdict counts at once; a sign once it lasts three samples, as in the events of a log.
+    A changed verdict counts at once. A changed sign counts after three samples, as in the events of a log.
 
     Attributes:
-        time_ns: of the sample that confirms it.
-        spec: its name.
-        state: "satisfied" and "violated" permanently; "holds" and "pending" so far.
-        sentence: what changed and why.
-        is_first: whether nothing was known before.
+        time_ns: time of the sample that confirms the change.
+        spec: name of the spec.
+        state: "satisfied" or "violated" permanently; "holds", "pending" or "unknown" until decided.
+        sentence: change and reason.
+        is_first: whether the spec had no known state before.
     """
 
     time_ns: int
@@ -531,7 +538,7 @@ class VerdictChange(NamedTuple):
 
 
 class VerdictChanges:
-    """The states of the results of some specifications, from sample to sample."""
+    """The current states of all results of some specifications."""
 
     def __init__(self, files: Sequence[Specification]) -> None:
         """Start before the first sample."""
@@ -539,7 +546,7 @@ class VerdictChanges:
         self._root = np.zeros(1, np.int64)
 
     def after(self, updates: Sequence[Update]) -> Iterator[VerdictChange]:
-        """Yield what changed with a sample, from the update of each file."""
+        """Yield the changes at a sample, from the update of each specification."""
         for states, update in zip(self._states, updates, strict=True):
             for place, spec in enumerate(update.specs):
                 if spec.numbers is None or states[place].are_final:

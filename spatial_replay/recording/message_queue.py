@@ -1,4 +1,4 @@
-"""Messages of the caller, from any thread to the one that writes the log."""
+"""Queue of the caller's messages, from any thread to the thread that writes the log."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from spatial_replay.text import times_apart
 from spatial_replay.trace.trace import LATEST_NS
 
 MOST_WAITING_BYTES: Final = 64 * 2**20
-"""The most bytes of messages that wait to be written; one message that is larger waits alone."""
+"""Limit of queued messages, bytes; a larger message is accepted into an empty queue."""
 
 _TOGETHER_BYTES: Final = 8 * 2**20
-"""About the most bytes that are written at once."""
+"""Approximate limit of messages that are written at once, bytes."""
 
 PAUSE_S = 0.001
-"""Between two looks at a queue that is full."""
+"""Polling interval while the queue is full, s."""
 
 
 class MessageQueue:
-    """Messages from any thread, on their way to the one thread that writes them.
+    """Messages from any thread that wait for the writing thread.
 
-    Only the threads that write messages take its lock, so that an interruption of one of them never stops
-    the writing thread.
+    Only the caller's threads take the lock, so that an interruption of one of them never blocks the writing
+    thread.
 
     Attributes:
-        newest_ns: the latest time of a queued message, -1 before the first.
-        is_closed: whether no more messages are taken.
-        process: the one that the recorder belongs to.
-        failure: why nothing can be written any more, or None.
+        newest_ns: latest time of a queued message, -1 before the first message.
+        is_closed: whether further messages are refused.
+        process: id of the process that opened the recorder.
+        failure: error that prevents further writing, or None.
     """
 
     def __init__(
@@ -48,15 +48,15 @@ class MessageQueue:
         """Begin without channels.
 
         Args:
-            name: of the log.
-            limit: how many messages may wait.
-            blocks: whether a message waits for its place, or is dropped.
-            ring: wakes the writing thread.
-            missed: takes the time of each message that is dropped.
+            name: name of the log, for errors.
+            limit: maximum number of waiting messages.
+            blocks: whether `put` waits while the queue is full, instead of dropping the message.
+            ring: function that wakes the writing thread.
+            missed: function that is called with the time of each dropped message.
         """
         self.missed = missed
         self._name, self._limit, self._blocks, self._ring = name, limit, blocks, ring
-        # reentrant, so that a signal handler may write while its own thread does
+        # reentrant, because a signal handler may write while it interrupts a write of the same thread
         self.lock = threading.RLock()
         self.channels: dict[str, MessageChannel] = {}
         self._declared: Mapping[int, Channel] = MappingProxyType({})
@@ -69,11 +69,11 @@ class MessageQueue:
 
     @property
     def dropped(self) -> int:
-        """How many messages were dropped, on all channels."""
+        """Number of dropped messages, over all channels."""
         return sum(channel.dropped for channel in self.channels.values())
 
     def channel(self, channel: Channel) -> MessageChannel:
-        """Return the channel of a topic, the same one whenever it is opened in the same way.
+        """Return the channel of a topic; a topic that is already open gives the same channel.
 
         Raises:
             UsageError: the recorder is closed, or the topic is open with another encoding or schema.
@@ -84,7 +84,7 @@ class MessageQueue:
             if message_channel is None:
                 number = len(self.channels)
                 message_channel = MessageChannel(self, number, channel)
-                # replaced, never changed: the writing thread may be reading it
+                # replaced instead of changed, because the writing thread reads it without the lock
                 self._declared = MappingProxyType({**self._declared, number: channel})
                 self.channels[channel.topic] = message_channel
             elif message_channel.declaration != channel:
@@ -94,11 +94,11 @@ class MessageQueue:
             return message_channel
 
     def require_open(self) -> None:
-        """Check that messages can be taken.
+        """Check that messages can be accepted.
 
         Raises:
-            UsageError: the recorder is closed, or another process has it since a fork.
-            Exception: what prevents writing.
+            UsageError: the recorder is closed, or was opened by another process before a fork.
+            SpatialReplayError: the failure that prevents writing.
         """
         if self.is_closed:
             raise UsageError(f"{self._name} is closed; open another recorder")
@@ -107,7 +107,7 @@ class MessageQueue:
         self.raise_failure()
 
     def raise_failure(self) -> None:
-        """Raise what prevents writing, if anything does."""
+        """Raise the failure that prevents writing, if there is one."""
         if self.failure is not None:
             raise self.failure
 
@@ -117,7 +117,7 @@ class MessageQueue:
         while self._is_full(size):
             if not self._blocks:
                 return False
-            # no one makes room after that
+            # after a failure the queue is never emptied
             self.raise_failure()
             self._ring()
             time.sleep(PAUSE_S)
@@ -128,7 +128,7 @@ class MessageQueue:
         return True
 
     def take(self) -> Messages:
-        """Return some of the messages that wait, none if there are none; for the writing thread."""
+        """Return some of the waiting messages, possibly none; only the writing thread calls it."""
         rows: list[Row] = []
         size = 0
         with suppress(queue.Empty):
@@ -136,7 +136,7 @@ class MessageQueue:
                 row = self._queue.get_nowait()
                 rows.append(row)
                 size += len(row.payload)
-        # only this thread counts what leaves, and others, under the lock, what comes: it needs no lock
+        # no lock: only this thread changes _bytes_out, and only holders of the lock change _bytes_in
         self._bytes_out += size
         return Messages.from_rows(self._declared, rows)
 
@@ -148,14 +148,14 @@ class MessageQueue:
 
 
 class MessageChannel:
-    """A topic of a recorder for messages of the caller's own; `Recorder.channel` opens it.
+    """A recorder's topic for messages of the caller; `Recorder.channel` opens it.
 
-    Any thread may write, also several on one channel.
+    Several threads may write to one channel.
 
     Attributes:
-        topic, encoding: those of its messages.
-        written: how many messages were taken.
-        dropped: how many messages were dropped because the queue was full.
+        topic, encoding: topic and encoding of the messages.
+        written: number of accepted messages.
+        dropped: number of messages that were dropped because the queue was full.
     """
 
     def __init__(self, queue: MessageQueue, number: int, declaration: Channel) -> None:
@@ -170,15 +170,16 @@ class MessageChannel:
         return f"MessageChannel({self.topic!r}, encoding={self.encoding!r}, written={self.written})"
 
     def write(self, time_ns: int, data: MessageData) -> None:
-        """Hand over the next message; return at once unless the queue is full.
+        """Queue the next message; return at once unless the queue is full.
 
         Args:
-            time_ns: its log time, on the clock of the samples; not before that of the channel's last message.
+            time_ns: log time of the message, on the clock of the samples. It may not be before the channel's
+                previous message.
             data: a dict for json, a message for protobuf, or bytes, which are written unchanged.
 
         Raises:
             UsageError: a time out of range or order, data that does not fit the channel, a closed recorder.
-            OutputError: something before could not be written.
+            OutputError: an earlier sample or message could not be written.
         """
         time_ns = self._check_time(time_ns)
         payload = self._encode(data)
@@ -194,8 +195,11 @@ class MessageChannel:
             self._put(time_ns, time_ns, payload)
 
     def copy(self, time_ns: int, payload: bytes) -> None:
-        """Hand over a message of another program, which may come a little late. It is published at its time,
-        and logged then or at the log time of its predecessor, whichever is later."""
+        """Queue a message of another program, which may arrive late.
+
+        Its publish time is `time_ns`. Its log time is `time_ns`, or the log time of the channel's previous
+        message if that is later.
+        """
         with self._queue.lock:
             self._queue.require_open()
             self._put(max(time_ns, self._last_ns), time_ns, payload)

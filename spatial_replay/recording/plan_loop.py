@@ -1,4 +1,4 @@
-"""The loop of a planned run: observe, decide, execute, until there is nothing more to do."""
+"""The loop of a planned run: observe, decide, execute, until no step is left."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from spatial_replay.recording.recorder import Recorder
 from spatial_replay.text import named_arguments
 
 HOLDING_SAMPLES: Final = 30
-"""How many samples the specification has to stay satisfied before a run ends."""
+"""Number of samples for which the specification must stay satisfied before a run ends."""
 MOST_WAITING_SAMPLES: Final = 150
-"""The most samples without progress between two motions, before a run ends."""
+"""Maximum number of samples without progress between two motions; then the run ends."""
 
 
 class Robot(Executor, Protocol):
-    """A robot that `plan` lets act. It writes every sample to the recorder, also during a motion."""
+    """A robot that executes the steps of `plan`. It writes every sample to the recorder, also in a motion."""
 
     def look(self) -> None:
         """Write one more sample to the recorder, while nothing moves."""
@@ -27,20 +27,20 @@ class Robot(Executor, Protocol):
 
 @named_arguments
 def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = False) -> Step:
-    """Let a planner decide and a robot act until there is nothing more to do, and record all of it.
+    """Run a planner and a robot until no step is left, and record the run.
 
-    The log has the samples, every decision with its maps and outcome, and the settings, so that
-    `verify --decisions` recomputes it. The loop ends: motions are bounded by the attempts at the automaton's
-    edges, waiting by the samples in which the automaton reaches no new state.
+    The log has the samples, the settings, and every decision with its maps and outcome, so that
+    `verify --decisions` can recompute it. The loop always ends. The number of attempts at the automaton's
+    edges limits the motions. The number of samples without a new state of the automaton limits a wait.
 
     Args:
-        planner: that has observed nothing yet.
-        robot: moves things, and writes samples with `recorder.write`.
-        recorder: that records the planner's specification, or was opened with `planner=`.
-        timings: also record how long each decision took; the recorder must have no planner yet.
+        planner: a planner that has observed nothing yet.
+        robot: moves objects, and writes samples with `recorder.write`.
+        recorder: records the planner's specification, or was opened with `planner=`.
+        timings: also record the duration of each decision; the recorder must have no planner yet.
 
     Returns:
-        The last decision: "hold" if the specification is satisfied, as far as the planner can see.
+        The last decision: "hold" if, by the planner's observations, the specification is satisfied.
 
     Raises:
         UsageError: the recorder does not record the planner's specification, or has another planner.
@@ -58,10 +58,10 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = 
 def run_plan(
     decider: BlackBox | Recorder, execute: Callable[[Step], Outcome], look: Callable[[], None]
 ) -> Step:
-    """Look, decide and act until there is nothing more to do; return the last decision.
+    """Observe, decide and execute until no step is left; return the last decision.
 
     Args:
-        look: takes one more sample, which the planner observes, while nothing moves.
+        look: takes one sample without a motion, and gives it to the planner.
     """
     look()
     planner = decider.planner
@@ -74,7 +74,7 @@ def run_plan(
             waited, reached = 0, {planner.states}
         elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
             look()
-            # samples count only while the automaton reaches no new state; waits for others are bounded
+            # a wait for other agents is bounded by the planner; any other wait by samples without a new state
             is_for_others = step.aim is not None and not step.ahead
             waited += not is_for_others and (not step.ahead or planner.states in reached)
             reached.add(planner.states)
@@ -83,8 +83,8 @@ def run_plan(
 
 
 def _holds(planner: Planner, look: Callable[[], None]) -> bool:
-    """Look for a while without a motion; return whether the specification stays satisfied."""
+    """Observe `HOLDING_SAMPLES` without a motion; return whether the specification stays satisfied."""
     for _ in range(HOLDING_SAMPLES):
         look()
-    # no motion can remove doubt about the past
+    # no motion can remove uncertainty about the past
     return planner.is_accepting or planner.is_doubtful

@@ -1,4 +1,4 @@
-"""Recorders: samples of a running loop, written to a log that a signal leaves whole."""
+"""Recorders: samples of a running loop, written to a log that is closed properly after a signal."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ if TYPE_CHECKING:
 
 
 FLUSH_S = 0.3
-"""About the longest time from writing a sample until the operating system has it."""
+"""Interval between two flushes to the operating system, s."""
 
 MOST_LOST_S = 0.8
-"""Samples of more time than this are never on their way: then `write` waits or, if it may not, drops."""
+"""Age of the oldest unflushed sample from which `write` waits, or drops samples if it may not wait, s."""
 
 _TOGETHER = 1024
-"""The most samples that are encoded at once."""
+"""Maximum number of samples that are encoded at once."""
 
 
 class SampleWriter:
-    """Samples and messages from a caller's threads, on their way to the one thread that writes them.
+    """Samples and messages from the caller's threads that wait for the writing thread.
 
     Attributes:
-        dropped: how many samples were dropped because the queue was full, or given to `miss`.
-        doubts: assumptions that the source contradicts; the end of the log has those set by then.
+        dropped: number of samples that were dropped because the queue was full, or given to `miss`.
+        doubts: assumptions that the source contradicts; they are written at the end of the log.
     """
 
     def __init__(
@@ -60,14 +60,15 @@ class SampleWriter:
         """Start the writing thread.
 
         Args:
-            name: of the log, for errors.
-            waiting: how many samples, and how many messages, may wait for the writing thread.
-            block: when that many wait, or `most_lost_s` of them, let `write` wait, too; otherwise drop what
-                comes, and count it.
-            most_lost_s: how much time of samples a kill may cost.
+            name: name of the log, for errors.
+            waiting: maximum number of waiting samples, and maximum number of waiting messages.
+            block: whether `write` waits at that limit or at `most_lost_s`, instead of dropping and counting
+                new samples.
+            most_lost_s: maximum time of samples that a kill may lose, s.
         """
         self._log, self.name = log, name
-        # unlike a queue with a limit of its own, an interruption never leaves this one locked
+        # reentrant, so an interruption never leaves it locked, unlike a Queue with a limit
+        # (https://docs.python.org/3/library/queue.html#queue.SimpleQueue.put)
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._waiting = waiting
@@ -88,20 +89,21 @@ class SampleWriter:
 
     @property
     def messages_dropped(self) -> int:
-        """How many messages were dropped, on all channels."""
+        """Number of dropped messages, over all channels."""
         return self._messages.dropped
 
     def reserve(self) -> bool:
-        """Return whether the next `write` takes its sample, which it then does at once."""
+        """Return whether the queue has room; the next `write` then accepts its sample without waiting."""
         self._is_reserved = self._messages.failure is not None or not self._is_behind()
         return self._is_reserved
 
     def copy(self, channel: Channel, time_ns: int, payload: bytes) -> None:
-        """Hand over a message of another program, as it is: its time becomes that of its publication.
+        """Queue an encoded message of another program; `time_ns` is its publish time.
 
         Raises:
-            UsageError: a topic of ours, or one that is open with another definition; a closed recorder.
-            OutputError: something before could not be written.
+            UsageError: a topic of this package, a topic that is open with another definition, or a closed
+                recorder.
+            OutputError: an earlier sample or message could not be written.
         """
         message_channel = self._messages.channels.get(channel.topic)
         if message_channel is None or message_channel.declaration != channel:
@@ -110,10 +112,10 @@ class SampleWriter:
         message_channel.copy(time_ns, payload)
 
     def write(self, sample: Sample) -> None:
-        """Hand over the next sample; return at once unless the queue is full.
+        """Queue the next sample; return at once unless the queue is full.
 
         Raises:
-            TraceError: a time that is not after the last one.
+            TraceError: a time that is not after the previous sample's time.
             OutputError: an earlier sample could not be written.
             UsageError: not a sample, or the recorder is closed.
         """
@@ -139,31 +141,33 @@ class SampleWriter:
 
     @property
     def newest_ns(self) -> int | None:
-        """Time of the newest sample; None before the first."""
+        """Time of the newest sample; None before the first sample."""
         return None if self._last_ns < 0 else self._last_ns
 
     def miss(self, sample: Sample) -> None:
-        """Count a sample that is left out."""
+        """Count a sample that is not recorded."""
         self.dropped += 1
         self._log.miss(sample.time_ns, kind="sample")
 
     def report(self, event: RunEvent) -> None:
-        """Hand over what happens to the run beside its samples, from the thread that writes these."""
+        """Queue an external event of the run; call it from the thread that writes samples."""
         self._events.put(event)
         self._ring()
 
     def _is_behind(self) -> bool:
-        """Return whether too many samples wait, or too much time of them could be lost."""
+        """Return whether too many samples wait, or the oldest unflushed sample is too old."""
         if self._queue.qsize() + self._log.backlog >= self._waiting:
             return True
         since = self._unsafe_s
         return since is not None and time.monotonic() - since > self._most_lost_s
 
     def close(self, *, interrupted: bool = False) -> None:
-        """Write all waiting samples and finish the log; closing twice, or after a fork, does nothing.
+        """Write all waiting samples and finish the log.
+
+        A second call, or a call in a forked process, has no effect.
 
         Raises:
-            OutputError: something could not be written.
+            OutputError: a sample or message could not be written.
         """
         with uninterrupted():
             if os.getpid() != self._messages.process:
@@ -179,7 +183,7 @@ class SampleWriter:
         self._messages.raise_failure()
 
     def _finish(self, *, interrupted: bool) -> None:
-        """Write the end of the log; after a failure, as far as that is possible, and say that it failed."""
+        """Write the end of the log; after a failure, try to write an end that states the failure."""
         end = RunEnd(interrupted, self.dropped, self._messages.dropped, self.doubts)
         try:
             if self._messages.failure is not None:
@@ -200,11 +204,11 @@ class SampleWriter:
         while not ended:
             now = time.monotonic()
             samples, ended = self._waiting_samples()
-            # those that are left came before the others
+            # after a full batch, the remaining samples may have waited since the last complete drain
             drained_s = now if len(samples) < _TOGETHER else drained_s
             self._record(samples, self._messages.take())
             self._report_events()
-            # decisions come before the samples that follow them
+            # a decision is written before the samples that follow it
             while self._drains and len(messages := self._messages.take()):
                 self._record([], messages)
             if self._messages.failure is None and time.monotonic() - flushed_s >= FLUSH_S:
@@ -227,7 +231,7 @@ class SampleWriter:
         try:
             trace = Trace.from_samples(samples)
         except Exception as error:
-            # what comes before the sample that cannot be encoded is written
+            # samples before the one that cannot be encoded are written
             sound = encodable(samples)
             self._try(lambda: self._log.add(sound, Trace.from_samples(sound), messages))
             self._fail(error)
@@ -235,14 +239,14 @@ class SampleWriter:
             self._try(lambda: self._log.add(samples, trace, messages))
 
     def _try(self, step: Callable[[], None]) -> None:
-        """Do a step of the writing thread."""
+        """Run a step of the writing thread; an error becomes the failure of the recorder."""
         try:
             step()
         except Exception as error:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """Let the next `write` raise an error, which would go unnoticed in this thread."""
+        """Store an error for the next `write` to raise, because nobody sees an error of this thread."""
         if not isinstance(error, SpatialReplayError):
             what = f"a sample or message could not be written ({type(error).__name__}: {error})"
             failure = OutputError(f"{self.name} ends here: {what}")
@@ -251,12 +255,12 @@ class SampleWriter:
         self._messages.failure = error
 
     def _ring(self) -> None:
-        """Wake the writing thread before its gathering time is over."""
+        """Wake the writing thread before the end of its gathering time."""
         if self._bell.empty():
             self._bell.put(None)
 
     def _waiting_samples(self) -> tuple[list[Sample], bool]:
-        """Return the gathered samples, and whether the log ends with them."""
+        """Return gathered samples, and whether the log ends after them."""
         if self._queue.qsize() < self._enough and not self._log.is_busy:
             with suppress(queue.Empty):
                 self._bell.get(timeout=self._log.gather_s)
@@ -272,17 +276,17 @@ class SampleWriter:
 
 @named_arguments
 class Recorder(SampleWriter):
-    """Record samples into an MCAP log, with the robustness of specifications beside them.
+    """Record samples into an MCAP log, with the robustness of specifications.
 
-    The log is written in place: if the process is killed, less than a second of samples is lost, counted from
-    when `write` took them, however busy the machine is. Leaving the `with` block closes the log properly,
-    also after an error or Ctrl-C; the log then says that it was interrupted. So does SIGTERM: in a `with`
-    block of the main thread it raises SystemExit(143), unless the program has a handler of its own. A signal
-    that arrives while the log is closed waits until that is done.
+    The log is written in place. If the process is killed, less than a second of samples is lost, counted from
+    the call of `write`, also on a busy machine. The end of the `with` block closes the log. After an error or
+    Ctrl-C the closed log is marked as interrupted. SIGTERM has the same effect: in a `with` block of the main
+    thread it raises SystemExit(143), unless the program handles SIGTERM. A signal that arrives during the
+    closing is delayed until the log is closed.
 
-    With a trigger, nothing is written until it fires. Earlier samples wait in memory, and each firing leaves
-    one log around it. With a planner, its decisions are recorded as well: samples, decisions and outcomes go
-    through the recorder, in their order; or `plan(planner, robot, recorder)` does that.
+    With a trigger, samples wait in memory until it fires; each firing writes one log of the time around it.
+    With a planner, the log also has its decisions. Give samples and outcomes to the recorder and take steps
+    from it, in their order, or call `plan(planner, robot, recorder)`.
 
     Use as:
 
@@ -310,28 +314,27 @@ class Recorder(SampleWriter):
     ) -> None:
         """Begin a log.
 
-        Returns when the first sample can be written without delay: the first time on a machine, numerical
-        code is compiled first, which takes many seconds.
+        Returns when the first sample can be written without delay. The first call on a machine compiles
+        numerical code, which takes many seconds.
 
         Args:
-            path: the log; with a trigger, the folder that its logs are written to.
-            specifications: evaluated as the samples arrive, without templates; one or several.
-            about: further metadata of the log: a seed, where the samples come from.
-            units: for sentences, axes and viewers: of signals by their names, of lengths by "".
-            waiting: how many samples, and how many messages of channels, may wait for the writing thread.
-            block: whether `write` waits while the queue is full, or, without a trigger, while more than 0.8 s
+            path: path of the log or, with a trigger, of the folder for its logs.
+            specifications: one or several specifications without templates, evaluated as samples arrive.
+            about: further metadata of the log, such as a seed or the origin of the samples.
+            units: units for sentences, axes and viewers: of signals by their names, of lengths by "".
+            waiting: maximum number of waiting samples, and maximum number of waiting messages of channels.
+            block: whether `write` waits while the queue is full or, without a trigger, while more than 0.8 s
                 of samples have not reached the operating system. Otherwise new samples are dropped, and the
                 log counts them.
-            trigger: when to write what, instead of everything.
-            durability: "process" for a log that survives the end of the process; "disk" for one that
-                survives that of the machine, too: then each flush waits for the disk (fsync).
-            planner: observes the samples that are written; its decisions are recorded, see `next_step`.
-            overwrite: replace a file that exists and is not empty.
+            trigger: condition for writing clips instead of the whole run.
+            durability: "process" for a log that survives a crash of the process. "disk" for a log that also
+                survives a crash of the machine: each flush waits for the disk (fsync).
+            planner: planner that observes the written samples; its decisions are recorded, see `next_step`.
+            overwrite: whether to replace an existing file that is not empty.
 
         Raises:
-            UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1.
-            UsageError: a trigger without a spec of that name, a planner with a trigger or without `block`.
-            UsageError: an existing file.
+            UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1, a
+                trigger that names no spec, a planner with a trigger or without `block`, or an existing file.
             OutputError: the file cannot be written.
         """
         if waiting < 1:
@@ -351,7 +354,7 @@ class Recorder(SampleWriter):
         self._entered = ExitStack()
         self._files = tuple(files)
         self._box: BlackBox | None = None
-        # what waits for a trigger is in memory anyway
+        # with a trigger, samples stay in memory on purpose, so their age is not limited
         most_lost_s = self.most_lost_s if trigger is None else math.inf
         super().__init__(log, self._path.name, waiting, block=block, most_lost_s=most_lost_s)
         if planner is not None:
@@ -363,11 +366,14 @@ class Recorder(SampleWriter):
         return None if self._box is None else self._box.planner
 
     def attach(self, planner: Planner, *, timings: bool = False) -> None:
-        """Let a planner observe every sample from now on, and record its decisions; `timings`: how long, too.
+        """Let a planner observe every further sample, and record its decisions.
+
+        Args:
+            timings: also record the duration of each decision.
 
         Raises:
-            UsageError: a second planner, one whose specification is not recorded, one that has observed
-                samples; a recorder with a trigger, or one that drops samples.
+            UsageError: the recorder already has a planner, has a trigger, drops samples, or does not record
+                the planner's specification; or the planner has observed samples.
         """
         from spatial_replay.planning.decision_log import BlackBox
 
@@ -388,15 +394,15 @@ class Recorder(SampleWriter):
             raise UsageError("decisions depend on all samples; attach a new planner before the first one")
 
     def write(self, sample: Sample) -> None:
-        """Hand over the next sample; a planner observes it, too.
+        """Queue the next sample, and let the planner observe it.
 
         Returns at once unless the queue is full.
 
         Raises:
-            TraceError: a time that is not after the last one.
+            TraceError: a time that is not after the previous sample's time.
             OutputError: an earlier sample could not be written.
-            UsageError: not a sample, or the recorder is closed; at the first sample, settings of the planner
-                that do not fit it.
+            UsageError: not a sample, a closed recorder, or settings of the planner that do not fit the first
+                sample.
         """
         super().write(sample)
         if self._box is not None:
@@ -408,11 +414,11 @@ class Recorder(SampleWriter):
                 self._log.add_plan(planner, self._files.index(planner.specification))
 
     def next_step(self) -> Step:
-        """Return the planner's next step, and record it with everything that it depends on.
+        """Return the planner's next step, and record it with its inputs.
 
         Raises:
-            UsageError: there is no planner, nothing was written yet, or the last step was not concluded.
-            OutputError: something before could not be written.
+            UsageError: there is no planner, no sample was written yet, or the last step was not concluded.
+            OutputError: an earlier sample or message could not be written.
         """
         return self._require_box().next_step()
 
@@ -420,8 +426,8 @@ class Recorder(SampleWriter):
         """Record the outcome of the last step, after the samples of its motion.
 
         Raises:
-            UsageError: there is no planner, not an outcome, or no step is being executed.
-            OutputError: something before could not be written.
+            UsageError: there is no planner, the argument is no outcome, or no step is being executed.
+            OutputError: an earlier sample or message could not be written.
         """
         self._require_box().conclude(outcome)
 
@@ -443,33 +449,36 @@ class Recorder(SampleWriter):
         schema_name: str | None = None,
         schema_encoding: str | None = None,
     ) -> MessageChannel:
-        """Open a topic for messages of your own, which are recorded beside the samples.
+        """Open a topic for your own messages, which are recorded next to the samples.
 
-        A replay keeps them, and the certificate covers them. Opening a topic again gives the same channel.
+        A replay copies the messages, and the certificate covers them. A topic that is already open gives the
+        same channel.
 
         Args:
-            topic: such as "/joint_states"; those under /spatial and those of a planner are taken.
-            schema: a JSON schema (dict or text), a protobuf class, or the definition that belongs to the
-                encoding (text or bytes); json needs none. Messages are not checked against it.
-            encoding: "json", "protobuf", "ros1", "cdr", "cbor", "msgpack" or "flatbuffer"; without it,
+            topic: name such as "/joint_states". Topics under /spatial and the topics of a planner are
+                reserved.
+            schema: a JSON schema (dict or text), a protobuf class, or the encoding's kind of definition (text
+                or bytes). json, cbor and msgpack need none. Messages are not checked against it.
+            encoding: "json", "protobuf", "ros1", "cdr", "cbor", "msgpack" or "flatbuffer". The default is
                 "protobuf" for a protobuf class, else "json".
-            schema_name: the type of the messages; a protobuf class has its name, a JSON schema its title.
-            schema_encoding: that of the schema where there are several: "ros2msg", "ros2idl" or "omgidl".
+            schema_name: type of the messages. The default is the name of a protobuf class, or the title of a
+                JSON schema.
+            schema_encoding: "ros2msg" (default), "ros2idl" or "omgidl" for the encoding "cdr".
 
         Raises:
-            UsageError: a topic of ours, an unknown encoding, a schema that does not fit, a topic that is open
-                in another way, a closed recorder.
-            OutputError: something before could not be written.
+            UsageError: a reserved topic, an unknown encoding, a schema that does not fit, a topic that is
+                open with another definition, or a closed recorder.
+            OutputError: an earlier sample or message could not be written.
         """
         return self._messages.channel(message_channel(topic, encoding, schema, schema_name, schema_encoding))
 
     def trigger(self, reason: str = "by hand") -> None:
-        """Fire the trigger now, whatever it waits for; from any thread, and from a signal handler.
+        """Fire the trigger now, regardless of its condition; any thread or signal handler may call it.
 
-        The clip is around the newest sample or message at the call, or around the first one to come.
+        The clip is around the newest sample or message at the call, or around the first one to arrive.
 
         Raises:
-            UsageError: the recorder has none.
+            UsageError: the recorder has no trigger.
         """
         if self._clips is None:
             raise UsageError(f"{self.name} is written as a whole; open a Recorder with a trigger")
@@ -478,21 +487,21 @@ class Recorder(SampleWriter):
 
     @property
     def is_triggered(self) -> bool:
-        """Whether it writes what its trigger chooses, not everything."""
+        """Whether the recorder writes clips instead of the whole run."""
         return self._clips is not None
 
     @property
     def clips(self) -> tuple[TriggeredClip, ...]:
-        """The logs that the trigger has left so far, complete ones only."""
+        """The completed logs of the trigger."""
         return () if self._clips is None else self._clips.written
 
     @property
     def held_bytes(self) -> int:
-        """Samples and messages that wait for the trigger."""
+        """Memory of the samples and messages that wait for the trigger, bytes."""
         return 0 if self._clips is None else self._clips.held_bytes
 
     def take_remarks(self) -> tuple[str, ...]:
-        """Return what the trigger has done since the last call, and what it could not hold."""
+        """Return remarks since the last call: on written clips, and on a ring that is too small."""
         return () if self._clips is None else self._clips.take_remarks()
 
     def __enter__(self) -> Self:

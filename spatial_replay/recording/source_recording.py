@@ -1,4 +1,4 @@
-"""Recordings of a source, such as a bag: its samples with verdicts as a log."""
+"""Recordings of a source, such as a bag: a log of its samples and verdicts."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Recorded:
 
     Attributes:
         samples: number of samples.
-        start_ns, end_ns: times of the first and the last.
+        start_ns, end_ns: times of the first and last sample.
         objects: names of the objects.
-        faults: what was lost while reading, each with its place.
+        faults: parts of the source that could not be read, each with its place.
         unreadable: number of observations with a number that is not finite.
-        missing: names in the specifications that no sample had.
-        remarks: what the source reports about its samples where nothing was lost.
+        missing: names in the specifications that are in no sample.
+        remarks: remarks of the source that report no loss.
     """
 
     samples: int
@@ -60,16 +60,16 @@ def record_source(
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
 ) -> Recorded:
-    """Record the samples of a source, in place under the final name.
+    """Record the samples of a source into a file that has its final name from the start.
 
-    Equal sources and specifications give equal bytes. An interruption leaves a shorter log, closed properly
+    Equal sources and specifications give equal bytes. An interruption leaves a shorter log that is closed
     and marked as interrupted.
 
     Args:
-        inputs: files that the output must not be.
-        unit: that of lengths, for readers, where the source declares none.
-        advance: called with the number of samples of each block that is done.
-        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
+        inputs: input files, which the output must not overwrite.
+        unit: unit of lengths, if the source declares none.
+        advance: called with the number of samples of each recorded block.
+        durability: "disk" to force each written chunk to the disk at once.
 
     Raises:
         UsageError: the output is an input, a specification cannot be recorded, or the source declares another
@@ -81,7 +81,7 @@ def record_source(
     refuse_templates(files)
     tally = _Tally()
     traces = _traces(source, tally)
-    # a source without samples raises here, before the output is touched
+    # a source without samples raises before the output is created
     first = next(traces)
     about = {"source": source.name, "options": json.dumps(dict(source.options))}
     about |= _units_metadata(source, unit)
@@ -95,7 +95,7 @@ def record_source(
             if tally.doubts:
                 recording.add_metadata(DOUBTS, tally.doubts_metadata())
     except OutputError:
-        # a disk that is full: half of a log that can be recorded again is worth less than none
+        # the disk is full: a partial log is removed, because the source can be recorded again
         if output.is_file():
             output.unlink(missing_ok=True)
         raise
@@ -103,7 +103,7 @@ def record_source(
 
 
 def _units_metadata(source: Source, unit: str) -> dict[str, str]:
-    """Return the entries for the log's metadata with axes and units; `unit` is that of lengths, if given."""
+    """Return the metadata entries of axes and units; `unit`, if given, is the unit of lengths."""
     axes = source.axes
     if unit and axes.unit not in ("", unit):
         raise UsageError(f"{source.name} declares lengths in {axes.unit}, and not in {unit}; leave that out")
@@ -115,7 +115,7 @@ def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
     """Read the samples of a source, in blocks of one or more.
 
     Raises:
-        LogError: there are none, or they cannot be read.
+        LogError: the source has no samples, or cannot be read.
     """
     any_sample = False
     for block in read_blocks(source):
@@ -136,7 +136,7 @@ def recording_in(
     about: Mapping[str, str] | None,
     known: Sequence[SpecAutomaton] = (),
 ) -> Iterator[tuple[LogWriter, Recording]]:
-    """Begin a log, and write its end however the block ends; after an error it is marked as interrupted."""
+    """Begin a log, and always write its end after the block; after an error it is marked as interrupted."""
     interrupted = True
 
     def end() -> None:
@@ -145,7 +145,7 @@ def recording_in(
             writer.close()
 
     with ExitStack() as ending:
-        # an interruption between two records would leave a log whose index does not fit
+        # an interruption between two records would leave a log with a wrong index
         with uninterrupted():
             writer = LogWriter(stream)
             recording = Recording(writer, files, about, known)
@@ -155,7 +155,7 @@ def recording_in(
 
 
 class _Tally:
-    """Counts of what was recorded so far."""
+    """Counts of recorded samples, faults and names."""
 
     def __init__(self) -> None:
         self._times: list[int] = []
@@ -191,5 +191,5 @@ class _Tally:
         )
 
     def doubts_metadata(self) -> dict[str, str]:
-        """Return the metadata record of the doubts; {} without any."""
+        """Return the metadata record of the doubts; {} if there are none."""
         return metadata_from_doubts(distinct_doubts(self.doubts, self._times[0]))
