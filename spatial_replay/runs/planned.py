@@ -1,6 +1,6 @@
-"""A simulated world whose robot executes a planner's steps, recorded with every decision.
+"""Recordings of a planner that moves objects in a simulated world, with every decision.
 
-`record_plan` sets up world, planner and log; `recording.plan_loop` lets them observe, decide and execute.
+`record_plan` sets up the world, the planner and the log. `recording.plan_loop` runs them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _PRESETS: Final[Mapping[Skill, Mapping[str, float]]] = MappingProxyType(
     {
         # a pushed block stops within a centimetre of its target; fingers need room behind it
         "push": {"cell_size": 0.005, "margin": 0.012, "constraint_margin": 0.008, "room": 0.04},
-        # fingers need room beside what they hold, and the hand beside taller things
+        # the fingers need room next to a held object, and the hand needs room next to taller objects
         "place": {
             "cell_size": 0.02,
             "margin": 0.01,
@@ -54,7 +54,7 @@ _PRESETS: Final[Mapping[Skill, Mapping[str, float]]] = MappingProxyType(
         },
     }
 )
-"""Resolution and distances for the planning of a skill, in metres, by the keys of settings files."""
+"""Planner settings of each skill: resolution and distances, metres, by the keys of settings files."""
 
 
 def _yaws_text(yaws: Sequence[float]) -> str:
@@ -63,7 +63,7 @@ def _yaws_text(yaws: Sequence[float]) -> str:
 
 
 _SAME_YAW: Final = math.radians(1.0)
-"""Yaws that differ by less count as one."""
+"""Difference below which two yaws count as equal, radians."""
 
 
 def settings_for(world: Tabletop) -> Settings:
@@ -88,10 +88,9 @@ def _settings(world: Tabletop, formula: Formula, changes: Mapping[str, Any]) -> 
 
 
 def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
-    """Return the yaws, in radians, that objects may need for a formula: none if no relation compares any.
+    """Return the yaws, in radians, that objects may need for a formula; none if it compares no yaws.
 
-    These are the ones that the compared objects have, for `a oriented[k] b`, and quarter turns from
-    the first of them.
+    These are the yaws of the compared objects, as in `a oriented[k] b`, and quarter turns of the first yaw.
     """
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
     parts = [part for atom in atoms for part in iter_expressions(atom.expression)]
@@ -107,23 +106,23 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
 
 
 def execute_in(world: Tabletop, settings: Settings, step: Step) -> Outcome:
-    """Let the robot of a simulated world execute a step, as an `Executor` does.
+    """Execute a step with the robot of a simulated world.
 
     Raises:
-        UsageError: the step moves nothing.
+        UsageError: the step has no motion.
     """
     target = step.target
     if target is None:
         raise UsageError(f"step {step.number} ({step.kind}) moves nothing")
     if settings.skill == "push":
-        # strokes turn objects, which matters only where orientations are planned
+        # strokes turn objects, which matters only if the planner plans orientations
         yaw = target.yaw if settings.workspace.yaws else None
         return world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
     return world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
 
 
 def _log_tick(log: RunLog, tick: TreeTick, time_ns: int) -> None:
-    """Log a tick of the robot's behaviour tree, with the newest sample."""
+    """Log a tick of the robot's behaviour tree at the time of the newest sample."""
     log.write_payload(TREE_CHANNEL, log.newest_ns, tick.payload(time_ns))
 
 
@@ -133,18 +132,17 @@ class PlannedRun:
 
     Attributes:
         samples: number of samples.
-        seconds: from the first to the last.
-        ended: the kind of the last decision: "hold" if the specification is satisfied, as far as the planner
-            can see.
-        name: the name of the planned spec.
-        verdict: its verdict in the log, which includes the uncertainty of positions.
-        reason: the last decision in words.
+        seconds: time from the first to the last sample.
+        ended: kind of the last decision: "hold" if, by the planner's observations, the spec is satisfied.
+        name: name of the planned spec.
+        verdict: verdict of the planned spec in the log, which includes the uncertainty of positions.
+        reason: sentence on the last decision.
         steps: number of executed motions.
         pruned: number of pruned edges of the automaton.
-        planning_s: time spent planning, in seconds of real time.
-        bounds: how many samples the bounds in seconds are, in words; empty without any.
-        yaws: to which yaws objects may be turned since the specification compares some, in words.
-        others: verdicts of the specifications of which the planner knew nothing, by name.
+        planning_s: wall time of the planning, s.
+        bounds: sentence on bounds in seconds and their numbers of samples; empty without such bounds.
+        yaws: sentence on the yaws to which objects may be turned; empty if the spec compares no yaws.
+        others: verdicts, by name, of the specifications that were not given to the planner.
     """
 
     samples: int
@@ -176,24 +174,26 @@ def record_plan(
     also: Sequence[Specification] = (),
     **conditions: Unpack[Conditions],
 ) -> PlannedRun:
-    """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
+    """Record a run in which a planner works towards a specification in a scenario's world.
+
+    Equal arguments give equal bytes.
 
     Args:
-        file: the specification to plan for; None takes that of the scenario.
-        also: further specifications to evaluate, of which the planner knows nothing.
-        name: the result to plan for, if there are several. All are evaluated.
-        cameras: one or two videos to make of the run; beside the first, their tags file is written.
-        inputs: files that the output must not be.
+        file: specification to plan for; None for the scenario's specification.
+        also: further specifications to evaluate, which the planner does not receive.
+        name: result to plan for, required if there are several. All results are evaluated.
+        cameras: paths of one or two videos of the run. Their tags file is written next to the first video.
+        inputs: input files, which the output must not overwrite.
         advance: called with the number of new samples.
-        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
-        changes: to the planner's settings for the world, by the keys of settings files.
-        timings: also log how long each decision took; logs of equal arguments then differ.
+        durability: "disk" to force each written chunk to the disk at once.
+        changes: changes of the planner's settings for the world, by the keys of settings files.
+        timings: also log the duration of each decision; logs of equal arguments then differ.
 
     Raises:
         NoAutomatonError: a specification without an automaton.
-        SpecificationError: no run satisfies the result, or names that the world does not have.
-        UsageError: no such scenario, no simulator, no such result, several to choose from, a result that
-            cannot be planned for.
+        SpecificationError: no run satisfies the result, or the specification names missing objects.
+        UsageError: no such scenario, no simulator, no such result, several results without `name`, or a
+            result that cannot be planned for.
         OutputError: the output cannot be written.
     """
     files = [default_specification(scenario) if file is None else file, *also]
@@ -212,7 +212,7 @@ def record_plan(
         settings = _settings(world, spec.formula, changes)
         planner = Planner(main_file, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
-        # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
+        # a replay has no rate, so no automaton for bounds in seconds; the log has none either, to be equal
         automata = (
             [SpecAutomaton(spec.name, main_file, spec, planner.automaton)] if planner.rate_hz is None else []
         )
@@ -250,7 +250,7 @@ def record_plan(
 
 
 def warm_up_planner() -> None:
-    """Plan a push that is not executed, so that the first decision does not wait for code to be loaded.
+    """Plan a push without executing it, so that the code of the planner is loaded before the first decision.
 
     With an empty compiler cache, code is interpreted until a child process has compiled it.
     """

@@ -1,4 +1,4 @@
-"""Videos or a camera, recorded: frames to samples, verdicts as they change, and a log with the pictures."""
+"""Recordings of videos and cameras: samples from frames, changes of verdicts, and a log with the pictures."""
 
 from __future__ import annotations
 
@@ -51,8 +51,9 @@ from spatial_replay.trace.units import Axes
 TRANSFORMS: Final = protobuf_channel(CAMERA_FRAMES, FrameTransforms)
 
 _AROUND: Final = 24
-"""Points of the outline of a disc."""
+"""Number of points on the outline of a disc."""
 _THICKNESS, _LETTERS = 3.0, 16.0
+"""Line width of outlines and font size of names, pixels."""
 
 Colour = tuple[float, float, float]
 
@@ -60,11 +61,11 @@ Colour = tuple[float, float, float]
 def asked_colours(
     requirements: Sequence[Sequence[Requirement]], sample: Sample, updates: Sequence[Update]
 ) -> Mapping[str, Colour]:
-    """Return the colour of each object: of the worst requirement that it takes part in, grey without one.
+    """Return the colour of each object: the colour of its worst requirement, or grey without requirements.
 
     Args:
-        requirements: of each result.
-        updates: of all files, after the sample.
+        requirements: requirements of each result.
+        updates: updates of all specifications at the sample.
     """
     worst: dict[str, int] = {}
     at = np.zeros(1, np.int64)
@@ -100,14 +101,14 @@ def _members(requirement: Requirement, sample: Sample) -> set[str]:
 
 
 def encode_video(time_ns: int, data: bytes, frame: str) -> bytes:
-    """Return the message of one frame in H.264."""
+    """Return the message of a frame in H.264."""
     message = CompressedVideo(frame_id=frame, data=data, format="h264")
     message.timestamp.FromNanoseconds(time_ns)
     return message.SerializeToString(deterministic=True)
 
 
 def encode_annotations(view: View, sample: Sample, colours: Mapping[str, Colour]) -> bytes:
-    """Return the outlines and names of the objects, and the outlines and numbers of all tags, in a view."""
+    """Return the message with the outlines of objects and tags, their names and numbers, in a view."""
     message = ImageAnnotations()
     time_ns = view.frame.time_ns
     for detection in view.detections:
@@ -117,7 +118,7 @@ def encode_annotations(view: View, sample: Sample, colours: Mapping[str, Colour]
         return message.SerializeToString(deterministic=True)
     for name, tracked_object in sample.objects.items():
         colour = colours.get(name, NEUTRAL)
-        # as high as its upper face, where its tags are
+        # outlines are drawn at the upper face, where the tags are
         z = 0.0 if tracked_object.height is None else tracked_object.height[1]
         lowest: Floats | None = None
         for part in tracked_object.footprint.parts:
@@ -138,6 +139,8 @@ def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
     """Return the calibration of a camera."""
     width, height = camera.size
     numbers = list(camera.distortion)
+    # plumb_bob has five parameters, rational_polynomial has more
+    # (https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/CameraInfo.html)
     message = CameraCalibration(
         frame_id=frame,
         width=width,
@@ -153,15 +156,16 @@ def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
 
 
 def encode_camera_pose(time_ns: int, plane: CameraPlane, frame: str) -> bytes:
-    """Return where the camera is in the frame of the scene."""
+    """Return the message with the pose of the camera in the frame of the scene."""
     message = FrameTransforms()
     transform = message.transforms.add(parent_frame_id=FRAME, child_frame_id=frame)
     transform.timestamp.FromNanoseconds(time_ns)
     x, y, z = (-plane.rotation.T @ plane.pose[3:]).tolist()
     transform.translation.x, transform.translation.y, transform.translation.z = x, y, z
-    # the other way round than the pose, which takes the scene to the camera
+    # the inverse of the pose, which transforms from the scene to the camera
     turn = -plane.pose[:3]
     angle = float(np.linalg.norm(turn))
+    # the limit at angle 0 is 0.5
     part = math.sin(angle / 2) / angle if angle > 0 else 0.5
     transform.rotation.w = math.cos(angle / 2)
     transform.rotation.x, transform.rotation.y, transform.rotation.z = (part * turn).tolist()
@@ -169,7 +173,7 @@ def encode_camera_pose(time_ns: int, plane: CameraPlane, frame: str) -> bytes:
 
 
 def _ring(vertices: Floats, radius: float) -> Floats:
-    """Return the outline of a convex part: of a rounded one, points on the arcs around its corners."""
+    """Return the outline of a convex part; a rounded part has points on the arcs around its corners."""
     if not radius:
         return vertices
     angles = np.linspace(0, 2 * math.pi, _AROUND, endpoint=False)
@@ -188,7 +192,8 @@ def _outline(
     outline.outline_color.r, outline.outline_color.g, outline.outline_color.b = colour
     outline.outline_color.a = 1.0
     for x, y in pixels.tolist():
-        # viewers count from the outer corner of the first pixel
+        # the origin is the outer corner of the first pixel, not its centre
+        # (https://docs.foxglove.dev/docs/sdk/schemas/points-annotation)
         outline.points.add(x=x + 0.5, y=y + 0.5)
 
 
@@ -207,24 +212,24 @@ def _text(
 # -------------------------------------------------------------------------------------------------- recording
 
 KeepVideo: TypeAlias = Literal["copy", "h264", "none"]
-"""How a log keeps a video: as it came, encoded again, or not at all."""
+"""Form of a video in a log: an unchanged copy, encoded again, or left out."""
 
 _NOT_YET_ALONE: Final = 2
-"""Samples at the end that a camera may lack, as its last frame comes before that of another."""
+"""Number of final samples that a camera may lack, because cameras do not end at the same time."""
 
 _POSE_EVERY_NS: Final = 10**9
-"""How often a log repeats the camera's calibration and pose, which do not change."""
+"""Interval at which a log repeats the camera's constant calibration and pose, ns."""
 
 
 class FrameSource(Protocol):
-    """Frames with increasing times, read once: a video file, an image topic, a camera.
+    """Frames with increasing times, which can be read once: a video file, an image topic, or a camera.
 
     Attributes:
-        name: for messages.
-        channel: the topic that the frames' `data` are messages of; None where they are H.264.
-        faults: what was lost so far.
-        copy_fault: why `data` cannot be copied into a log; None if it can.
-        remark: on the options it was opened with, once all frames are read; None without any.
+        name: name for error messages.
+        channel: channel whose messages are the frames' `data`; None if `data` is H.264.
+        faults: sentences on lost frames.
+        copy_fault: reason why `data` cannot be copied into a log; None if it can.
+        remark: sentence on the options of the source, available after the last frame; None without a remark.
     """
 
     name: str
@@ -244,16 +249,16 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SeenRun:
-    """The result of recording what a camera saw.
+    """The result of recording cameras.
 
     Attributes:
-        samples: their number; each is of one frame, of several cameras one each.
-        seconds: from the first to the last.
-        endings: the result of each spec at the end.
-        fits: of each camera its name and how the reference tags fit; None without any.
-        remarks: tags and objects that were missing, doubtful or not mapped.
-        faults: what was lost of the video.
-        kept: how the video of each camera is in the log.
+        samples: number of samples; each has at most one frame of each camera.
+        seconds: time from the first to the last sample.
+        endings: result of each spec at the end.
+        fits: name of each camera and fit of its reference tags, None without reference tags.
+        remarks: sentences on tags and objects that were missing, doubtful or not mapped.
+        faults: sentences on lost parts of the videos.
+        kept: form of each camera's video in the log.
     """
 
     samples: int
@@ -280,23 +285,23 @@ def record_cameras(
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
 ) -> SeenRun:
-    """Record the objects that cameras show, with verdicts; equal frames give equal bytes.
+    """Record the objects in the pictures of cameras, with verdicts; equal frames give equal bytes.
 
     Args:
-        cameras: one or several, whose frames of one time make one sample.
-        offsets_ns: what is added to the stamps of each camera; nothing unless given.
-        hold_ns: how long a hidden object stays where it was, with growing uncertainty; None for what the
-            tags file says.
-        keep: how the log keeps the videos; None copies each where that is possible, and encodes it otherwise.
-        inputs: files that the output must not be.
-        begin: takes the time of the first sample.
-        show: takes each change of a verdict.
+        cameras: one or several cameras, whose simultaneous frames make one sample.
+        offsets_ns: offset of each camera's time stamps; empty for no offsets.
+        hold_ns: time for which a hidden object keeps its position, with growing uncertainty. None for the
+            value of the tags file.
+        keep: form of the videos in the log; None copies each video if possible, and else encodes it.
+        inputs: input files, which the output must not overwrite.
+        begin: called with the time of the first sample.
+        show: called with each change of a verdict.
         advance: called with 1 for each sample.
 
     Raises:
-        UsageError: a specification that cannot be recorded, reference tags that do not fit.
-        UsageError: an unknown camera, one with a calibration of another size, a video that cannot be copied.
-        LogError: there is no frame.
+        UsageError: a specification that cannot be recorded, reference tags that do not fit, an unknown
+            camera, a calibration for another picture size, or a video that cannot be copied.
+        LogError: no frame can be read.
         OutputError: the output cannot be written.
     """
     refuse_templates(files)
@@ -315,7 +320,7 @@ def record_cameras(
         raise LogError("; ".join([f"{camera_list}: no frame can be read", *began]))
     if keep == "h264" and any(frame is not None and frame.detections is not None for frame in first):
         raise UsageError("detections have no images to encode; leave out --keep-video h264")
-    # reference tags that do not fit raise here, before the output is touched
+    # reference tags that do not fit raise before the output is created
     begun = observer.observe(*first)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
     changes = VerdictChanges(files)
@@ -361,7 +366,7 @@ def record_cameras(
 
 
 class _Alone:
-    """Which cameras have frames of one time, and when each ends."""
+    """Counts of simultaneous frames of the cameras, and the last frame of each camera."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
@@ -370,7 +375,7 @@ class _Alone:
         self._last_of = [-1] * len(names)
 
     def count(self, observation: Observation) -> None:
-        """Take in a sample."""
+        """Count the frames of a sample."""
         self._samples += 1
         places_seen = [place for place, view in enumerate(observation.views) if view is not None]
         self._together += len(places_seen) > 1
@@ -378,7 +383,7 @@ class _Alone:
             self._last[place], self._last_of[place] = self._samples, observation.sample.time_ns
 
     def remarks(self, first_ns: int, last_ns: int) -> Iterator[str]:
-        """Yield which cameras ended before the others, or that their times have nothing in common."""
+        """Yield remarks on cameras that ended early, and on cameras without simultaneous frames."""
         if len(self._names) == 1:
             return
         if not self._together:
@@ -397,7 +402,7 @@ class _Alone:
 
 
 class _Picture:
-    """Messages of one camera in the log: picture, annotations, calibration, pose, as `/camera2/video`."""
+    """Writer of one camera's messages, such as `/camera2/video`: picture, annotations, calibration, pose."""
 
     def __init__(self, number: int, camera: FrameSource, keep_mode: KeepVideo) -> None:
         self._frame = "camera" if number == 1 else f"camera{number}"
@@ -418,7 +423,7 @@ class _Picture:
         colours: Mapping[str, Colour],
         camera: Camera | None,
     ) -> None:
-        """Write what a frame shows."""
+        """Write the messages of a frame."""
         time_ns = view.frame.time_ns
         self._write_frame(log, view.frame)
         log.write_payload(self._annotations, time_ns, encode_annotations(view, sample, colours))
@@ -443,7 +448,7 @@ class _Picture:
             log.write_payload(self._video, frame.time_ns, encoded)
 
     def _is_due(self, what: str, time_ns: int) -> bool:
-        """Return whether what does not change is repeated now."""
+        """Return whether a constant message must be repeated now."""
         last_ns = self._placed_ns.get(what)
         if last_ns is not None and time_ns - last_ns < _POSE_EVERY_NS:
             return False

@@ -1,4 +1,4 @@
-"""Runs of simulated worlds: their log, and runs by the script of a world."""
+"""Logs of simulated runs, and recordings of a world's scripted run."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from spatial_replay.trace.trace import Sample, Trace
 from spatial_replay.trace.units import Axes
 
 _STRETCH = 30
-"""Samples that are written together. The written part can be read even if the process is killed."""
+"""Number of samples that are written together; written samples remain readable if the process is killed."""
 
 
 class RunLog:
-    """A log being written: samples as they arrive, and messages about decisions in between.
+    """The open log of a run: samples, and messages on decisions between samples.
 
-    Equal samples, specifications and messages give equal bytes. Use `run_log` to make one.
+    Equal samples, specifications and messages give equal bytes. `run_log` opens one.
 
     Attributes:
-        samples: the number of samples so far.
-        newest_ns: the time of the newest one.
+        samples: number of samples.
+        newest_ns: time of the newest sample.
     """
 
     def __init__(self, writer: LogWriter, recording: Recording) -> None:
@@ -53,19 +53,19 @@ class RunLog:
 
     @property
     def seconds(self) -> float:
-        """The time from the first sample to the last."""
+        """Time from the first to the last sample, s."""
         return (self.newest_ns - self._first_ns) / 1e9
 
     @property
     def verdicts(self) -> Mapping[str, Verdict]:
-        """The verdict of each result, by its name, on what was written; final when the log has ended."""
+        """The verdict of each result by name, over the written samples; final at the end of the log."""
         return self._recording.verdicts
 
     def write(self, sample: Sample) -> None:
         """Add the next sample.
 
         Raises:
-            TraceError: it is not after the one before.
+            TraceError: the sample is not after the previous sample.
             OutputError: the log cannot be written.
         """
         if not self.samples:
@@ -73,7 +73,7 @@ class RunLog:
         self.newest_ns = sample.time_ns
         self.samples += 1
         if len(self._waiting) >= _STRETCH:
-            # flushed only when the next sample arrives: messages about the newest sample have its time
+            # flushed only at the next sample, because messages about the newest sample have its time
             self.flush()
         self._waiting.append(sample)
 
@@ -82,7 +82,7 @@ class RunLog:
         self._beside.append(messages)
 
     def write_payload(self, channel: Channel, time_ns: int, payload: bytes) -> None:
-        """Write the next message of another channel."""
+        """Write the next message of a channel."""
         number = self._written[channel.topic]
         self.write_messages(messages_of(channel, np.array([time_ns], np.int64), [payload], number))
         self._written[channel.topic] += 1
@@ -108,13 +108,13 @@ class RunLog:
             self._writer.add_attachment(name, media_type, data)
 
     def flush(self) -> None:
-        """Write everything so far, so that it can be read even if the process is killed."""
+        """Write all samples and messages, so that they remain readable if the process is killed."""
         with uninterrupted():
             self.write_waiting()
             self._writer.flush()
 
     def write_waiting(self) -> None:
-        """Write what was not written yet."""
+        """Write the waiting samples and messages, without flushing the file."""
         waiting, self._waiting = self._waiting, []
         beside, self._beside = self._beside, []
         if waiting or beside:
@@ -130,16 +130,16 @@ def run_log(
     known: Sequence[SpecAutomaton] = (),
     durability: Durability = "process",
 ) -> Iterator[RunLog]:
-    """Open the log of a run, in place under its final name, and close it properly however the run ends.
+    """Open the log of a run in a file that has its final name from the start, and always close it.
 
     After an interruption or an error the log is shorter, and marked as interrupted.
 
     Args:
-        files: specifications to evaluate and write beside the samples.
-        about: further metadata: the scenario, a seed.
-        inputs: files that the output must not be.
-        known: automata of specs of these files, which are not compiled again.
-        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
+        files: specifications to evaluate and to store in the log.
+        about: further metadata, such as the scenario or a seed.
+        inputs: input files, which the output must not overwrite.
+        known: compiled automata of specs of these files, which are not compiled again.
+        durability: "disk" to force each written chunk to the disk at once.
 
     Raises:
         UsageError: the output is an input, or a specification cannot be recorded.
@@ -162,13 +162,13 @@ def run_log(
 
 
 def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None:
-    """Check that a world has the objects and signals that specifications name.
+    """Check that a world has all objects and signals that the specifications name.
 
     Args:
-        sample: a sample of the world, which always shows all objects.
+        sample: any sample of the world, because every sample has all objects.
 
     Raises:
-        SpecificationError: with every missing name.
+        SpecificationError: lists every missing name.
     """
     objects, signals = sorted(sample.objects), sorted(sample.signals)
     remarks = [remark for file in files for remark in check_names(file, objects, signals, where="world")]
@@ -183,9 +183,9 @@ class SimulatedRun:
 
     Attributes:
         samples: number of samples.
-        seconds: from the first to the last.
-        objects: their names.
-        outcome: how the robot's motion ended, in words.
+        seconds: time from the first to the last sample.
+        objects: names of the objects.
+        outcome: end of the robot's motion, in words.
     """
 
     samples: int
@@ -209,15 +209,15 @@ def record_script(
     """Record a scenario's world while its robot follows the script; equal arguments give equal bytes.
 
     Args:
-        files: specifications to evaluate during the run; None takes that of the scenario.
-        duration_ns: duration in simulated time; None ends with the script.
-        cameras: one or two videos to make of the run; beside the first, their tags file is written.
-        inputs: files that the output must not be.
+        files: specifications to evaluate during the run; None for the scenario's specification.
+        duration_ns: duration in simulated time; None for the duration of the script.
+        cameras: paths of one or two videos of the run. Their tags file is written next to the first video.
+        inputs: input files, which the output must not overwrite.
         advance: called with the number of new samples.
-        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
+        durability: "disk" to force each written chunk to the disk at once.
 
     Raises:
-        SpecificationError: names that the world does not have.
+        SpecificationError: a specification names missing objects or signals.
         UsageError: no such scenario, no simulator, a duration of 0, a specification that cannot be recorded.
         OutputError: the output cannot be written.
     """
@@ -242,14 +242,14 @@ def record_script(
             world.attach(observe)
             result = world.follow(world.script(), duration_ns)
             if not log.samples:
-                # without a motion there is no sample: take the one of the world at rest
+                # a script without motions gives no sample, so the world at rest is recorded
                 world.step()
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
 
 def simulate_script(scenario: str, **conditions: Unpack[Conditions]) -> list[Sample]:
-    """Return the samples of a scripted run without a log; those that `record_script` records.
+    """Return the samples that `record_script` would record, without writing a log.
 
     Raises:
         UsageError: no such scenario, no simulator.
@@ -262,7 +262,7 @@ def simulate_script(scenario: str, **conditions: Unpack[Conditions]) -> list[Sam
 
 
 def about_run(scenario: str, **conditions: Unpack[Conditions]) -> dict[str, str]:
-    """Return the metadata about how a run was made."""
+    """Return the metadata on the scenario and the conditions of a run."""
     seed, starts = conditions.get("seed", 0), conditions.get("starts", ())
     injections = [str(injection) for injection in conditions.get("injections", ())]
     options = {"seed": seed, "noise_m": conditions.get("noise_m", 0.0), "inject": injections}

@@ -1,4 +1,4 @@
-"""Simulated worlds through cameras: videos of a run whose truth is known, and their tags file."""
+"""Virtual cameras: videos of simulated runs, whose true positions are known, and their tags file."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ from spatial_replay.trace.trace import Sample
 
 _BLACK, _WHITE = 30, 220
 _OVERSAMPLED: Final = 4
-"""Pixels along each edge of a pixel that are averaged, as on a sensor."""
+"""Samples along each edge of a pixel, which are averaged."""
 
 _BEHIND: Final = 3e-3
-"""By how much a plate may lie behind a surface that it is glued on, in footprint units."""
+"""Depth up to which a plate may lie behind the surface that carries it, footprint units."""
 
 
 class Plate(NamedTuple):
-    """A tag in the scene, on a white plate one cell wider.
+    """A tag in the scene, on a white plate with a margin of one cell.
 
     Attributes:
-        centre: (3,), of its face.
+        centre: (3,), centre of the face.
         axes: (2, 3), unit vectors to the tag's right and to its top.
-        size: edge of its black square.
+        size: edge length of the black square.
     """
 
     id: int
@@ -60,10 +60,10 @@ class Plate(NamedTuple):
 
 
 class Backdrop(NamedTuple):
-    """Background and foreground of the plates.
+    """Image of the scene without plates.
 
     Attributes:
-        image: (height, width) grey, or (height, width, 3).
+        image: (height, width) in grey, or (height, width, 3) in colour.
         depth: (height, width), distances along the camera's axis.
     """
 
@@ -82,20 +82,20 @@ def render(
     seed: Sequence[int] = (0,),
     backdrop: Backdrop | None = None,
 ) -> Image:
-    """Return the image of plates, grey or, with a coloured backdrop, in colour.
+    """Return an image of plates in grey or, with a coloured backdrop, in colour.
 
     Args:
-        instants: the plates at some instants of the exposure; what moves between them is blurred.
-        pose: (6,), rotation vector and translation from the scene's frame to the camera's.
-        noise: standard deviation of a pixel's brightness, of 255.
-        blur_px: standard deviation of the lens's blur, in pixels.
-        seed: of the noise.
-        backdrop: what else is seen; a plate is hidden by what is nearer.
+        instants: the plates at some instants of the exposure; plates that move are blurred.
+        pose: (6,), rotation vector and translation from the scene's frame to the camera's frame.
+        noise: standard deviation of a pixel's brightness, from 0 to 255.
+        blur_px: standard deviation of the lens blur, pixels.
+        seed: seed of the noise.
+        backdrop: the rest of the scene, whose nearer parts hide plates.
     """
     width, height = camera.size
     base = np.full((height, width), 120, np.uint8) if backdrop is None else backdrop.image
     depth = None if backdrop is None else backdrop.depth
-    # most plates stand still, and are drawn once
+    # plates at rest, which are most plates, are drawn once
     moves = [
         any(
             (plate.centre != plates[0].centre).any() or (plate.axes != plates[0].axes).any()
@@ -112,7 +112,7 @@ def render(
             total += _expose(family, moving, camera, pose, image, depth)
         image = ((total + len(instants) // 2) // len(instants)).astype(np.uint8)
     image = blur(image, blur_px)
-    # of the brightness: the same in all colours
+    # noise of the brightness, so it is equal in all colour channels
     normal_noise = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
     brighter = np.rint(normal_noise * noise).astype(np.int16)
     image = np.clip(image + (brighter if image.ndim == 2 else brighter[..., None]), 0, 255)
@@ -124,7 +124,7 @@ def _expose(
 ) -> Image:
     image = base.copy()
     turn = rotations(pose[None, :3])[0]
-    # those far away first
+    # far plates first, so that near plates cover them
     nearness = [float((turn @ plate.centre + pose[3:])[2]) for plate in plates]
     for index in np.argsort(nearness)[::-1].tolist():
         _draw(image, _tile(family, plates[index].id), plates[index], camera, turn, pose[3:], depth)
@@ -134,13 +134,14 @@ def _expose(
 def _draw(
     image: Image, tile: Image, plate: Plate, camera: Camera, turn: Floats, shift: Floats, depth: Floats | None
 ) -> None:
-    """Draw one plate into an image, where nothing is in front of it."""
+    """Draw the visible part of a plate into an image."""
     cells = tile.shape[0]
-    # the black square is one cell inside of the tile on each side
+    # the tile has a margin of one cell around the black square
     half = plate.size / 2 * cells / (cells - 2)
     right, up = plate.axes * half
     corners = np.stack([plate.centre + i * right + j * up for i, j in ((-1, 1), (1, 1), (1, -1), (-1, -1))])
     seen = corners @ turn.T + shift
+    # a plate behind the camera, or seen from its back, is not drawn
     if (seen[:, 2] <= 0).any() or np.dot(np.cross(seen[1] - seen[0], seen[3] - seen[0]), seen[0]) <= 0:
         return
     pixels = camera.pixels(seen)
@@ -169,7 +170,7 @@ def _draw(
     part = image[low[1] : high[1], low[0] : high[0]]
     if image.ndim == 3:
         tile_pixels, share = tile_pixels[..., None], share[..., None]
-    # beyond the tile its pixels are averaged with black, by the share of a pixel that the tile covers
+    # `tile_pixels` is already weighted: outside the tile it was averaged with black
     part[:] = np.clip(part * (1 - share) + tile_pixels, 0, 255).round().astype(np.uint8)
 
 
@@ -186,40 +187,43 @@ def _tile(family: str, number: int) -> Image:
 FAMILY: Final = "36h11"
 _FIRST_REFERENCE: Final = 100
 _EXPOSURE: Final = 0.25
-"""The share of the time between two frames in which light is gathered, half of it before a sample's time."""
+"""Exposure time as a share of the frame interval, centred on a sample's time."""
 
 _FASTEST: Final[Mapping[str, float]] = MappingProxyType({"push": 0.12, "place": 0.5})
-"""Metres a second that the robot moves objects at most, and a little more: what it hides may be so fast."""
+"""Speed limit of hidden movable objects for each skill, m/s; slightly above the robot's speed."""
 
 _NUDGED: Final = 0.01
-"""The same of what it only bumps into."""
+"""Speed limit of hidden objects that the robot only touches, m/s."""
 
 _HOLD: Final = "10s"
-"""How long hidden objects are held: what has become too uncertain to matter is as good as unknown."""
+"""Hold time of hidden objects; a long time is safe, because a very uncertain object counts as unknown."""
 
 
 class _Look(NamedTuple):
-    """Where a camera is, and what is in the middle of its picture, in metres."""
+    """Position of a camera, and the point in the middle of its picture, metres."""
 
     eye: tuple[float, float, float]
     look_at: tuple[float, float, float]
 
     @property
     def pose(self) -> Floats:
-        """(6,), rotation vector and translation from the scene's frame to the camera's."""
+        """(6,), rotation vector and translation from the scene's frame to the camera's frame."""
         return pose_looking_at(np.array(self.eye), np.array(self.look_at), np.array([0.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True)
 class _Views:
-    """Where the cameras of a scenario are, all of one kind, and the tags that they see.
+    """The cameras of a scenario, which differ only in their poses, and the tags that they see.
 
     Attributes:
-        coarse: pixels along each edge that share one of the simulator's picture, which costs most time.
-        focal: in pixels; the principal point is in the middle.
-        looks: that of each camera: what the arm hides from one is seen from another.
-        tag: edge of the tags on objects, in metres.
-        reference: edge of those on the table, at `places`.
+        size: width and height of a picture, pixels.
+        coarse: number of pixels along each edge that share a pixel of the simulator's picture. Its rendering
+            takes most of the time.
+        focal: focal length, pixels; the principal point is in the middle.
+        looks: pose of each camera; a second camera sees objects that the arm hides from the first.
+        tag: edge length of the tags on objects, metres.
+        reference: edge length of the tags on the table, metres.
+        places: positions (x, y) of the tags on the table, metres.
     """
 
     size: tuple[int, int]
@@ -258,12 +262,12 @@ _PUSHED: Final = _Views(
 _WHOLE_TABLE_TWICE: Final = replace(
     _WHOLE_TABLE, looks=(*_WHOLE_TABLE.looks, _Look((-0.3, -1.05, 1.35), (0.27, 0.0, 0.0)))
 )
-# what one camera sees of a lifted object leaves its height uncertain: after each release, both see it again
+# one camera cannot measure the height of a lifted object; both cameras see each object after its release
 _SET_TWICE: Final = replace(
     _WHOLE_TABLE,
     looks=(_Look((1.51, -0.33, 1.0), (0.27, 0.0, 0.0)), _Look((-0.37, -1.11, 1.0), (0.27, 0.0, 0.0))),
 )
-# rays from the tags to eyes all around find no moment in which the arm hides a block from both of these
+# chosen by casting rays from the tags to positions all around: the arm never hides a block from both cameras
 _PUSHED_TWICE: Final = replace(
     _PUSHED,
     size=(1280, 960),
@@ -278,24 +282,25 @@ _VIEWS: Final[Mapping[str, tuple[_Views, ...]]] = MappingProxyType(
         "table-setting": (_WHOLE_TABLE, _SET_TWICE),
     }
 )
-"""By the number of cameras."""
+"""Cameras of each scenario: one camera, and two cameras."""
 
 MOST_CAMERAS: Final = 2
+"""Maximum number of cameras of a run."""
 
 
 class Film:
-    """Cameras above a simulated world; a process for one run.
+    """Cameras above a simulated world, for one run.
 
-    Every object carries a tag on a card on its top, those that things are put on two; further tags lie on the
-    table. The pictures have the blur of lens and motion, and noise; what the arm hides is hidden.
+    Every object has a tag on its top, and every support has two tags. Further tags lie on the table. The
+    pictures have lens blur, motion blur and noise. The arm hides objects from the cameras.
     """
 
     def __init__(self, world: Tabletop, writers: Sequence[VideoWriter], seed: int) -> None:
         """Begin before the first sample.
 
         Args:
-            writers: of the videos, one or two.
-            seed: of the noise.
+            writers: writers of one or two videos.
+            seed: seed of the noise.
         """
         self._world, self._writers, self._seed = world, writers, seed
         self._views = _VIEWS[world.name][len(writers) - 1]
@@ -303,12 +308,16 @@ class Film:
         self._taken = 0
 
     def take(self, sample: Sample) -> None:
-        """Add the frames of a sample, while the world is in its state."""
+        """Add a frame of the current state of the world to each video.
+
+        Args:
+            sample: sample of the same state.
+        """
         for writer, frame in zip(self._writers, self.frames(sample.time_ns), strict=True):
             writer.write(frame)
 
     def frames(self, time_ns: int) -> Iterator[Frame]:
-        """Yield the picture that each camera has of the world as it is now."""
+        """Yield each camera's picture of the current state of the world."""
         scene, views = self._world.scene, self._views
         poses = {name: scene.pose(name) for name in scene.bodies}
         instants = [self._plates(poses, 0.0)]
@@ -319,16 +328,16 @@ class Film:
         size = (views.size[0] // views.coarse, views.size[1] // views.coarse)
         for number, look in enumerate(views.looks):
             colours, depth = scene.engine.picture(size, views.focal / views.coarse, look.eye, look.look_at)
-            # of a plane, the inverse of its depth is linear in the picture
+            # inverse depth can be interpolated: on a plane it is linear in the pixel coordinates
             nearness = 1 / depth
-            # the simulator takes the depths at the lower edges of pixels
+            # the simulator gives the depths at the lower edges of pixels
             nearness[1:] = (nearness[1:] + nearness[:-1]) / 2
             image = render(
                 FAMILY,
                 instants,
                 views.camera,
                 look.pose,
-                # of one camera as before there were two
+                # the first camera's noise does not depend on the number of cameras
                 seed=(self._seed, self._taken, *([number] if number else [])),
                 backdrop=Backdrop(
                     enlarge(colours[..., ::-1], views.coarse), 1 / enlarge(nearness, views.coarse)
@@ -337,7 +346,7 @@ class Film:
             yield Frame(time_ns, image)
 
     def _plates(self, poses: Mapping[str, Pose], share: float) -> list[Plate]:
-        """Return all tags, moved on by a share of the way since the frame before."""
+        """Return all tags, displaced by a share of their motion since the previous frame."""
         plates = [
             Plate(_FIRST_REFERENCE + index, np.array([x, y, 0.0]), np.eye(3)[:2], self._views.reference)
             for index, (x, y) in enumerate(self._views.places)
@@ -354,17 +363,17 @@ class Film:
 
 
 def tags_of_film(videos: Sequence[Path]) -> Path:
-    """Return where the tags file of a film is."""
+    """Return the path of a film's tags file."""
     return videos[0].with_suffix(".tags.yaml")
 
 
 def tags_text(world: Tabletop, cameras: int = 1) -> str:
-    """Return the tags file of a world that is at rest, for one or two cameras."""
+    """Return the tags file of a world at rest, for one or two cameras."""
     view = _VIEWS[world.name][cameras - 1]
     lines = [f"family: {FAMILY}", f"size: {view.tag:g}", "objects:"]
     for number, body in _bodies_with_tags(world):
         shape = body.shape
-        # without a minus before nothing
+        # adding 0.0 turns -0.0 into 0.0, which has no sign in the text
         bottom, top = (round(height, 4) + 0.0 for height in world.scene.height(body.name))
         outline = (
             f"box: [{shape.length:g}, {shape.width:g}]"
@@ -389,12 +398,12 @@ def tags_text(world: Tabletop, cameras: int = 1) -> str:
 
 
 def _bodies_with_tags(world: Tabletop) -> list[tuple[int, Body]]:
-    """Return the bodies, each with the number of its first tag."""
+    """Return the bodies, each with the number of its first tag; a body has up to two."""
     return [(2 * index, body) for index, body in enumerate(world.bodies)]
 
 
 def _spots(body: Body) -> list[tuple[float, float]]:
-    """Return where tags are on a body: of one that things are put on, where these leave them to be seen."""
+    """Return the positions of tags on a body: in the middle, or near the edges of a support."""
     if not body.support:
         return [(0.0, 0.0)]
     if isinstance(body.shape, Box):
@@ -406,11 +415,11 @@ def _spots(body: Body) -> list[tuple[float, float]]:
 
 @contextmanager
 def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> Iterator[Film | None]:
-    """Open the videos of a world, one or two, and write the tags file beside the first; None without any.
+    """Open one or two videos of a world, and write the tags file next to the first; None without videos.
 
     Raises:
-        UsageError: the extra `vision` is not installed, or a name that is not that of a video or comes
-            twice, more cameras than there are places for.
+        UsageError: the extra `vision` is not installed, there are more than two cameras, or a name is
+            duplicate or has no ending of a video.
         OutputError: a file cannot be written.
     """
     if not videos:
