@@ -1,1 +1,1 @@
-"""The robustness of a formula on a trace, online, offline and by the paper, with the deciding atoms."""
+"""Robustness of formulas on traces, with deciding atoms: online, offline, and by the paper."""

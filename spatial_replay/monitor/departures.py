@@ -1,6 +1,6 @@
-"""Members of open groups that leave a log within reach of a threshold and come back: nothing judged them.
+"""Temporary absences of members of open groups near a threshold, during which no atom judged them.
 
-An object counts likewise in a formula that asks whether it is present.
+An object that a formula tests with `present` is treated like a member.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from spatial_replay.text import Instant, Sentence, printable, with_unit
 from spatial_replay.trace.trace import ABSENT, Trace
 
 _APPROACH_NS: Final = 1_000_000_000
-"""The approach of an object is its change of distance over so long before it leaves."""
+"""Time before an absence over which the approach is measured, ns."""
 
 
 _STAND_IN: Final = "\0"
-"""A name that no object has; it comes before all others."""
+"""A name that no object has; it sorts before all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,10 @@ class Departure:
     """An absence of a member from its open group, or of an object from the log.
 
     Attributes:
-        name: of the object.
-        start_ns, end_ns: the first sample without it, and the sample in which it is a member again.
-        distance: from the object that its atom compares it with, in the sample before `start_ns`, or at
-            `end_ns` if it was out of reach before.
+        name: name of the object.
+        start_ns, end_ns: times of the first sample without it, and of the sample of its return.
+        distance: distance to the reference of its atom, in the last sample before the absence. If the
+            member was not near then, the distance at `end_ns`.
         message: a sentence.
     """
 
@@ -72,12 +72,12 @@ _Visitors: TypeAlias = Group | TrackedName
 
 
 class _Watch(NamedTuple):
-    """The distance of some members from something, with its threshold.
+    """A distance between members and a reference, with its threshold.
 
     Attributes:
-        visitors: the open group of the members, or the one object that its formula asks to be present.
-        member, reference: the terms, not enlarged.
-        threshold: enlargements are part of it.
+        visitors: the open group of the members, or the one object that the formula tests with `present`.
+        member, reference: terms of the distance, without enlargements.
+        threshold: threshold of the atom plus the enlargements.
     """
 
     visitors: _Visitors
@@ -90,21 +90,22 @@ class _Watch(NamedTuple):
 
 
 class Departures:
-    """Members that leave and come back, collected block by block.
+    """Collects absences of members that return, block by block.
 
-    A member counts if it was less than twice the threshold away before or after, or approached fast enough to
-    reach the threshold while it was away. At a threshold of 0 it counts if it was nearer than its own size.
+    An absence is collected if the member was closer than twice the threshold before or after it. For a
+    threshold of 0, the limit is the member's own size. It is also collected if the member approached fast
+    enough to reach the threshold meanwhile.
 
     Attributes:
-        departures: the ones so far.
+        departures: the departures so far.
     """
 
     def __init__(self, instances: Iterable[Instance], regions: Mapping[str, Outline], unit: str = "") -> None:
         """Start before the first sample.
 
         Args:
-            instances: the formulas of one specification.
-            unit: of lengths; "" where the log declares none.
+            instances: instances of one specification.
+            unit: unit of lengths; "" if the log declares none.
         """
         self.departures: list[Departure] = []
         self._regions, self._unit = regions, unit
@@ -115,13 +116,13 @@ class Departures:
         self._absent: dict[tuple[_Visitors, str], _Absence] = {}
 
     def restart(self) -> Departures:
-        """Return departures from the same groups in another log, before its first sample."""
+        """Return an empty collection for another log, with the same specification."""
         departures = copy(self)
         departures.departures, departures._past, departures._absent = [], None, {}
         return departures
 
     def add(self, trace: Trace) -> None:
-        """Add the next samples; the ones that fill a pause do not count."""
+        """Add the next samples, except samples that only fill a pause."""
         trace = trace.without_filling() if self._watches else trace
         if not self._watches or not len(trace):
             return
@@ -130,13 +131,13 @@ class Departures:
         scene = TraceScene(trace, self._regions)
         for visitors in self._watches:
             self._follow(visitors, scene)
-        # the newest second suffices for the approach of a member that leaves next
+        # the last second suffices to measure the approach of the next member that leaves
         self._past = tail(trace, Reach(1, _APPROACH_NS))
 
     def _follow(self, visitors: _Visitors, scene: TraceScene) -> None:
         trace, past_count = scene.trace, 0 if self._past is None else len(self._past)
         names, members = _memberships(visitors, scene)
-        # no one arrives in the first sample of a log
+        # membership cannot change in the first sample of a log
         start = max(past_count, 1)
         samples, columns = np.nonzero(np.diff(members[start - 1 :], axis=0))
         turns = list(zip((samples + start).tolist(), columns.tolist(), strict=True))
@@ -172,10 +173,10 @@ class Departures:
                 )
 
     def _distances(self, visitors: _Visitors, columns: Integers, samples: Integers, trace: Trace) -> Floats:
-        """Return the distances (N, watches, 3) of N members in three samples of each (N, 3)."""
+        """Return the distances (N, watches, 3) of N members, each in three samples (N, 3) of its own."""
         rows = trace.rows[samples.ravel()]
         cells = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
-        # one object stands for each member in its samples, so that all are measured at once
+        # a stand-in replaces each member in its samples, so that one call measures all members
         rows = np.column_stack([rows[cells], rows])
         rows[cells[0], cells[1] + 1] = ABSENT
         stand_in = replace(
@@ -197,9 +198,9 @@ class Departures:
     def _return(
         self, visitors: _Visitors, name: str, absence: _Absence, end_ns: int, distances: Floats, size: float
     ) -> None:
-        """Add the departure of a member that is back, if it was within reach of a threshold."""
+        """Add the departure of a member that has returned, if it was near a threshold."""
         span_ns = max(absence.last_ns - absence.early_ns, 1)
-        # a group without members is infinitely far away, and no member approaches it
+        # an empty group is infinitely far away: inf - inf is NaN, which counts as no approach
         with np.errstate(invalid="ignore"):
             approaches = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
         for watch, approach, last_distance, return_distance in zip(
@@ -221,14 +222,15 @@ class Departures:
 
 
 class _Absence(NamedTuple):
-    """An absence so far.
+    """An absence that has not ended.
 
     Attributes:
-        why: the beginning of the sentence about it.
-        early_ns, last_ns: a sample at most a second before the last one with the member, and that.
-        start_ns: the first sample without it.
-        early, last: (watches,), its distances in the first two.
-        size: its own in the second.
+        reason: beginning of the sentence about it.
+        early_ns: time of the first sample with the member within the second before `last_ns`.
+        last_ns: time of the last sample with the member.
+        start_ns: time of the first sample without it.
+        early, last: (watches,), distances at `early_ns` and `last_ns`.
+        size: size of the member at `last_ns`.
     """
 
     reason: str
@@ -241,13 +243,13 @@ class _Absence(NamedTuple):
 
 
 def _early(trace: Trace, members: Flags, sample: int, column: int) -> int:
-    """Return the first sample with a member in the second before the one before a sample."""
+    """Return the first sample with a member within the second up to `sample` - 1."""
     begin = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
     return begin + int(members[begin:sample, column].argmax())
 
 
 def _sizes(trace: Trace, samples: Integers, columns: Integers) -> Floats:
-    """Return the sizes (N, K) of N objects in K samples of each (N, K); 0 where they are unknown."""
+    """Return the sizes (N, K) of N objects, each in K samples of its own; 0 if unknown."""
     rows = trace.rows[samples, columns[:, None]]
     sizes = np.zeros(rows.shape)
     sizes[rows >= 0] = trace.footprints.select(rows[rows >= 0]).sizes
@@ -255,7 +257,7 @@ def _sizes(trace: Trace, samples: Integers, columns: Integers) -> Floats:
 
 
 def _memberships(visitors: _Visitors, scene: TraceScene) -> tuple[Sequence[str], Flags]:
-    """Return the names (M,) of all members and, (T, M), in which samples they are members: 1 or 0."""
+    """Return the names (M,) of all members, and their membership (T, M) in each sample, 1 or 0."""
     if isinstance(visitors, Group):
         names, members, _ = scene.members(visitors)
         return names, members
@@ -266,7 +268,7 @@ def _memberships(visitors: _Visitors, scene: TraceScene) -> tuple[Sequence[str],
 
 
 def _why_absent(visitors: _Visitors, name: str, trace: Trace, sample: int) -> str:
-    """Return why an object is no member in a sample."""
+    """Return the reason of an absence as the beginning of a sentence."""
     row = int(trace.rows[sample, trace.names.index(name)])
     if row == ABSENT or isinstance(visitors, TrackedName):
         return f"{printable(name)} was not in the log"
@@ -310,7 +312,7 @@ def _without_enlargement(term: Term) -> Term:
 
 
 def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
-    """Return a term in which the object that it is the centre of, or itself, is changed."""
+    """Return a term with a changed base; the base of a `Centre` is inside it."""
     if isinstance(term, Centre):
         inner: Any = _with_base(term.term, change)
         return replace(term, term=inner)
@@ -318,7 +320,7 @@ def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
 
 
 def _with_group(term: Term, groups: Mapping[str, Group | Earlier]) -> Term:
-    """Return a term about the whole group that its variable stands for, without other variables."""
+    """Return a term with its variable replaced by the whole group; only named objects stay excluded."""
 
     def change(base: Term) -> Term:
         group = groups.get(base.name, base) if isinstance(base, Variable) else base
@@ -331,12 +333,12 @@ def _with_group(term: Term, groups: Mapping[str, Group | Earlier]) -> Term:
 
 
 def _about(term: Term, name: str) -> Term:
-    """Return a term about one member in place of its open group."""
+    """Return a term with its open group replaced by one member."""
     return _with_base(term, lambda _: TrackedName(name))
 
 
 def _without(term: Term, name: str) -> Term:
-    """Return a term in which an object is no member of its open group."""
+    """Return a term whose open group excludes an object."""
 
     def change(base: Term) -> Term:
         if not isinstance(base, Group) or not base.is_open:

@@ -1,4 +1,4 @@
-"""Verdicts that rest on objects or signals which a log may have been read wrongly for."""
+"""Doubtful verdicts: their objects or signals may have been misread from the log."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from spatial_replay.trace.trace import ABSENT, Trace
 
 
 class ClassMembers:
-    """The objects that were of some classes in any sample so far.
+    """Names of the objects of given classes, collected over all samples so far.
 
     Args:
-        classes: in lower case; any object is one of `ANY_CLASS`.
+        classes: class names in lower case; `ANY_CLASS` stands for every object.
     """
 
     def __init__(self, classes: Iterable[str]) -> None:
         self._names = {name: set[str]() for name in classes if name != ANY_CLASS}
 
     def __bool__(self) -> bool:
-        """Return whether there is a class whose members are collected."""
+        """Return whether the members of any class are collected."""
         return bool(self._names)
 
     def add(self, trace: Trace) -> None:
@@ -36,23 +36,27 @@ class ClassMembers:
         if not codes:
             return
         rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
-        # -1, the row of an absent object, reads the appended entry: a code that no class has
+        # row -1 of an absent object reads the appended last entry, a code that no class has
         code_of_row = np.append(trace.class_code, -1)[rows]
         for code in codes:
             columns = np.flatnonzero((code_of_row == code).any(axis=0)).tolist()
             self._names[class_by_code[code]].update(trace.names[column] for column in columns)
 
     def may_include(self, classes: Iterable[str], objects: frozenset[str]) -> bool:
-        """Return whether one of the objects was of one of the classes."""
+        """Return whether any of the objects had any of the classes."""
         return bool(objects) and any(
             name == ANY_CLASS or not objects.isdisjoint(self._names[name]) for name in classes
         )
 
 
 def needs_of_spec(spec: NamedSpec, object: str | None = None) -> Needs:
-    """Return the names that one spec uses; the parameter of a template stands for the object."""
+    """Return the names that a spec uses.
+
+    Args:
+        object: the object of a template's instance; None for other specs.
+    """
     needs = Needs.of([Specification((replace(spec, parameter=None),), profile="")], {})
-    # an object of `present` alone is not needed for a verdict, but may be absent by a wrong reading
+    # `Needs.of` omits objects that only `present` names; a misread log may lack them as well
     names = {
         term.name
         for atom in iter_atoms(spec.formula)
@@ -63,7 +67,7 @@ def needs_of_spec(spec: NamedSpec, object: str | None = None) -> Needs:
 
 
 def doubts_about(needs: Needs, doubts: Iterable[Doubt], members: ClassMembers) -> tuple[Doubt, ...]:
-    """Return the doubts that results with these needs rest on, without those that are accepted."""
+    """Return the doubts about needed objects, signals and classes, without accepted doubts."""
     return tuple(
         doubt
         for doubt in doubts
@@ -79,10 +83,10 @@ def doubts_about(needs: Needs, doubts: Iterable[Doubt], members: ClassMembers) -
 def doubts_of_instances(
     instances: Sequence[Instance], doubts: Sequence[Doubt], traces: Callable[[], Iterable[Trace]]
 ) -> list[tuple[Doubt, ...]]:
-    """Return for each instance the doubts that its verdict rests on, without those that are accepted.
+    """Return the doubts that affect the verdict of each instance, without accepted doubts.
 
     Args:
-        traces: iterates over the samples; called if there are doubts and groups of a class.
+        traces: iterates over the samples; called only if there are doubts and groups of a class.
     """
     if all(doubt.is_accepted for doubt in doubts):
         return [()] * len(instances)

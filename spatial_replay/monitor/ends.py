@@ -1,7 +1,7 @@
-"""Where the evaluation of a log begins and ends: specifications and spans of topics in, samples out.
+"""Begin and end of the evaluation of a log, from needs of specifications and spans of topics.
 
-A recorded log, a trace and a running robot follow one rule. Evaluation begins at the first sample where
-each needed topic has sent a message and can be placed, and ends at the last such sample.
+Recorded logs, traces and running robots follow one rule. Evaluation begins at the first sample where each
+needed topic has sent a message that transforms can place. It ends at the last such sample.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Needs:
         """Return the needs of specifications.
 
         Args:
-            each: for parameters of templates, the objects that they stand for: "all", "class:NAME" or a name.
+            each: choice of objects for each template parameter: "all", "class:NAME" or a name.
         """
         objects: set[str] = set()
         signals: set[str] = set()
@@ -58,14 +58,14 @@ class Needs:
         return cls(frozenset(objects), frozenset(signals), frozenset(name.casefold() for name in classes))
 
     def choose(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
-        """Return the spans of the topics that carry a needed object or signal, or may do so."""
+        """Return the spans of topics that carry, or may carry, a needed object or signal."""
         unseen = self.objects.difference(*(span.objects for span in spans))
         return [span for span in spans if self._is_needed(span, unseen)]
 
     def choose_first(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
-        """Return the spans that are needed whichever of their objects are seen later.
+        """Return the spans that are needed regardless of the objects that appear later.
 
-        A run does not know these, and begins where its recording does.
+        A live run cannot know later objects, but has to begin at the same sample as its recording.
         """
         patterns = {span.pattern for span in spans}
         fixed = {name: re.escape(name) for name in self.objects if re.escape(name) in patterns}
@@ -84,21 +84,22 @@ class Needs:
 
 
 class RunEnds:
-    """Leaves out the samples at both ends of a log in which a needed topic cannot be judged.
+    """Leaves out samples at both ends of a log, where a needed topic cannot be judged.
 
-    Samples are left out only before a needed topic begins, after it ends, and where no transform places it.
-    At each end at most the topic's `limit_ns` is left out. A topic that is missing for longer leaves a hole.
+    Samples are left out before a needed topic begins, after it ends, and where no transform places it.
+    At each end at most the topic's `limit_ns` is left out. No sample is left out for a topic that is missing
+    for longer.
 
     Args:
-        start, end: whether samples are left out at the start, and at the end.
-        is_rest: whether samples came before, so that all of these may be left out.
-        within_ns: replaces the limits of the topics at the start.
+        start, end: whether samples may be left out at the start, and at the end.
+        is_rest: whether the trace continues earlier samples; then all its samples may be left out.
+        within_ns: limit at the start, instead of the topics' own limits.
 
     Attributes:
         log_begin_ns: time of the first sample.
-        begin_ns: time of the first sample that counts; None until that is decided.
-        end_ns: samples from this time on are left out; known after `finish`.
-        late: needed topics that could not be judged in time, so that evaluation began without them.
+        begin_ns: time of the first evaluated sample; None until it is decided.
+        end_ns: time from which samples are left out; set by `finish`.
+        late: needed topics that came too late, so that evaluation began without them.
     """
 
     def __init__(
@@ -125,11 +126,14 @@ class RunEnds:
 
     @property
     def has_spans(self) -> bool:
-        """Whether the log says when its topics could be judged."""
+        """Whether any sample so far came with spans of topics."""
         return bool(self._spans)
 
     def add(self, trace: Trace) -> list[Trace]:
-        """Add the next samples; return those that count now, one trace for each that was added, in order."""
+        """Add the next samples and return the samples that are ready for evaluation.
+
+        Each added trace is returned once, trimmed, in order of addition.
+        """
         if self.begin_ns is not None and not self._end and not self.late:
             return [trace]
         if len(trace):
@@ -143,11 +147,11 @@ class RunEnds:
         return self._release(self._open_since_ns())
 
     def release(self) -> list[Trace]:
-        """Return the samples that wait, which count, too; none before evaluation begins."""
+        """Return the pending samples, which are all evaluated; none before evaluation begins."""
         return [] if self.begin_ns is None else self._release(FOREVER)
 
     def finish(self) -> list[Trace]:
-        """Return the remaining samples that count, at the end of the log."""
+        """Return the remaining evaluated samples at the end of the log."""
         if self._is_empty:
             return self._release(FOREVER)
         if self.begin_ns is None:
@@ -165,7 +169,7 @@ class RunEnds:
         for span in trace.spans:
             earlier_span = self._spans.get(span.topic)
             self._spans[span.topic] = span if earlier_span is None else earlier_span.join(span)
-            # the first sample after the last one in which the topic could be judged
+            # the sample after the last sample in which the topic could be judged
             next_sample = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
             since_ns = int(times_ns[next_sample]) if next_sample < len(times_ns) else None
             if next_sample == 0 and earlier_span is not None and self._since_ns[span.topic] is not None:
@@ -176,7 +180,7 @@ class RunEnds:
         return span.limit_ns if self._within_ns is None else self._within_ns
 
     def _decide_begin(self) -> bool:
-        """Begin if no needed topic is waited for any more."""
+        """Begin evaluation if no needed topic is awaited; return whether it began."""
         passed_ns = self._log_end_ns - self.log_begin_ns
         is_waiting = self._is_empty or (
             self._start
@@ -210,7 +214,7 @@ class RunEnds:
         self._remark("beginning", left_out, reason)
 
     def _remark_late(self, span: TopicSpan) -> None:
-        """Say that objects are absent before a topic that was not waited for."""
+        """Add a remark that the objects of a late topic are absent until it begins."""
         if span.pattern is None or span.begun_ns is None or span.begun_ns <= self.log_begin_ns:
             return
         limit = format_duration(self._limit_ns(span))
@@ -239,7 +243,7 @@ class RunEnds:
         self.remarks = (*self.remarks, sentence)
 
     def _open_spans(self) -> Iterator[TopicSpan]:
-        """Yield the spans that end before the newest sample, by no more than their limits."""
+        """Yield needed spans that ended before the newest sample, by no more than their limits."""
         if not self._end:
             return
         for span in self.needs.choose(tuple(self._spans.values())):
@@ -249,14 +253,14 @@ class RunEnds:
                 yield span
 
     def _open_since_ns(self) -> int:
-        """Return the first time at which a needed topic may have ended with the log; FOREVER if none has."""
+        """Return the earliest time from which a needed topic may have ended; FOREVER if none may have."""
         return min((self._since_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
 
     def _release(self, before_ns: int) -> list[Trace]:
-        """Return the traces that end before a time, and drop them here."""
+        """Remove and return the pending traces that end before a time."""
         count = 0
         for trace in self._pending_traces:
-            # a trace is released as a whole: callers count on one trace for each that they added
+            # traces are released whole, because callers expect one trace for each added trace
             if len(trace) and int(trace.times_ns[-1]) >= before_ns:
                 break
             if len(trace):
@@ -266,7 +270,7 @@ class RunEnds:
         return [self.trim(trace) for trace in released]
 
     def trim(self, trace: Trace) -> Trace:
-        """Return the samples of a trace that count, as far as that is decided."""
+        """Return the samples of a trace from `begin_ns` to before `end_ns`."""
         counting = within(trace, self.begin_ns, self.end_ns)
         return replace(counting, spans=()) if counting.spans else counting
 
@@ -274,10 +278,10 @@ class RunEnds:
 def trim_trace(
     trace: Trace, needs: Needs, *, start: bool = True, end: bool = True, is_rest: bool = False
 ) -> tuple[Trace, tuple[Sentence, ...]]:
-    """Return the samples of a trace that count, and remarks on those left out; see `RunEnds`."""
+    """Return the evaluated samples of a trace, and remarks on samples left out (see `RunEnds`)."""
     if not trace.spans:
         return trace, ()
     ends = RunEnds(needs, start=start, end=end, is_rest=is_rest)
     (counting,) = [*ends.add(trace), *ends.finish()]
-    # the same trace object keeps its cache of measurements
+    # an untrimmed trace stays the same object, so its cache of measurements stays in use
     return (counting, ends.remarks) if ends.remarks else (trace, ())

@@ -1,4 +1,4 @@
-"""Comparisons of distances that heights decide: one object is above another, and not beside it."""
+"""Distance comparisons that heights decide, because one object is above the other."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ from spatial_replay.text import Instant, Sentence, plural
 from spatial_replay.trace.trace import Trace
 
 _MOST_SAMPLES: Final = 64
-"""Samples of a block to compare, spread over those in which one object may be above another."""
+"""Limit on compared samples of a block, spread evenly."""
 
 
 @dataclass(slots=True)
 class _Comparison:
-    """A comparison of a distance, and in how many samples heights decide it.
+    """A comparison of a distance, with the number of samples in which heights decide it.
 
     Attributes:
-        holds: whether it holds in the first of them, which is at `first_ns`.
+        first_ns: time of the first such sample.
+        holds: whether the comparison holds in that sample.
+        count: number of such samples.
+        compared: number of samples that were compared.
     """
 
     atom: Atom
@@ -39,7 +42,7 @@ class _Comparison:
 
 
 class HeightComparisons:
-    """Comparisons whose truth is another one seen from above, collected block by block."""
+    """Counts comparisons whose truth changes without heights, block by block."""
 
     def __init__(self, specifications: Sequence[Specification]) -> None:
         """Start before the first sample."""

@@ -1,4 +1,4 @@
-"""How often and where an invariant (`G p`) is violated: each interval, with its worst sample."""
+"""Violated intervals of an invariant (`G p`), each with its worst sample."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from spatial_replay.spec.formula import Temporal, operands_of, operator_of
 from spatial_replay.text import Instant, Sentence, number_text, plural
 
 LISTED: Final = 5
-"""Intervals that an explanation lists."""
+"""Number of intervals that an explanation lists."""
 MOST_EXPLAINED: Final = 256
-"""Intervals of one invariant with an atom, since each looks into its sample."""
+"""Limit on intervals of an invariant that get a deciding atom, because each reads its sample again."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViolatedInterval:
-    """Samples in a row at which the operand of a `G` is violated.
+    """Consecutive samples at which the operand of a `G` is violated.
 
     Attributes:
-        start_ns, end_ns: the first and the last of them.
-        samples: how many they are.
-        worst_ns: the first with the least robustness.
-        robustness: that of the operand there.
-        deciding: the atom that decides there: of a missed response, the one that came closest to it. None
-            after `MOST_EXPLAINED` intervals, and if no atom decides.
-        deciding_ns: the time of the sample in which this atom was measured.
-        place: a point on what it relates or, where that has none, on what its condition relates; else None.
+        start_ns, end_ns: times of the first and the last sample.
+        samples: number of samples.
+        worst_ns: time of the first sample with the least robustness.
+        robustness: robustness of the operand at `worst_ns`.
+        deciding: deciding atom at `worst_ns`. For a missed response, the atom that came closest to
+            fulfilling it. None after `MOST_EXPLAINED` intervals, and if no atom decides.
+        deciding_ns: time of the sample in which this atom was measured.
+        place: contact point of the deciding atom or, if it has none, of the condition's atom; else None.
     """
 
     start_ns: int
@@ -66,11 +66,11 @@ class ViolatedInvariant:
     """A part `G p` of a result that is violated.
 
     Attributes:
-        spec: the innermost named spec that it belongs to.
+        spec: innermost named spec that contains it.
         node: its id.
-        intervals: in which `p` is violated, by time.
-        condition: of `G (condition -> response)`, its condition; else None.
-        entries: the intervals in which the condition held, and in how many of them the response was missed.
+        intervals: violated intervals of `p`, by time.
+        condition: text of the condition in `G (condition -> response)`; else None.
+        entries: number of intervals in which the condition held, and number of these with a missed response.
     """
 
     spec: str
@@ -81,7 +81,7 @@ class ViolatedInvariant:
 
 
 class _Runs(NamedTuple):
-    """Runs of samples: the first (K,) of each, and the one after its last."""
+    """Runs of consecutive samples: first sample (K,) of each run, and last sample plus one."""
 
     starts: Integers
     ends: Integers
@@ -101,13 +101,13 @@ def find_violated_invariants(
     goes_on: bool = False,
     most: int = MOST_EXPLAINED,
 ) -> Iterator[ViolatedInvariant]:
-    """Yield the conjuncts `G p` and `not F p` that are violated, in their order.
+    """Yield the violated conjuncts `G p` and `not F p`, in order.
 
     Args:
         leaves: (C, A, T), the instance's leaves.
         times_ns: (T,), T at least 1.
-        goes_on: whether samples may follow: then only what they cannot change is violated.
-        most: intervals of each that get an atom, the first ones.
+        goes_on: whether samples may follow; then only permanent violations count.
+        most: limit on intervals of each invariant that get a deciding atom; later ones get none.
     """
     invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
     if not invariants:
@@ -121,12 +121,12 @@ def find_violated_invariants(
 
 
 class _Invariant(NamedTuple):
-    """An operator over all samples of its window.
+    """An operator that requires its operand at all samples of its window.
 
     Attributes:
-        operator: `G`, or an `F` that is negated.
-        operand: the id of its operand.
-        condition: the id of the condition, if the operand is an implication; else None.
+        operator: `G`, or a negated `F`.
+        operand: id of its operand.
+        condition: id of the condition if the operand is an implication; else None.
     """
 
     conjunct: Conjunct
@@ -136,7 +136,7 @@ class _Invariant(NamedTuple):
 
     @property
     def end(self) -> End:
-        """Which end of the operand's interval decides a violation."""
+        """The end of the operand's interval that decides a violation."""
         return End.HIGH if self.operator.operator == "G" else End.LOW
 
     @classmethod
@@ -188,7 +188,7 @@ def _with_atoms(
     intervals: Sequence[ViolatedInterval],
     worst: Sequence[int],
 ) -> Iterator[ViolatedInterval]:
-    """Yield intervals with the atom that decides the worst sample of each."""
+    """Yield the intervals, each with the atom that decides its worst sample."""
     bindings, condition = evidence.instance.bindings, invariant.condition
     paths = [deciding_path(nodes, invariant.operand, invariant.end, sample=sample) for sample in worst]
     response_paths = [missed_response(path, nodes, bindings)[1] for path in paths]
@@ -221,11 +221,11 @@ def _place_of(deciding: DecidingAtom | None) -> Point | None:
 def invariant_sentences(
     invariant: ViolatedInvariant, first_ns: int, units: Mapping[str, str]
 ) -> Iterator[Sentence]:
-    """Yield sentences on how often an invariant is violated, and on the first of several intervals.
+    """Yield sentences on the number of violated intervals, and on the first few of several intervals.
 
     Args:
-        first_ns: the time that others are counted from.
-        units: those that the log declares.
+        first_ns: reference time of the sentences.
+        units: declared units of the log.
     """
     intervals = invariant.intervals
     entries, missed = invariant.entries

@@ -1,4 +1,4 @@
-"""Numbers of a specification against those of a log: thresholds out of reach, regions far away, windows."""
+"""Plausibility of a specification for a log: thresholds out of reach, far regions, windows too long."""
 
 from __future__ import annotations
 
@@ -42,24 +42,25 @@ from spatial_replay.trace.trace import Pauses, Trace
 
 _LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
 _FAR = 10.0
-"""Beyond so many times the extent of all that was seen, a length is most likely in another unit."""
+"""Ratio of a length to the log's extent above which the length is probably in another unit."""
 _APART = 5.0
-"""A threshold below the least number divided by this, or above the greatest times it, is far away."""
+"""Ratio of a threshold and the nearest measured number above which the threshold is out of reach."""
 
 
 @dataclass(frozen=True, slots=True)
 class ThresholdRange:
-    """An atom's quantity over a log, which it compares with its threshold.
+    """The range over a log of the quantity that an atom compares with its threshold.
 
     Attributes:
-        atom: with one distance or signal in it.
-        bound: what binds its variables, from the outside in: open quantifiers, and the objects of a template.
-        least, greatest: of the distance or signal, whatever objects the variables stand for; least > greatest
-            if it is never known, or a text.
-        known, holding, failing: samples in which it is known, in which the atom holds, and in which it fails,
-            whatever objects the variables stand for.
-        empty: samples in which no object is in the groups of the variables, so that it holds for all.
-        samples: how many there are.
+        atom: an atom with one distance or signal.
+        bound: quantifiers that bind its variables, outermost first, with one over the objects of a template.
+        least, greatest: range of the quantity over all objects that the variables stand for. For a text, and
+            for a quantity that is never known, least > greatest.
+        known: number of samples in which the quantity is known.
+        holding: number of samples in which the atom holds for all objects.
+        failing: number of samples in which the atom fails for all objects.
+        empty: number of samples in which no object is in the groups of the variables.
+        samples: number of all samples.
     """
 
     atom: Atom
@@ -82,7 +83,7 @@ class ThresholdRange:
 
     @property
     def objects(self) -> str | None:
-        """Its variables and their groups, as `d in drinks`; None without any."""
+        """Its variables and their groups, as in `d in drinks`; None without variables."""
         over = [
             f"{', '.join(quantifier.variables)} in {format_term(quantifier.group).strip('()')}"
             for quantifier in self.bound
@@ -91,12 +92,12 @@ class ThresholdRange:
 
     @property
     def text(self) -> str:
-        """The atom, and what its variables stand for."""
+        """The atom with the groups of its variables."""
         return self.atom.text if self.objects is None else f"{self.atom.text} for {self.objects}"
 
     @property
     def _words_of_empty(self) -> str:
-        """Words for the value over empty groups."""
+        """The words on samples without an object, with the atom's value there."""
         quantifiers = {quantified.quantifier for quantified in self.bound}
         if len(quantifiers) > 1:
             return "has no object"
@@ -122,14 +123,14 @@ class ThresholdRange:
 
 
 class LogNumbers:
-    """Quantities of a log and thresholds of a specification, collected block by block.
+    """Numbers of a log against which a specification is checked, collected block by block.
 
     Attributes:
-        box: xmin, ymin, xmax, ymax of all footprints; empty (xmin > xmax) without any.
-        samples: how many there are.
-        times_ns: of the first and the last one.
-        classes: of its objects; "" for objects without one.
-        missing: by object and signal of the specification, how many samples lack it, and the first of them.
+        box: xmin, ymin, xmax, ymax of all footprints; xmin > xmax without footprints.
+        samples: number of samples.
+        times_ns: times of the first and the last sample.
+        classes: classes of the objects; "" for objects without a class.
+        missing: number of samples that lack an object or signal of the specification, and time of the first.
     """
 
     def __init__(self, specification: Specification) -> None:
@@ -153,7 +154,7 @@ class LogNumbers:
         }
 
     def add(self, trace: Trace) -> None:
-        """Add the next samples; those that fill a pause do not count."""
+        """Add the next samples, except samples that only fill a pause."""
         trace = trace.without_filling()
         if not len(trace):
             return
@@ -187,18 +188,18 @@ class LogNumbers:
                 threshold_range.atom,
                 expression=_compared_quantity(threshold_range.atom) or threshold_range.atom.expression,
             )
-            # one call a formula, as in a replay: the limit of bindings counts all formulas of a call
+            # one call per formula, as in a replay: the limit of bindings counts all formulas of a call
             least, greatest, all_hold, any_holds = (
                 leaf_values(scene, [over_bindings(quantifier, threshold_range.bound, atom)], {})[:, 0]
                 for atom in (quantity_atom, threshold_range.atom)
                 for quantifier in ("forall", "exists")
             )
-            # low and high ends differ where something is unknown; without any object they are infinite
+            # low and high ends differ where a value is unknown, and are infinite where there is no object
             is_text = isinstance(threshold_range.atom.parameters[-1], str)
             is_sure = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
             for ends in (all_hold, any_holds) if is_text else (least, greatest):
                 is_sure &= ends[0] == ends[min(1, len(ends) - 1)]
-            # `forall` of nothing is +inf, `exists` -inf
+            # over no object, `forall` is +inf and `exists` is -inf
             is_empty = (all_hold == np.inf).all(axis=0) & (any_holds == -np.inf).all(axis=0)
             is_sure &= ~is_empty
             has_number = is_sure & (not is_text)
@@ -214,35 +215,35 @@ class LogNumbers:
 
     @property
     def ranges(self) -> Sequence[ThresholdRange]:
-        """Quantity of each atom with a threshold."""
+        """The range of each atom that compares one signal or distance with a number."""
         return tuple(
             replace(threshold_range, samples=self.samples) for threshold_range in self._ranges.values()
         )
 
     def range_of(self, atom: Atom, bound: tuple[Quantified, ...]) -> ThresholdRange | None:
-        """Return what an atom compares with its threshold; None if that is not one number."""
+        """Return the range of an atom; None if it does not compare one signal or distance."""
         return self._ranges.get(_key(atom, bound))
 
     @property
     def extent(self) -> float:
-        """The diagonal of `box`; 0 if nothing was seen."""
+        """The diagonal of `box`; 0 without footprints."""
         left, bottom, right, top = self.box
         return hypot(right - left, top - bottom) if left <= right else 0.0
 
     @property
     def seconds(self) -> float:
-        """From the first sample to the last."""
+        """Time from the first sample to the last, s."""
         return (self.times_ns[1] - self.times_ns[0]) / 1e9
 
     @property
     def rate(self) -> float | None:
-        """Samples a second, as they usually come; None of fewer than two samples."""
+        """Usual number of samples per second; None for fewer than two samples."""
         usual_ns = self._pauses.usual_ns
         return 1e9 / usual_ns if usual_ns else None
 
 
 def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
-    """Return each window given in samples, in seconds at the log's rate."""
+    """Return a line for each window given in samples, with its seconds at the log's rate."""
     if log.rate is None:
         return []
     lines: dict[str, None] = {}
@@ -263,7 +264,7 @@ _Windows: TypeAlias = tuple[tuple[Temporal, Bound], ...]
 
 
 def _reach(formula: Formula, rate: float) -> tuple[float, _Windows]:
-    """Return how far a formula looks ahead, in seconds, and the windows within each other that do."""
+    """Return the look-ahead of a formula in seconds, with the nested windows that add up to it."""
     farthest = max(
         (_reach(operand, rate) for operand in operands_of(formula)), key=itemgetter(0), default=(0.0, ())
     )
@@ -283,10 +284,10 @@ def _nesting_text(windows: _Windows) -> str:
 def plausibility_warnings(
     specification: Specification, log: LogNumbers, zero_ns: int
 ) -> tuple[Diagnostic, ...]:
-    """Return a warning for each region, number and window that hardly fits what the log holds.
+    """Return a warning for each region, number and window that is implausible for the log.
 
     Args:
-        zero_ns: the time that texts count from.
+        zero_ns: reference time of the texts.
     """
     source = SourceText.of(specification.source, specification.filename)
     warnings: dict[str, Diagnostic] = {}
@@ -344,7 +345,7 @@ def plausibility_warnings(
 
 
 def _empty_class(group: Group | Earlier, log: LogNumbers) -> str | None:
-    """Return the class of a group that no object of the log has; None for other groups."""
+    """Return the class of a group if no object of the log has it; else None."""
     name = group.class_name if isinstance(group, Group) else None
     if name is None or name == ANY_CLASS or name.casefold() in map(str.casefold, log.classes):
         return None
@@ -389,7 +390,7 @@ def _doubts(atom: Atom, log: LogNumbers, threshold_range: ThresholdRange | None)
 
 
 def _is_far(limit: float, threshold_range: ThresholdRange, *, is_length: bool) -> bool:
-    """Return whether no number that was taken comes near a threshold."""
+    """Return whether a threshold is out of reach of the measured range."""
     least, greatest = threshold_range.least, threshold_range.greatest
     if least <= limit <= greatest:
         return False
@@ -417,7 +418,7 @@ def _doubts_of_window(text: str, bound: Bound, log: LogNumbers) -> Iterator[tupl
 
 
 def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float:
-    """Return how far the bounding boxes of an outline and of the log are apart; 0 if they meet."""
+    """Return the gap between the bounding boxes of an outline and of the log; 0 if they meet."""
     xs, ys = zip(*outline.vertices, strict=True)
     apart_x = max(box[0] - max(xs), min(xs) - box[2], 0.0)
     apart_y = max(box[1] - max(ys), min(ys) - box[3], 0.0)
@@ -425,7 +426,7 @@ def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float
 
 
 def _compared_quantity(atom: Atom) -> Expression | None:
-    """Return the signal or distance that an atom compares with numbers; None if it is computed or not one."""
+    """Return the only signal or distance that an atom compares with a number; None for other atoms."""
     if atom.relation == "sum":
         return None
     parts = {part for part in iter_expressions(atom.expression) if isinstance(part, (Signal, Measurement))}
@@ -443,7 +444,7 @@ def _key(atom: Atom, bound: tuple[Quantified, ...]) -> tuple[str, ...]:
 def over_bindings(
     quantifier: Literal["forall", "exists"], bound: tuple[Quantified, ...], atom: Atom
 ) -> Atom | Quantified:
-    """Return an atom for all objects that its variables may stand for, or for some."""
+    """Return an atom under quantifiers of one kind that bind its variables."""
     formula: Atom | Quantified = atom
     for binding in reversed(bound):
         formula = Quantified(quantifier, binding.variables, binding.group, formula)
@@ -451,7 +452,7 @@ def over_bindings(
 
 
 def bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
-    """Yield every node, with the quantifiers that bind variables of it, from the outside in."""
+    """Yield every node; atoms come with the quantifiers that bind their variables, outermost first."""
     for spec in specification.results:
         for node, quantifiers in iter_bound(spec.formula):
             yield node, _binding(node, quantifiers, spec.parameter) if isinstance(node, Atom) else ()
@@ -460,9 +461,10 @@ def bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Q
 def _binding(
     atom: Atom, quantifiers: tuple[Quantified, ...], parameter: str | None
 ) -> tuple[Quantified, ...]:
-    """Return those of the quantifiers around an atom that bind a variable of it, or of one that does.
+    """Return the quantifiers around an atom that bind its variables, or variables of their groups.
 
-    The objects of a template are all but those that the atom names: no distance to itself is meant.
+    A template parameter ranges over all objects that the atom does not name, because an object is not to be
+    compared with itself.
     """
     variables = _variables([*terms_of(atom.expression), *atom.terms])
     bound: list[Quantified] = []

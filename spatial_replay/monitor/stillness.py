@@ -1,4 +1,4 @@
-"""Objects that never change by a bit while all of their kind do: a tracker may have lost them."""
+"""Objects that never change while all others of their class move: the tracker may have lost them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from spatial_replay.text import plural, printable
 from spatial_replay.trace.trace import Trace
 
 _LEAST_REPORTS: Final = 20
-"""An object with fewer reports may rest."""
+"""Minimum number of reports to judge an object."""
 _MOSTLY: Final = 0.95
-"""The others change in at least this part of their reports."""
+"""Minimum fraction of reports in which each other object changes."""
 _LEAST_OTHERS: Final = {True: 1, False: 3}
-"""How many others there have to be: of its class, or without a class, where a goal among two is usual."""
+"""Minimum number of other objects, by whether they have a class.
+
+Objects without a class need more, because one of two objects is often a fixed goal.
+"""
 
 
 @dataclass(slots=True)
 class _Reports:
-    """The reports of an object after its first one.
+    """The reports of an object after its first report.
 
     Attributes:
-        last: numbers of the last one.
+        last: (3,), numbers of the newest report.
     """
 
     count: int = 0
@@ -40,7 +43,7 @@ class _Reports:
 
 
 class Stillness:
-    """How often each object changed from one report to the next, collected block by block."""
+    """Counts the changes between consecutive reports of each object, block by block."""
 
     def __init__(self) -> None:
         """Start before the first sample."""
@@ -74,7 +77,7 @@ class Stillness:
             reports.last = report_numbers[-1]
 
     def remarks(self) -> Iterator[str]:
-        """Yield a sentence on each object that never changed while all others of its class mostly did."""
+        """Yield a sentence on each object that never changed while all others of its class mostly changed."""
         by_class: dict[str | None, dict[str, _Reports]] = defaultdict(dict)
         for name, reports in self._reports.items():
             if name not in self._lasting:
@@ -93,7 +96,7 @@ class Stillness:
 
 
 def _numbers(trace: Trace) -> Floats:
-    """Return numbers (R, 3) of each observation that change whenever it moves or turns."""
+    """Return the sum of the vertices and the yaw of each observation, (R, 3)."""
     batch = trace.footprints
     places = batch.vertex_start[batch.part_start]
     sums = np.zeros((len(trace.yaw), 3))
