@@ -1,11 +1,11 @@
-"""Offline robustness: rho(t, node) of every node from each sample to the end of the samples.
+"""Offline robustness: rho(t, node) of every node at each sample t, given all samples.
 
-A monitor's numbers, in contrast, are about the first and the newest sample. A sliding window is evaluated as
-a log of its own at each position.
+A monitor, in contrast, computes robustness only at the first and the newest sample. A sliding window is
+evaluated as a separate log at each position.
 
-The end of the samples is known, so each operator is one pass, independent of the width of its window.
-A future operator is a past one in reversed time: kernels work on *steps* 0, 1, … and look back. Step i stands
-at begin + i, or at end - 1 - i for a future operator.
+The last sample is known, so each operator takes one pass, independent of the width of its window.
+A future operator is a past operator in reversed time: kernels count *steps* 0, 1, … and look back. Step i is
+sample begin + i, or sample end - 1 - i for a future operator.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Steps(NamedTuple):
 
     Attributes:
         stamps: times of all samples in ns.
-        origin, stride: step i stands at origin + stride * i.
-        length: how many steps there are.
+        origin, stride: step i is sample origin + stride * i.
+        length: number of steps.
     """
 
     stamps: Integers
@@ -86,7 +86,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: S
 def _run_delay(
     source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing: float
 ) -> None:
-    """Take the value at the last step at least `distance` back."""
+    """Copy to each step the value of the latest step at least `distance` back, or `missing`."""
     back = -1
     for i in range(steps.length):
         while back < i and _distance(steps, unit, back + 1, i) >= distance:
@@ -98,10 +98,10 @@ def _run_delay(
 def _slide(
     source: Floats, target: Floats, steps: Steps, unit: int, near: int, far: int, sign: float, extrema: Floats
 ) -> None:
-    """Compute the greatest (sign 1) or least (sign -1) value over the steps from `far` to `near` back.
+    """Compute the sliding maximum (sign 1) or minimum (sign -1) over the steps from `far` to `near` back.
 
-    The window is kept in two stacks: `extrema` holds those from each step up to a middle, `recent` that of
-    the steps from there on. Every step enters either once, however wide the window is.
+    Two stacks hold the window: `extrema` has the extremum from each older step up to `middle`, and `recent`
+    is the extremum from `middle` on. Each step enters each stack once, regardless of the window's width.
     """
     first, middle, end = 0, 0, 0
     recent = -np.inf
@@ -146,14 +146,14 @@ def _run_boolean(
 def run_offline(
     rows: Integers, leaves: Floats, stamps: Integers, begin: int, end: int, columns: Floats, extrema: Floats
 ) -> None:
-    """Run all rows over the samples from begin to before end, as if there were no others.
+    """Compute all rows on the samples from `begin` to before `end` alone.
 
     Args:
         rows: (R, OFFLINE_WIDTH), operands first.
         leaves: (C, A, T) in one, two or four channels.
         stamps: (T,), ns.
-        columns: (C, K, T), receives the numbers.
-        extrema: (T,), room to work in.
+        columns: (C, K, T), output.
+        extrema: (T,), work space.
     """
     channels = leaves.shape[0]
     for r in range(rows.shape[0]):
@@ -188,11 +188,11 @@ def run_windows(
     rows: Integers, leaves: Floats, stamps: Integers, starts: Integers, columns: Floats, extrema: Floats,
     result: Floats,
 ) -> None:  # fmt: skip
-    """Compute the first columns at the start of a window that ends at each sample, on its samples alone.
+    """Compute the nodes at the start of the window that ends at each sample, on the window's samples alone.
 
     Args:
-        starts: (T,), the first sample of each window.
-        result: (C, N, T).
+        starts: (T,), first sample of each window.
+        result: (C, N, T), output for the first N columns.
     """
     for t in range(len(stamps)):
         run_offline(rows, leaves, stamps, starts[t], t + 1, columns, extrema)
@@ -202,14 +202,14 @@ def run_windows(
 
 
 _MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
-"""Future operators and the past ones that they are in reversed time."""
+"""The past operator that equals each future operator in reversed time."""
 
 
 class OfflineTable(SignalTable):
-    """Rows of past operators, and of future operators as past ones in reversed time.
+    """Instruction rows in which future operators are past operators in reversed time.
 
-    That needs the samples' end, so it is for a stretch that is finished; there, unlike for a stretch that
-    grows, every operator is a single pass.
+    Reversed time starts at the last sample, so the table serves finished traces only. Each operator is a
+    single pass.
     """
 
     def _added_row(self, formula: Formula, operands: list[int]) -> int:
@@ -218,10 +218,12 @@ class OfflineTable(SignalTable):
         return super()._added_row(formula, operands)
 
     def instructions(self, nodes: Sequence[int]) -> Integers:
-        """Return rows with the columns they read and write: n for node n, then those of other rows.
+        """Return instruction rows with their input and output columns.
+
+        Node n writes column n. Rows that belong to no node write the columns after these.
 
         Args:
-            nodes: (N,), the row of each node.
+            nodes: (N,), row of each node.
 
         Returns:
             (R, OFFLINE_WIDTH), operands first.
@@ -242,13 +244,13 @@ class OfflineTable(SignalTable):
 
 @dataclass(frozen=True, eq=False)
 class OfflineNodes:
-    """Every node of a formula at every sample.
+    """The robustness of every node of a formula at every sample.
 
     Attributes:
         times_ns: (T,).
-        columns: (C, N, T), the ends of each node's interval (see `channels`).
-        conditions: (C, T) of each operand, by id, that its operator leaves out of samples without a rate (see
-            `judged_operands`): where it has one.
+        columns: (C, N, T), ends of each node's interval, in channels (see `online.codes`).
+        conditions: (C, T), whether the operand's rates have values, by operand id. It has only operands that
+            their operators leave out at samples without a rate (see `_judged_operands`).
         goes_on: whether samples may follow.
     """
 
@@ -269,7 +271,7 @@ class OfflineNodes:
         return self.columns[low, node], self.columns[high, node]
 
     def judged_ends(self, operand: int) -> tuple[Floats, Floats]:
-        """Return the ends (T,) of an operand; they are neutral in samples that its operator leaves out."""
+        """Return the ends (T,) of an operand, neutral at samples that its operator leaves out."""
         low, high = self.ends(operand)
         condition = self.conditions.get(operand)
         if condition is None:
@@ -280,7 +282,7 @@ class OfflineNodes:
         return np.maximum(-has_high, low), np.maximum(-has_low, high)
 
     def is_left_out(self, operand: int, sample: int) -> bool:
-        """Return whether the temporal operator above leaves a sample out."""
+        """Return whether the operator of an operand leaves a sample out."""
         return operand in self.conditions and bool((self.conditions[operand][:, sample] == -np.inf).all())
 
     @cached_property
@@ -296,12 +298,13 @@ class OfflineNodes:
 
 @dataclass(frozen=True, eq=False)
 class OfflineFormula:
-    """A formula compiled once, to be evaluated over several logs.
+    """A formula compiled once for evaluation over several logs.
 
     Attributes:
-        table: (R, OFFLINE_WIDTH), its rows.
-        nodes, width: how many nodes it has, and columns with those of other rows.
-        conditions: the column of each operand's condition (see `OfflineNodes`).
+        table: (R, OFFLINE_WIDTH), its instruction rows.
+        nodes: number of nodes.
+        width: number of columns of all rows.
+        conditions: column of each operand's condition, by operand id (see `OfflineNodes`).
     """
 
     formula: Formula
@@ -317,8 +320,8 @@ class OfflineFormula:
         """Compile a formula.
 
         Args:
-            order: which leaf is which.
-            stand_ins: what is computed in place of each of `computed_formulas`, if that is something else.
+            order: leaves of the formula in the order of their numbers.
+            stand_ins: formulas to compute instead of `computed_formulas(formula)`; empty for none.
         """
         table, tree = OfflineTable(order), nodes_with_operands(formula)
         rows = [table.add(computed_formula) for computed_formula in stand_ins or computed_formulas(formula)]
@@ -339,7 +342,7 @@ class OfflineFormula:
 
 
 def computed_formulas(formula: Formula) -> list[Formula]:
-    """Return the nodes of a formula, by id, and the conditions of operands that leave samples out."""
+    """Return the nodes of a formula, by id, then the conditions of operands that are left out at samples."""
     tree = nodes_with_operands(formula)
     return [
         *(node for node, _ in tree),
@@ -348,7 +351,7 @@ def computed_formulas(formula: Formula) -> list[Formula]:
 
 
 def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boolean]:
-    """Return the operands, by id, that their operators read with samples left out, as they read them."""
+    """Return the `given` or `with` form of each operand, by id, that its operator leaves out at samples."""
     return {
         identifier: operand
         for node, operands in tree
@@ -364,8 +367,8 @@ def evaluate_offline(
     """Evaluate every node over all samples.
 
     Args:
-        order: which leaf is which.
-        leaves: (C, A, T), their intervals (see `leaf_values`).
+        order: leaves of the formula in the order of their numbers.
+        leaves: (C, A, T), intervals of the leaves (see `leaf_values`).
         times_ns: (T,), increasing; T at least 1.
     """
     return OfflineFormula.of(formula, order).evaluate(leaves, times_ns)
@@ -374,10 +377,10 @@ def evaluate_offline(
 def evaluate_prefix(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
-    """Evaluate every node over samples that others may follow; arguments as of `evaluate_offline`.
+    """Evaluate every node over samples that may continue; arguments as for `evaluate_offline`.
 
-    Values after the last sample are unknown, [-inf, +inf], so the numbers at the first sample are those of a
-    monitor. The path through them leads to the atom that settled a verdict before the log ended.
+    Values after the last sample are unknown, [-inf, +inf], so the numbers at the first sample equal a
+    monitor's. Their deciding path ends at the atom that settled a verdict before the log ended.
     """
     return replace(_evaluate_beyond(formula, order, leaves, times_ns, _is_open), goes_on=True)
 
@@ -385,9 +388,9 @@ def evaluate_prefix(
 def evaluate_with_whole_windows(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
-    """Evaluate every node over a finished log, but with windows that go on beyond its end.
+    """Evaluate every node over a finished log, with unknown values in windows that it cuts (see `is_cut`).
 
-    Values there are unknown, and only there (see `is_cut`). Arguments as of `evaluate_offline`.
+    Arguments as for `evaluate_offline`.
     """
     return _evaluate_beyond(formula, order, leaves, times_ns, is_cut)
 
@@ -408,23 +411,23 @@ def _evaluate_beyond(
 
 
 class _OpenFormulas:
-    """Formulas in which leaves of their own stand for what samples beyond the last one may bring.
+    """Formulas with an extra leaf for the unknown values in each open window.
 
     Attributes:
-        leaves: one for each operator with a window that such samples may fall into.
-        columns: of each leaf (T,), at which samples it may be anything; it is `false` at the others.
+        leaves: one for each operator whose window is open at some sample.
+        columns: (T,) for each leaf, whether it is unknown at a sample; it is `false` at all others.
     """
 
     def __init__(self, times_ns: Integers, beyond: Callable[[Temporal, Integers], Booleans]) -> None:
-        """Begin without any; `beyond` returns at which samples an operator's window is open."""
+        """Start without leaves; `beyond` returns the samples (T,) at which an operator's window is open."""
         self.leaves: list[Atom] = []
         self.columns: list[Booleans] = []
         self._times_ns, self._beyond = times_ns, beyond
-        # formulas are stored to stay alive: a freed one would leave its id to another
+        # formulas are stored to stay alive: a new formula could reuse the id of a freed one
         self._stand_ins: dict[int, tuple[Formula, Formula]] = {}
 
     def of(self, formula: Formula) -> Formula:
-        """Return the formula to compute in place of one."""
+        """Return the formula to compute instead of `formula`."""
         if id(formula) not in self._stand_ins:
             self._stand_ins[id(formula)] = formula, self._stand_in_of(formula)
         return self._stand_ins[id(formula)][1]
@@ -450,17 +453,17 @@ class _OpenFormulas:
             case "G":
                 return Boolean("and", (node, Boolean("not", (leaf,))))
             case "U":
-                # a later sample may fulfil it, as far as the left operand has lasted up to now
+                # a later sample may fulfil it, up to the minimum of the left operand so far
                 lasting = Temporal("G", node.operands[:1])
                 return Boolean("or", (node, Boolean("and", (leaf, lasting))))
         return Boolean("and", (Boolean("or", (node, leaf)), Boolean("not", (leaf,))))
 
 
 def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
-    """Return (T,), at which samples the end of a log cuts the window of an operator short.
+    """Return (T,), whether the end of a log cuts the window of an operator short at each sample.
 
-    An operator without an upper bound ends with the log; WX says itself what holds at the last sample. A log
-    of one sample shows nothing of what lasts: it cuts every G.
+    The log never cuts an operator without an upper bound, which ends with it, and WX, which is defined at the
+    last sample. The exception is a log of one sample: it shows no duration, so it cuts every G.
     """
     bound = formula.bound
     is_bounded = formula.operator == "X" or (bound is not None and bound.upper is not None)
@@ -469,7 +472,7 @@ def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
 
 
 def _is_open(formula: Temporal, times_ns: Integers) -> Booleans:
-    """Return (T,), at which samples later ones can fall into the window of an operator."""
+    """Return (T,), whether later samples can fall into the window of an operator at each sample."""
     bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX") else formula.bound
     return ~is_closed(bound, times_ns) & (formula.operator in FUTURE_OPERATORS)
 
@@ -489,10 +492,10 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
 def windows_of(
     formula: Temporal, times_ns: Integers, samples: Integers | None = None
 ) -> tuple[Integers, Integers]:
-    """Return the first sample (T,) in an operator's window at each sample, and the one after the last.
+    """Return the bounds (T,) of an operator's window at each sample: first sample, last sample plus one.
 
     Args:
-        samples: indices of those whose windows are wanted; None for all.
+        samples: indices of the samples whose windows are returned; None for all.
     """
     count = len(times_ns)
     indices = np.arange(count, dtype=np.int64)
@@ -502,7 +505,7 @@ def windows_of(
         positions = indices if samples is None else samples
         edge = np.full(len(positions), count if is_ahead else 0, np.int64)
         return (positions, edge) if is_ahead else (edge, positions + 1)
-    # as distances from the first sample, and no further than the last: sums stay below 64 bits
+    # distances from the first sample, bounds capped at the last one: their sums fit 64 bits
     places = indices if bound.unit == "samples" else times_ns - times_ns[0]
     furthest = int(places[-1]) + 1
     near = min(bound.lower, furthest)
@@ -518,20 +521,20 @@ def windows_of(
 def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
-    """Compute each node's robustness at each sample, to the end of the log, (N, T); NaN: not determined."""
+    """Return each node's robustness (N, T) from each sample to the end of the log; NaN if undetermined."""
     return _determined_numbers(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
 
 
 def window_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers, width_ns: int
 ) -> Floats:
-    """Compute each node's robustness over the samples in (t - width, t], at each sample's t, (N, T).
+    """Return the robustness (N, T) of each node over the window (t - width, t] of each sample t.
 
-    It is that at the first of these samples, on these samples alone: past operators start there. NaN where it
-    is not determined. Takes time in proportion to the samples in a window.
+    Each window is evaluated at its first sample as a separate log, so past operators start there.
+    Undetermined values are NaN. The time of each window is proportional to its samples.
 
     Raises:
-        UsageError: a width that is no positive number of ns.
+        UsageError: the width is not a positive number of ns.
     """
     if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
         raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer, 1 to 2**63 - 1 ns")
@@ -556,7 +559,7 @@ def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Ato
 def _determined_numbers(ends: Floats) -> Floats:
     """Reduce the ends (C, N, T) to determined numbers (N, T), in place.
 
-    Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
+    Adding zero turns -0.0 into 0.0, so that equal numbers have equal bits.
     """
     determined: Floats = ends[0]
     determined += 0.0

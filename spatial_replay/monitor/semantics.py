@@ -1,8 +1,7 @@
-"""The two semantics of a formula, one of which is chosen by name; and Def. 16 of the paper as samples come.
+"""The two semantics of a formula, chosen by name, and an online evaluation of Def. 16 of the paper.
 
-`PaperRun` differs from `OnlineRun` beyond the ends of the run: an operand that would need samples from there
-is left out of minima and maxima. And where something is unknown: every number that depends on it is
-undetermined.
+`PaperRun` differs from `OnlineRun` in two ways. Minima and maxima leave out an operand that needs samples
+beyond the ends of the run. A number that depends on an unknown value is undetermined.
 """
 
 from __future__ import annotations
@@ -38,19 +37,19 @@ from spatial_replay.spec.walks import is_spatial, leaf_key, nodes_with_operands
 
 
 class PaperMemory(NamedTuple):
-    """State between samples; each array of numbers has a parallel one of lost numbers.
+    """State between samples; each array of numbers has a parallel array of flags for undetermined numbers.
 
     Attributes:
-        stamps: (room,), times of the samples in ns; of the first alone if nothing keeps a column.
-        columns: (K, room), numbers at each sample, on the samples so far.
+        stamps: (room,), times of the samples in ns; only the first time if there are no columns.
+        columns: (K, room), stored numbers at each sample, on the samples so far.
         value: (N,), each node at the first sample.
         now: (N,), each node at the newest sample.
-        left: (N,), of an until at the first sample: the least of its left operand.
-        starts: (N,), where the window of the earliest sample that is still open begins; -1 for not yet.
-        opens: (N,), the earliest sample whose window is still open.
-        pairs: the left operand of an until for each end of its run, one row after the other.
-        pair_starts: (P, room), sample s of the row of end t is at `pair_starts[p, t] + s`.
-        pair_end: (1,), how much of `pairs` is used.
+        left: (N,), running minimum of an until's left operand, for the until at the first sample.
+        starts: (N,), first sample in the window of sample `opens`; -1 before it is known.
+        opens: (N,), earliest sample whose window is still open.
+        pairs: minimum of an until's left operand from each sample to each end, one row per end.
+        pair_starts: (P, room), `pair_starts[p, t] + s` is the index in `pairs` for sample s and end t.
+        pair_end: (1,), used length of `pairs`.
     """
 
     stamps: Integers
@@ -120,7 +119,7 @@ def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: P
 
 @piece
 def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: PaperMemory) -> bool:
-    """Return whether the last sample is in the first one's window; note where that window begins."""
+    """Return whether the last sample is in the first sample's window; record the start of that window."""
     passed = time_ns - memory.stamps[0] if rows[n, IS_IN_NS] else last
     if memory.starts[n] < 0 and passed >= rows[n, LOW]:
         memory.starts[n] = last
@@ -131,7 +130,7 @@ def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: Pa
 def _step_first(
     rows: Integers, operands: Integers, n: int, last: int, time_ns: int, memory: PaperMemory
 ) -> None:
-    """Update a temporal node that is needed at the first sample only."""
+    """Update a temporal node that is needed only at the first sample."""
     code, value, lost = rows[n, CODE], memory.value, memory.lost_value
     right = operands[rows[n, END] - 1]
     right_row = rows[right, COLUMN]
@@ -182,7 +181,7 @@ def _apart(rows: Integers, n: int, earlier: int, later: int, memory: PaperMemory
 
 @piece
 def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
-    """Update a temporal node that is needed at every sample, where its window was still open."""
+    """Update a temporal node that is needed at every sample, at the samples whose windows are still open."""
     code = rows[n, CODE]
     row, inner = rows[n, COLUMN], rows[n, INNER]
     target, target_lost = memory.columns[row], memory.lost_columns[row]
@@ -246,12 +245,12 @@ def step_paper(
     rows: Integers, operands: Integers, leaves: Floats, lost_leaves: Flags, times_ns: Integers,
     t: int, count: int, position: int, memory: PaperMemory, series: Floats,
 ) -> None:  # fmt: skip
-    """Run the samples t up to t + count; `position` samples came before.
+    """Add the samples from t to before t + count, after `position` earlier samples.
 
     Args:
-        leaves: (A, T); NaN where one is left out.
-        lost_leaves: (A, T), 1 where one is not known.
-        series: (N, 4, T), receives value, now, lower and upper of each node.
+        leaves: (A, T), NaN where a leaf is left out.
+        lost_leaves: (A, T), 1 where a leaf is unknown.
+        series: (N, 4, T), output: value, now, lower and upper of each node.
     """
     nodes = rows.shape[0]
     for k in range(t, t + count):
@@ -296,16 +295,16 @@ def step_paper(
 CODE, FIRST, END, IS_IN_NS, LOW, HIGH, IS_PLAIN, COLUMN, INNER, PAIRS, LEAF = range(11)
 WIDTH = 11
 NOTHING = -1
-"""No upper end, no column, no table of pairs."""
+"""Table entry for no upper bound, no column, and no row of pairs."""
 
-# codes of nodes, beside those of reports for Boolean ones; a row is a node as written, since Def. 16 gives a
-# number to each
+# codes of nodes; Boolean nodes have the codes of reports. Each node has a row as written, without expansion,
+# because Def. 16 gives a number to each
 LEAF_NODE, TRUTH = 0, 1
 NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
 
 _TEMPORAL_CODES = {"X": NEXT, "F": EVENTUALLY, "G": ALWAYS, "U": UNTIL}
 OPERATORS = frozenset(_TEMPORAL_CODES)
-"""The temporal operators that there are."""
+"""The temporal operators of the paper's semantics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,11 +312,11 @@ class PaperTable:
     """A formula's nodes, by id.
 
     Attributes:
-        rows: (N, WIDTH), the columns `CODE` to `LEAF`. `FIRST` and `END` are places in `operands`; `COLUMN`,
-            `INNER` and `PAIRS` are places in `PaperMemory`. `LEAF` is a leaf's number, or a constant's sign.
+        rows: (N, WIDTH), the columns `CODE` to `LEAF`. `FIRST` and `END` index `operands`; `COLUMN`, `INNER`
+            and `PAIRS` index arrays of `PaperMemory`. `LEAF` is a leaf's number, or a constant's sign.
         operands: ids of the operands, node after node.
-        columns: how many columns are kept.
-        pairs: how many tables over pairs of samples are kept.
+        columns: number of stored columns.
+        pairs: number of stored tables over pairs of samples.
     """
 
     rows: Integers
@@ -364,7 +363,7 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
 
 
 def _columns(nodes: Sequence[tuple[Formula, Sequence[int]]], is_plain: Sequence[bool]) -> list[bool]:
-    """Return which nodes are needed at all samples; parents come before their operands."""
+    """Return whether each node is needed at all samples; parents precede their operands."""
     needs_column = [False] * len(nodes)
     for identifier, (node, operands) in enumerate(nodes):
         for operand in operands:
@@ -390,7 +389,7 @@ def _code(node: Formula, leaves: Mapping[object, int]) -> tuple[int, int]:
 
 @inlined
 def least(first: float, second: float) -> float:
-    """Return the lesser number, of those not left out; NaN if both are."""
+    """Return the lesser of two numbers; NaN stands for a left-out operand."""
     if np.isnan(first):
         return second
     if np.isnan(second):
@@ -400,7 +399,7 @@ def least(first: float, second: float) -> float:
 
 @inlined
 def most(first: float, second: float) -> float:
-    """Return the greater number, of those not left out; NaN if both are."""
+    """Return the greater of two numbers; NaN stands for a left-out operand."""
     if np.isnan(first):
         return second
     if np.isnan(second):
@@ -416,7 +415,7 @@ def pick(is_least: bool, first: float, second: float) -> float:
 
 @inlined
 def combine(code: int, first: float, second: float) -> float:
-    """Apply a Boolean operator; for one operand, both are that operand."""
+    """Apply a Boolean operator to two numbers; a unary operator gets its operand twice."""
     if code == codes.REPORT_AND:
         return least(first, second)
     if code == codes.REPORT_OR:
@@ -436,7 +435,7 @@ def combine(code: int, first: float, second: float) -> float:
 def total(
     is_least: bool, numbers: Floats, lost: Flags, first: int, last: int
 ) -> tuple[float, int]:  # fmt: skip
-    """Return the least or the greatest number from `first` to `last`."""
+    """Return the least or greatest number from sample `first` to `last`."""
     extremum, is_lost = np.nan, 0
     for t in range(first, last + 1):
         extremum = pick(is_least, extremum, numbers[t])
@@ -448,7 +447,7 @@ def total(
 def scan(
     is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, target: Floats, target_lost: Flags
 ) -> None:
-    """Compute, from each sample from `first` on, the least or greatest number up to `last`."""
+    """Compute the least or greatest number from each sample to `last`, for the samples from `first` on."""
     extremum, is_lost = np.nan, 0
     for t in range(last, first - 1, -1):
         extremum = pick(is_least, extremum, numbers[t])
@@ -461,10 +460,10 @@ def scan_until(
     left: Floats, left_lost: Flags, right: Floats, right_lost: Flags,
     first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
-    """Run until from each sample from `first` on to `last`; the left operand depends on no later sample.
+    """Compute until from each sample to `last`, for a left operand that depends on no later sample.
 
-    The best over later ends is capped by the left operand here. An end of which everything was left out so
-    far takes on the left operand here, which is then as good as any.
+    The scan goes backwards; the left operand at each sample caps the best value over later ends. An end
+    whose numbers were all left out so far takes the left operand's value, which no capped end exceeds.
     """
     best, is_lost, is_any_left_out = np.nan, 0, False
     for t in range(last, first - 1, -1):
@@ -487,7 +486,7 @@ def scan_until_by_last(
     left: Floats, left_lost: Flags, right: float, right_lost: int,
     first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
-    """Run until from each sample to `last`, given until to the sample before it."""
+    """Update until from each sample to `last`, given its values up to the sample before."""
     least_left, is_lost = np.nan, right_lost
     target[last], target_lost[last] = np.nan, 0
     for t in range(last, first - 1, -1):
@@ -502,7 +501,7 @@ def scan_until_by_pairs(
     least_left: Floats, least_left_lost: Flags, starts: Integers, right: Floats, right_lost: Flags,
     first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
-    """Run until from each sample to `last`, given the least left operand for each beginning and end."""
+    """Compute until from each sample to `last`, given the left operand's minimum for each start and end."""
     target[first : last + 1], target_lost[first : last + 1] = np.nan, 0
     for end in range(first, last + 1):
         for t in range(first, end + 1):
@@ -514,14 +513,14 @@ def scan_until_by_pairs(
 _TILE = 256
 _FIRST_ROOM = 1024
 MAX_PAIRS = 1 << 26
-"""The most pairs of samples that untils may store a number for: about 11,600 samples, 0.6 GB."""
+"""Limit on pairs of samples for which untils store a number: about 11,600 samples, 0.6 GB."""
 
 
 class PaperRun:
     """The numbers of every node on every prefix by Def. 16.
 
-    A temporal operator over plain formulas carries one number. Below another temporal operator it carries
-    numbers for every sample so far, and each sample takes time in proportion to them.
+    A temporal operator over formulas without temporal operators stores one number. Below another temporal
+    operator it stores a number for every sample so far, and each new sample takes time proportional to them.
     """
 
     def __init__(
@@ -530,8 +529,8 @@ class PaperRun:
         """Start before the first sample.
 
         Args:
-            leaves: the formula's atoms and open quantifiers, in the order in which `extend` is given them.
-            max_pairs: the most pairs of samples to compare.
+            leaves: atoms and open quantifiers of the formula, in the order in which `extend` receives them.
+            max_pairs: limit on compared pairs of samples.
         """
         self._max_pairs = max_pairs
         self._table = paper_table(formula, leaves)
@@ -540,12 +539,12 @@ class PaperRun:
         self._value = np.full(len(self._table.rows), np.nan)
 
     def __len__(self) -> int:
-        """Return how many samples were added."""
+        """Return the number of added samples."""
         return self._position
 
     @property
     def final(self) -> Floats:
-        """(N, 2): twice each node's value on the samples so far; NaN where it is undetermined."""
+        """(N, 2): each node's value on the samples so far, in both columns; NaN if undetermined."""
         return np.repeat(self._value[:, None], 2, axis=1)
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
@@ -554,13 +553,13 @@ class PaperRun:
         Args:
             leaves: (C, A, T), as for `OnlineRun.extend`, with NaN where a leaf is left out (see `left_out`).
             times_ns: (T,), increasing and after the previous samples.
-            empty: gives memory for what is returned.
+            empty: allocator of the result.
 
         Returns:
-            (N, 4, T): value, now, lower and upper of each node; the last two are the first.
+            (N, 4, T): value, now, lower and upper of each node; lower and upper equal the value.
 
         Raises:
-            UsageError: more pairs of samples than allowed.
+            UsageError: the pairs of samples exceed the limit.
         """
         # Def. 16 knows no uncertainty: nominal ends only, and a number is lost where they differ
         low, high = low_and_high(len(leaves), wide=False)
@@ -623,15 +622,15 @@ def left_out(
     times_ns: Integers,
     first_ns: int,
 ) -> Floats:
-    """Return leaves with NaN where one, or the body of a quantifier, looks back (`a[-3]`) to before the log.
+    """Return leaves with NaN where a leaf, or the body of a quantifier, looks back (`a[-3]`) beyond the log.
 
-    So are those of rates that have no value yet, below an operator that leaves such samples out.
+    A leaf with a rate is also NaN where the rate has no value, if an operator leaves such samples out.
 
     Args:
-        values: (C, A, T) of these leaves.
-        positions: (T,), how many samples of the log come before each.
+        values: (C, A, T), numbers of these leaves.
+        positions: (T,), number of samples of the log before each.
         times_ns: (T,).
-        first_ns: the time of the log's first sample.
+        first_ns: time of the log's first sample.
     """
     is_before = np.zeros(values.shape[1:], np.bool_)
     numbers = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
@@ -669,15 +668,15 @@ def _first_memory(table: PaperTable) -> PaperMemory:
 
 
 def _longer(array: np.ndarray, more: int) -> np.ndarray:
-    """Return the array with room for more along its last axis."""
+    """Return the array with `more` zeros at the end of its last axis."""
     return np.concatenate([array, np.zeros((*array.shape[:-1], more), array.dtype)], axis=-1)
 
 
 def check_operators(specification: Specification) -> None:
-    """Check that all temporal operators of the result specs are the paper's.
+    """Check that the paper's semantics has all temporal operators of the result specs.
 
     Raises:
-        UsageError: the first other operator, with its place.
+        UsageError: an operator is not the paper's; the message gives its place.
     """
     for spec in specification.results:
         for _, _, node in iter_nodes(spec.formula):
@@ -692,10 +691,10 @@ def check_operators(specification: Specification) -> None:
 
 
 def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -> Semantics:
-    """Return a name as semantics that define all operators of some specifications.
+    """Return the semantics of a name, which has to define all operators of the specifications.
 
     Raises:
-        UsageError: an unknown name, or an operator without a meaning.
+        UsageError: an unknown name, or an operator that the semantics does not define.
     """
     if name not in get_args(Semantics):
         choices = " and ".join(repr(choice) for choice in get_args(Semantics))
@@ -707,24 +706,24 @@ def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -
 
 
 class Run(Protocol):
-    """One formula on one stream of samples."""
+    """The evaluation of one formula over a stream of samples."""
 
     @property
     def final(self) -> Floats:
         """(N, 2): lower and upper end of each node's value if the log ends here."""
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
-        """Add samples; return value, now, lower and upper of each node, (N, 4, T), as `empty` gives them."""
+        """Add samples; return value, now, lower and upper of each node, (N, 4, T), allocated by `empty`."""
 
     def __len__(self) -> int:
-        """Return how many samples were added."""
+        """Return the number of added samples."""
 
 
 class Evaluator(NamedTuple):
     """A formula with its program, evaluated under some semantics.
 
     Attributes:
-        program: of the formula; its leaves are evaluated under either semantics.
+        program: program of the formula; both semantics evaluate its leaves.
     """
 
     formula: Formula
@@ -733,14 +732,15 @@ class Evaluator(NamedTuple):
 
     @property
     def has_open_end(self) -> bool:
-        """Whether numbers before the end of a log are about its continuations, too."""
+        """Whether numbers before the end of a log hold for all its continuations."""
         return self.semantics == "ltlf"
 
     def begin(self, *, is_live: bool = False, samples: int | None = None) -> Run:
-        """Start a run before the first sample; samples of a live one come one by one.
+        """Start a run before the first sample.
 
         Args:
-            samples: how many there will be, if that is known: a short run has little room.
+            is_live: whether samples are added one by one.
+            samples: number of samples in all, if known; a short run allocates less memory.
         """
         if self.semantics == "paper":
             return PaperRun(self.formula, self.program.leaves)
@@ -753,11 +753,11 @@ class Evaluator(NamedTuple):
     def leaves_within_log(
         self, leaves: Floats, positions: Integers, times_ns: Integers, first_ns: int
     ) -> Floats:
-        """Return leaves with those that look back to before the log marked as the semantics require.
+        """Return leaves, marked as the semantics requires where they look back beyond the log.
 
         Args:
             leaves: (C, A, T).
-            positions: (T,), how many samples of the log come before each.
+            positions: (T,), number of samples of the log before each.
             times_ns: (T,).
             first_ns: time of the log's first sample.
         """

@@ -1,6 +1,6 @@
-"""The instances of specifications, one per spec and one per object for a template, evaluated over samples.
+"""Instances of specifications evaluated over samples: one per spec, or per object of a template.
 
-A monitor adds sample by sample, a replay block by block, `evaluate` a whole trace at once: all three get the
+A monitor adds single samples, a replay adds blocks, and `evaluate` adds a whole trace. All three compute the
 same bits.
 """
 
@@ -35,11 +35,11 @@ class Instance:
     """One formula to evaluate.
 
     Attributes:
-        spec: the statement that it comes from.
-        object: the object that the template's parameter stands for, or None.
-        bindings: that object by the parameter's name.
-        start_ns, end_ns: it is evaluated over the samples from start to before end.
-        named: the specs of its file by name, of which some are parts of the formula.
+        spec: `spec` statement of the formula.
+        object: object of a template's instance; else None.
+        bindings: that object, by the name of the template's parameter.
+        start_ns, end_ns: evaluated samples, from `start_ns` to before `end_ns`.
+        named: all specs of its file, by name.
     """
 
     spec: NamedSpec
@@ -66,11 +66,11 @@ class Instance:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The objects that a template's parameter stands for: all, those of a class, or one by its name.
+    """The objects that a template is evaluated for: all objects, a class, or one named object.
 
     Attributes:
-        class_name: the class, in any case; None for objects of any.
-        name: of the one object; None for objects of any.
+        class_name: class of the objects, in any case; None for any class.
+        name: name of the one object; None for any name.
     """
 
     class_name: str | None
@@ -81,7 +81,7 @@ class Choice:
         """Read `all`, `class:NAME`, or the name of an object.
 
         Raises:
-            UsageError: there is no name.
+            UsageError: the text has no name.
         """
         if text == "all":
             return cls(None)
@@ -106,14 +106,15 @@ def find_instances(
 ) -> list[Instance]:
     """Return the instances of a specification over the samples from `start_ns` to before `end_ns`.
 
-    A template has one per chosen object, by name, over the samples from the object's first to its last
-    appearance among them.
+    A template has one instance per chosen object, in order of names. It covers the samples from the object's
+    first to its last appearance.
 
     Args:
-        traces: the samples, in blocks; read only if there is a template.
+        each: choice of objects for each template parameter: "all", "class:NAME" or a name.
+        traces: the samples, in blocks; read only for templates.
 
     Raises:
-        UsageError: no choice for a template's parameter, a choice for a parameter that no template has.
+        UsageError: a template parameter has no choice, or a choice is for an unknown parameter.
     """
     templates = [spec for spec in specification.results if spec.parameter is not None]
     check_choices(templates, each)
@@ -135,7 +136,7 @@ def find_instances(
 
 
 def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
-    """Check that the parameters of all templates, and no others, have a choice of objects."""
+    """Check that every template parameter has a choice of objects, and every choice a parameter."""
     for spec in templates:
         if spec.parameter not in each:
             raise UsageError(
@@ -147,7 +148,7 @@ def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
 
 
 def check_parameters(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
-    """Check that every choice of objects is for the parameter of some template."""
+    """Check that every choice of objects names the parameter of a template."""
     for parameter in each:
         if parameter not in {spec.parameter for spec in templates}:
             template_names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
@@ -169,7 +170,7 @@ def _appearances(
                 continue
             first_ns = spans[name][0] if name in spans else int(times[present_samples[0]])
             spans[name] = (first_ns, int(times[present_samples[-1]]))
-            # a row below `ABSENT` is -2 - the observation of an object whose position is unknown
+            # a row below `ABSENT` stands for observation -2 - row, an object with unknown position
             codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[present_samples]])
             for parameter, choice in choices.items():
                 if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
@@ -178,7 +179,7 @@ def _appearances(
 
 
 NEVER = -1
-"""In place of a time: no sample settled it."""
+"""Settling time of a verdict that no sample settled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +189,7 @@ class SeriesBlock:
     Attributes:
         times_ns: (T,) int64; T may be 0.
         series: (N, 4, T): value, now, lower and upper of each node.
-        leaves: (C, A, T), the leaves they follow from: `leaf_values` of the same samples.
+        leaves: (C, A, T), `leaf_values` of the same samples, from which the series is computed.
     """
 
     times_ns: Integers
@@ -216,18 +217,18 @@ class InstanceStream:
     """One instance evaluated over the samples so far.
 
     Attributes:
-        semantics: which of them evaluates it.
-        first_satisfied_ns: the first sample with a value of at least 0 at the root, or None.
-        settled_ns: (N, 2): when each node's satisfaction and its violation became certain;
-            `NEVER` where only the end of the log decides, and under the paper's semantics.
-        robustness: (N,): each node's value on the samples so far.
+        semantics: semantics of the evaluation.
+        first_satisfied_ns: time of the first sample with a root value of at least 0, or None.
+        settled_ns: (N, 2), times at which each node's satisfaction and violation became certain. `NEVER` if
+            only the end of the log decides, and under the paper's semantics.
+        robustness: (N,), value of each node on the samples so far.
     """
 
     def __init__(self, instance: Instance, semantics: Semantics = "ltlf", samples: int | None = None) -> None:
         """Start before the first sample.
 
         Args:
-            samples: how many there will be, if that is known.
+            samples: number of samples in all, if known.
         """
         self.instance = instance
         self.semantics: Semantics = semantics
@@ -237,7 +238,7 @@ class InstanceStream:
         self._begin()
 
     def restart(self) -> None:
-        """Start again before the first sample; `final` of the samples so far is lost."""
+        """Restart before the first sample, without `final` of the samples so far."""
         if isinstance(self._run, OnlineRun):
             self._run.restart()
         else:
@@ -268,7 +269,7 @@ class InstanceStream:
         """Add the samples of a scene that fall into the instance's window.
 
         Args:
-            empty: gives memory for the numbers of nodes.
+            empty: allocator of the series.
         """
         times = scene.trace.times_ns[scene.skip :]
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
@@ -278,14 +279,14 @@ class InstanceStream:
             no_series = np.empty((len(program.reports), 4, 0))
             return SeriesBlock(times, no_series, np.empty((1, len(program.leaves), 0)))
         leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
-        # the scene begins with the log or beyond every reach, so its positions may stand for the log's
+        # the scene starts with the log, or as far back as terms look: its positions can replace the log's
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
         return self.extend_leaves(leaves, times, empty)
 
     def extend_leaves(self, leaves: Floats, times: Integers, empty: Empty = np.empty) -> SeriesBlock:
-        """Add samples, at least one, by their leaves."""
+        """Add one or more samples by their leaves."""
         series = self._run.extend(leaves, times, empty)
         self.robustness = series[:, 0, -1].copy()
         if self._evaluator.has_open_end:
@@ -296,7 +297,7 @@ class InstanceStream:
         return SeriesBlock(times, series, leaves)
 
     def _settle(self, times_ns: Integers, series: Floats) -> None:
-        """Take the time of the first sample at which each node became certain."""
+        """Set `settled_ns` of the nodes that became certain in these samples."""
         newest = series[:, :, -1]
         for column, is_settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
             # certainty is permanent: only nodes that are certain at the newest sample are searched, once
@@ -305,13 +306,17 @@ class InstanceStream:
 
 
 def _first_certain(series: Floats, column: int) -> int:
-    """Return the first sample at which a node, (4, T), is certainly satisfied, or violated with column 1."""
+    """Return the first sample at which a node is certainly satisfied (column 0) or violated (column 1).
+
+    Args:
+        series: (4, T), series of the node, certain at the last sample.
+    """
     ends, is_violation = series[2 + column], bool(column)
     return bisect_left(range(len(ends)), True, key=lambda k: bool(ends[k] >= 0.0) != is_violation)
 
 
 class EvaluationStream:
-    """The instances of a specification, and the recent samples that they may still look back at."""
+    """The instances of a specification, and the recent samples that their terms look back at."""
 
     def __init__(
         self,
@@ -330,10 +335,10 @@ class EvaluationStream:
         """Add the next samples; return one block for each of `streams`.
 
         Args:
-            empty: gives memory for the numbers of nodes.
+            empty: allocator of the series.
 
         Raises:
-            TraceError: samples that do not come after the previous ones.
+            TraceError: the samples do not follow the previous ones in time.
         """
         if not len(trace):
             return [stream.extend(TraceScene(trace, self._regions)) for stream in self.streams]
@@ -356,7 +361,7 @@ class EvaluationStream:
 
 
 def one_after_another(traces: Sequence[Trace]) -> Trace:
-    """Join traces whatever their times are: each sample gets its number as its time."""
+    """Join traces regardless of their times: the index of each sample becomes its time."""
     numbered, begin = [], 0
     for trace in traces:
         # times of different traces overlap, and those of one trace have to increase
@@ -371,15 +376,15 @@ def one_after_another(traces: Sequence[Trace]) -> Trace:
 def run_together(
     instances: Sequence[Instance], scene: TraceScene, traces: Sequence[Trace], semantics: Semantics
 ) -> Iterator[tuple[list[InstanceStream], list[SeriesBlock]]]:
-    """Evaluate instances over each of many traces, whose leaves are measured together.
+    """Evaluate instances over each of many traces, with all leaves measured together.
 
     Args:
-        instances: without bindings, and with terms that do not look back.
-        scene: of the samples of all traces, `one_after_another`.
+        instances: instances without bindings, whose terms do not look back.
+        scene: scene of the joined traces (see `one_after_another`).
 
     Yields:
-        For each trace, the streams that have seen it, and the numbers of each stream. The streams see the
-        next trace afterwards.
+        the streams at the end of each trace, and one block of numbers per stream. The same streams restart
+        for the next trace.
     """
     leaves_by_instance = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
     longest = max(map(len, traces), default=0)
@@ -404,7 +409,7 @@ class LiveStream:
         """Start before the first sample.
 
         Args:
-            start_ns: earlier samples are not evaluated, only looked back at.
+            start_ns: time of the first evaluated sample; terms may look back at earlier samples.
         """
         formulas = [spec.formula for spec in specification.results]
         self._evaluators = [Evaluator(formula, compile_formula(formula), semantics) for formula in formulas]
@@ -422,16 +427,18 @@ class LiveStream:
 
     @property
     def finals(self) -> list[Floats | None]:
-        """For each formula (N, 2), lower and upper end of each node's value if the log ends here, or None
-        before the first sample that is evaluated."""
+        """For each formula (N, 2), lower and upper end of each node's value if the log ends here.
+
+        None before the first evaluated sample.
+        """
         return [run.final if len(run) else None for run in self._runs]
 
     def extend(self, sample: Sample) -> list[Floats | None]:
-        """Add the next sample, whose time comes after the last one's.
+        """Add the next sample, which is later than the previous one.
 
         Returns:
-            (N, 4) for each formula: value, now, lower and upper of each node. Before the start,
-            None, or NaN under semantics without continuations to wait for.
+            (N, 4) for each formula: value, now, lower and upper of each node. Before `start_ns` it is None,
+            or NaN under the paper's semantics.
         """
         if not self._is_online:
             return self._extend_apart(sample)
@@ -449,7 +456,7 @@ class LiveStream:
         """Return the leaves (C, A, 1) of a formula in the newest evaluated sample.
 
         Raises:
-            UsageError: no sample has been evaluated, or under the paper's semantics.
+            UsageError: no sample has been evaluated, or the semantics is the paper's.
         """
         room = self._leaves.room
         if not (room.channels and self._is_online):

@@ -1,4 +1,4 @@
-"""Verdicts, online and at the end of a log, and the semantics that they are of."""
+"""Verdicts during a run and at the end of a log, and the names of the semantics."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from spatial_replay.errors import UsageError
 from spatial_replay.text import nearest_hint
 
 Semantics: TypeAlias = Literal["ltlf", "paper"]
-"""Robustness over finite traces, or the paper's Def. 16 to the letter."""
+"""Finite-trace robustness, or Definition 16 of the paper."""
 
 FAILING_KINDS: Final = ("vacuous", "cut", "unknown", "left", "doubtful")
-"""Kinds of results that fail where asked (`fail_on`)."""
+"""Kinds of results that `fail_on` can turn into failures."""
 ALLOWED_KINDS: Final = ("vacuous", "dropped", "doubtful")
-"""Kinds of results that pass where asked (`allow`)."""
+"""Kinds of results that `allow` can accept."""
 
 
 def checked_kinds(name: str, kinds: object, known: Sequence[str]) -> frozenset[str]:
     """Return kinds of results as a set.
 
     Raises:
-        UsageError: something else than a sequence of known kinds.
+        UsageError: `kinds` is not a sequence of known kinds.
     """
     if isinstance(kinds, str) or not isinstance(kinds, Iterable):
         raise UsageError(f"{name} is {shortened(kinds)}; give a sequence, as in ({known[0]!r},)")
@@ -38,8 +38,8 @@ def checked_kinds(name: str, kinds: object, known: Sequence[str]) -> frozenset[s
 class Verdict(StrEnum):
     """The verdict of a formula.
 
-    At the end of a log it is satisfied, violated or unknown. While samples still come it is satisfied or
-    violated if no continuation can change that, and pending otherwise.
+    At the end of a log it is satisfied, violated or unknown. During a run it is pending until no
+    continuation can change it.
     """
 
     SATISFIED = "satisfied"
@@ -48,7 +48,7 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
     def __bool__(self) -> bool:
-        """Refuse: "violated" would be true as every text is.
+        """Refuse a truth value: as a non-empty text, even "violated" would be true.
 
         Raises:
             UsageError: always.
@@ -57,16 +57,16 @@ class Verdict(StrEnum):
 
 
 def final_verdict(lower: float, upper: float) -> Verdict:
-    """Return the verdict of a finished log, from the interval of its value."""
+    """Return the verdict on a finished log from the interval of the robustness."""
     if lower >= 0.0:
         return Verdict.SATISFIED
     return Verdict.VIOLATED if upper < 0.0 else Verdict.UNKNOWN
 
 
 def online_verdict(lower: float, upper: float) -> Verdict:
-    """Return the verdict while samples still come, from the interval over every continuation.
+    """Return the verdict during a run from the interval of the robustness over all continuations.
 
-    Without an interval (NaN: the paper's semantics has no continuations) it is unknown.
+    It is unknown for NaN, because the paper's semantics has no continuations.
     """
     if lower >= 0.0:
         return Verdict.SATISFIED
@@ -78,7 +78,7 @@ def online_verdict(lower: float, upper: float) -> Verdict:
 
 
 def counts_text(verdicts: Iterable[str]) -> str:
-    """Return how many of some verdicts are of each kind, the worst first: "26 violated, 2 satisfied"."""
+    """Return the number of verdicts of each kind, the worst kind first: "26 violated, 2 satisfied"."""
     counts = Counter(map(str, verdicts))
     return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in reversed(_BEST_FIRST) if counts[verdict])
 
@@ -87,15 +87,18 @@ _BEST_FIRST: Final = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdi
 
 
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
-    """Return the worst: violated, unknown, pending, satisfied; satisfied if there are none."""
+    """Return the worst verdict in the order violated, unknown, pending, satisfied; satisfied for none."""
     return max(verdicts, key=_BEST_FIRST.index, default=Verdict.SATISFIED)
 
 
 def require_ltlf(semantics: Semantics, what: str) -> None:
-    """Check that results have signals, windows and witnesses, which only "ltlf" defines.
+    """Check that the semantics is "ltlf": the paper's defines no signals, windows and witnesses.
+
+    Args:
+        what: subject of the error message.
 
     Raises:
-        UsageError: other semantics.
+        UsageError: the semantics is another one.
     """
     if semantics != "ltlf":
         raise UsageError(f"{what} is not defined under the semantics {semantics!r}; evaluate with 'ltlf'")
