@@ -1,4 +1,4 @@
-"""Monitor a running system: a specification evaluated sample by sample, and the violations that settle."""
+"""Monitor a running system: evaluate a specification sample by sample and report permanent violations."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ from spatial_replay.trace.trace import (
 )
 
 _MOST_KNOWN: Final = 1000
-"""Names that a missing one is compared with, of each kind."""
+"""Limit on names of each kind that are stored as spelling hints."""
 
 
 class NodeUpdate(NamedTuple):
@@ -88,9 +88,9 @@ class SpecUpdate:
     """One spec after one sample.
 
     Attributes:
-        numbers: (N, 4): value, now, lower and upper of each node; None before the monitor's start.
-        names: the name of each node, or None.
-        unit: the declared one of its robustness, or "".
+        numbers: (N, 4), value, now, lower and upper of each node; None before the monitor's start.
+        names: name of each node, or None.
+        unit: declared unit of its robustness, or "".
     """
 
     spec: NamedSpec
@@ -125,7 +125,7 @@ class Monitored(NamedTuple):
 
     Attributes:
         specs: the result specs, with the names of their nodes and the unit of each.
-        places: for each name of a node, its index in `specs` and its node.
+        places: index in `specs` and node id, by the name of the node.
     """
 
     specs: tuple[tuple[NamedSpec, tuple[str | None, ...], str], ...]
@@ -133,10 +133,10 @@ class Monitored(NamedTuple):
 
 
 class Settlement(NamedTuple):
-    """The state of a monitor besides its numbers; most samples leave it as it is.
+    """The state of a monitor apart from its numbers; most samples do not change it.
 
     Attributes:
-        settled: what `Update.violations` are found from.
+        settled: settled verdicts from which `Update.violations` is computed.
         satisfied, remarks: see `Update`.
     """
 
@@ -146,15 +146,15 @@ class Settlement(NamedTuple):
 
 
 class Update:
-    """The numbers and verdicts after a sample. It stays as it is when others follow."""
+    """The numbers and verdicts after one sample. Later samples do not change it."""
 
-    # a frozen dataclass takes half a microsecond more to make, at every sample
+    # a frozen dataclass takes 0.5 µs more to construct, at every sample
     __slots__ = ("_monitored", "_numbers", "_settlement", "_specs", "_time_ns")
 
     def __init__(
         self, time_ns: int, numbers: Sequence[Floats | None], monitored: Monitored, settlement: Settlement
     ) -> None:
-        """Take the numbers (N, 4) of each result spec, and the specs that they are numbers of."""
+        """Store the numbers (N, 4) of each result spec."""
         self._time_ns = time_ns
         self._numbers = numbers
         self._monitored = monitored
@@ -175,7 +175,7 @@ class Update:
 
     @property
     def specs(self) -> tuple[SpecUpdate, ...]:
-        """One for each result spec, in the order of the text."""
+        """One update for each result spec, in the order of the text."""
         if self._specs is None:
             of_specs = zip(self._monitored.specs, self.numbers, strict=True)
             self._specs = tuple(
@@ -185,31 +185,31 @@ class Update:
 
     @property
     def places(self) -> Mapping[str, tuple[int, int]]:
-        """For each name, its index in `specs` and its node."""
+        """Index in `specs` and node id, by the name of the node."""
         return self._monitored.places
 
     @property
     def violations(self) -> tuple[Violation, ...]:
         """Permanent violations, in the order in which they became certain; computed on demand.
 
-        The parts of a conjunction are reported apart. None under the paper's semantics, where later samples
-        may change every verdict.
+        Each conjunct is reported separately. There are none under the paper's semantics, because later
+        samples may change every verdict.
         """
         return tuple([settled.violation for settled in self._settlement.settled])
 
     @property
     def satisfied(self) -> tuple[Settled, ...]:
-        """The specs that are permanently satisfied; why is found when asked for (`reason`)."""
+        """The permanently satisfied specs; their `reason` is computed on demand."""
         return self._settlement.satisfied
 
     @property
     def remarks(self) -> tuple[Diagnostic, ...]:
-        """A warning for each object and signal of the specification that is missing for too long."""
+        """Warnings of objects and signals of the specification that have been missing for too long."""
         return self._settlement.remarks
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the specs'."""
+        """The worst verdict of the specs."""
         return worst_verdict(spec.verdict for spec in self.specs)
 
     def __repr__(self) -> str:
@@ -228,14 +228,14 @@ class Update:
 
 
 class Ending(NamedTuple):
-    """The result of one spec if a run ends with its newest sample, as a replay of its log reports it.
+    """The result of one spec if a run ends with its newest sample; a replay of its log gives the same.
 
     Attributes:
-        robustness: the value of the root on the samples so far; NaN if it is not determined.
-        lower, upper: the ends of the value's interval over the finished log.
-        unit: the declared one of these, or "".
-        reason: why it is unknown, as `explain` has it; "" if it is not, or if that was not noted.
-        doubts: assumptions that the verdict rests on, and that the run contradicts.
+        robustness: value of the root on the samples so far; NaN if undetermined.
+        lower, upper: ends of the value's interval over the finished log.
+        unit: declared unit of these numbers, or "".
+        reason: explanation of an unknown verdict; "" for other verdicts, and without `note_unknown`.
+        doubts: assumptions under the verdict that the run contradicts.
     """
 
     spec: NamedSpec
@@ -250,11 +250,10 @@ class Ending(NamedTuple):
 
 @named_arguments
 class Monitor:
-    """Evaluates a specification as samples come.
+    """Evaluates a specification sample by sample, with the same bits as a replay of the log.
 
-    Gives the same bits as a replay of the log. Time per sample and memory depend on the specification alone,
-    not on the length of the run: on the samples that windows and delays (`a[-3]`) span. Only the paper's
-    semantics makes temporal operators below others read every sample again.
+    Time per sample and memory depend on the samples in windows and delays (`a[-3]`), not on the length of the
+    run. The paper's semantics is an exception: its nested temporal operators read all samples again.
     """
 
     def __init__(
@@ -272,20 +271,20 @@ class Monitor:
     ) -> None:
         """Start before the first sample.
 
-        The first time on a machine, updates are interpreted while a child process compiles their code.
+        On first use on a machine, a child process compiles the code; until then updates are interpreted.
 
         Args:
-            start_ns: samples before this time are only there to be looked back at (`a[-3]`).
-            units: for sentences: of signals by their names, of lengths by "".
-            missing_after: a time ("5s") or a number of samples; updates after it warn of each object and
-                signal that has never come so far. None for no warnings.
-            strict_names: a missing name is an error of `update` then.
-            wait_for: names of objects and signals; evaluation begins at the first sample by which each of
-                them has come. Samples before it are not evaluated.
-            start_within: a time ("1s") after the first sample; evaluation begins then without those that are
-                missing (`late`). None to wait for them as long as it takes.
-            wait: compile in this process before the first sample, for loops above 500 Hz. The first time on a
-                machine, that takes many seconds.
+            start_ns: time of the first evaluated sample; terms may look back (`a[-3]`) at earlier samples.
+            units: declared units for sentences: of signals by name, of lengths under "".
+            missing_after: time ("5s") or number of samples after which updates warn of each object and
+                signal that has not come yet. None for no warnings.
+            strict_names: whether `update` raises an error for a missing name instead of a warning.
+            wait_for: names of objects and signals. Evaluation begins at the first sample by which all of
+                them have come; earlier samples are not evaluated.
+            start_within: longest wait for these names after the first sample ("1s"). Evaluation then begins
+                without the missing names (`late`). None for no limit.
+            wait: whether to compile in this process before the first sample, for loops above 500 Hz. On first
+                use on a machine, this takes many seconds.
 
         Raises:
             UsageError: not a specification, unknown semantics, an invalid start, units that are not texts,
@@ -318,7 +317,7 @@ class Monitor:
         self.reset()
 
     def reset(self) -> None:
-        """Begin another run, as a new monitor does; the next sample is its first one."""
+        """Begin another run, like a new monitor; the next sample is its first."""
         self._live = self._begin()
         self._violations = self._remember()
         self._awaited = self._await()
@@ -329,7 +328,7 @@ class Monitor:
         self._unknown: dict[int, Settled] = {}
 
     def note_unknown(self) -> None:
-        """Note the samples with which results became unknown, for the reasons in `endings`."""
+        """Store the newest samples of results that became unknown, so that `endings` can explain them."""
         if self._violations is None:
             return
         for index, final in enumerate(self._live.finals):
@@ -340,7 +339,7 @@ class Monitor:
 
     @property
     def begin_ns(self) -> int | None:
-        """Time of the first evaluated sample; None before it."""
+        """Time of the first evaluated sample; None before that sample."""
         return self._start.begin_ns
 
     @property
@@ -359,11 +358,11 @@ class Monitor:
 
     @property
     def names(self) -> Collection[str]:
-        """The named specs, wherever they occur."""
+        """The names of all named specs, nested specs included."""
         return self._monitored.places.keys()
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Return the ends of the value of a named spec if the run ends here, over everything unknown.
+        """Return the interval of a named spec's value if the run ends here, over all unknown values.
 
         Raises:
             UsageError: no node has the name.
@@ -378,13 +377,13 @@ class Monitor:
         return lower, upper
 
     def leaves(self, place: int = 0) -> Floats:
-        """Return the leaves (C, A, 1) of the newest sample, as `SpecResult.leaves` of its log has them.
+        """Return the leaves (C, A, 1) of the newest sample; `SpecResult.leaves` of its log has the same.
 
         Args:
-            place: that of the spec in `Update.specs`.
+            place: index of the spec in `Update.specs`.
 
         Raises:
-            UsageError: no sample has been evaluated, or under the paper's semantics.
+            UsageError: no sample has been evaluated, or the semantics is the paper's.
         """
         return self._live.leaves(place)
 
@@ -392,9 +391,9 @@ class Monitor:
         """Add the next sample and return its numbers and verdicts.
 
         Raises:
-            TraceError: a time that does not come after the last one's.
-            UsageError: not a sample; more objects in open groups than can be bound.
-            SpecificationError: with `strict_names`, a name that is missing for too long.
+            TraceError: the sample is not later than the previous one.
+            UsageError: not a sample, or more objects in open groups than can be bound.
+            SpecificationError: with `strict_names`, a name has been missing for too long.
         """
         require_sample(sample)
         time_ns = sample.time_ns
@@ -419,8 +418,8 @@ class _Start:
     """Decides at which sample evaluation begins.
 
     Attributes:
-        begin_ns: time of that sample; None before it.
-        missing: the names that are still to come.
+        begin_ns: time of that sample; None before that sample.
+        missing: the names that have not come yet.
     """
 
     def __init__(self, wait_for: Collection[str], within: str | None) -> None:
@@ -436,7 +435,7 @@ class _Start:
         self._first_ns: int | None = None
 
     def has_begun(self, sample: Sample) -> bool:
-        """Return whether a sample is evaluated; samples come in the order of their times."""
+        """Return whether evaluation has begun at a sample; called for each sample until then."""
         if self.begin_ns is not None:
             return True
         self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
@@ -464,10 +463,10 @@ class _AwaitedNames:
         self._names_so_far: tuple[set[str], set[str], set[str]] = (set(), set(), set())
         self._remarks: tuple[Diagnostic, ...] = ()
         self.is_open = after is not None and bool(self._objects or self._signals)
-        """Whether any is still to come."""
+        """Whether any name is still missing."""
 
     def extend(self, sample: Sample) -> tuple[Diagnostic, ...]:
-        """Return a warning for each that has not come by this sample, which is late by now."""
+        """Return a warning for each missing name once the limit has passed; before it, none."""
         self._samples += 1
         if self._first_ns is None:
             self._first_ns = sample.time_ns
@@ -491,7 +490,7 @@ class _AwaitedNames:
         return self._remarks
 
     def _learn(self, *names: Collection[str]) -> None:
-        """Keep names, for hints."""
+        """Store names as candidates for spelling hints."""
         if not self._remarks:
             # bounded: a run may bring a new track name at every sample
             for names_so_far, new_names in zip(self._names_so_far, names, strict=True):
@@ -519,7 +518,7 @@ class _AwaitedNames:
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
-    """Map each name to its spec and node; to the first if several have it."""
+    """Map each name to the index of its spec and its node id; of equal names, the first counts."""
     places: dict[str, tuple[int, int]] = {}
     for index, of_spec in enumerate(names):
         for identifier, name in enumerate(of_spec):
@@ -529,7 +528,7 @@ def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, 
 
 
 def _ending(spec: NamedSpec, final: Floats | None, last: Floats | None, unit: str) -> Ending:
-    """Return a result from the interval (N, 2) of each node at the end and the numbers after a sample."""
+    """Return a result from the intervals (N, 2) of its nodes at the end and their last numbers (N, 4)."""
     if final is None:
         return Ending(spec, Verdict.UNKNOWN, _robustness(last), float("-inf"), float("inf"), unit)
     lower, upper = final[0].tolist()
@@ -541,9 +540,9 @@ def _robustness(numbers: Floats | None) -> float:
 
 
 REMEMBERED = 1024
-"""Samples that a monitor keeps to look for the atom that settled a violation."""
+"""Number of newest samples that a monitor stores to find the deciding atom of a violation."""
 _AT_ONCE = 64
-"""As many samples are searched as a whole; of more, the newest first."""
+"""Limit on samples that are searched as a whole; longer runs are searched from the newest sample back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -551,15 +550,15 @@ class Violation:
     """A part of a specification that is permanently violated. `str()` is a sentence on it.
 
     Attributes:
-        spec: the innermost named spec that it belongs to.
+        spec: innermost named spec that contains it.
         node: its id in the tree of the result.
         text: its canonical text.
-        time_ns: of the sample that made it certain.
-        robustness: below 0: the most that the part can still reach.
-        witness: the atom that settled it, and what would flip it; None if that lies further back than the
-            samples that the monitor keeps.
-        first_ns: the time that the sentences count from: that of the monitor's first sample.
-        unit: the declared one of `robustness`, or "".
+        time_ns: time of the sample that made it certain.
+        robustness: upper bound of the robustness that the part can still reach; below 0.
+        witness: the atom that settled it, and the change that would flip it. None if the atom is older than
+            the samples that the monitor stores.
+        first_ns: reference time of the sentences, the time of the monitor's first sample.
+        unit: declared unit of `robustness`, or "".
     """
 
     spec: str
@@ -573,22 +572,22 @@ class Violation:
 
     @property
     def atom(self) -> DecidingAtom | None:
-        """The atom that settled it: its objects, its value, what was measured."""
+        """The atom that settled it, with its objects, value and measurements."""
         return None if self.witness is None else self.witness.deciding
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """The objects, regions and groups that the atom is about."""
+        """The objects, regions and groups of the atom."""
         return () if self.atom is None else self.atom.objects
 
     @property
     def value(self) -> float:
-        """The robustness of the atom with every uncertainty at 0; NaN if there is none."""
+        """The robustness of the atom with every uncertainty at 0; NaN without an atom."""
         return float("nan") if self.atom is None else self.atom.value
 
     @property
     def threshold(self) -> Threshold | None:
-        """The change of the atom's number that would have prevented it, if there is one."""
+        """The change of the atom's number that would have prevented the violation, if there is one."""
         return None if self.witness is None else self.witness.threshold
 
     @property
@@ -611,7 +610,7 @@ class Violation:
 
 
 def _has_factor(atom: Atom) -> bool:
-    """Return whether what an atom measures is multiplied: its amount is not that of the signal then."""
+    """Return whether an atom multiplies its signal: its robustness is then no amount of the signal."""
     expression = atom.expression.operand if isinstance(atom.expression, Scaled) else atom.expression
     return any(isinstance(part, Product | Scaled) for part in iter_expressions(expression))
 
@@ -621,14 +620,14 @@ def _settling_number(atom: DecidingAtom) -> float:
 
 
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
-    """Return an atom, its number, and when it decided."""
+    """Return a clause with the atom, its margin, and the time at which it decided."""
     is_violated = witness.verdict is Verdict.VIOLATED
     outcome = how_text(_settling_number(atom), atom.atom, witness.units, is_violated=is_violated)
     return f"`{atom.text}` {outcome} at {Instant(witness.time_ns, first_ns)}"
 
 
 def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
-    """Return what is wrong in a few words: in which direction a distance or a signal is off."""
+    """Return a short description of a violation, such as "cup is 0.03 m too close to edge"."""
     signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
     if _has_factor(atom.atom):
         signed = []
@@ -649,12 +648,15 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """A verdict that a monitor has seen, with the samples to find its atom in.
+    """A verdict of a monitor, with the samples in which its deciding atom is searched.
 
     Attributes:
-        verdict: permanently satisfied or violated; or unknown, if the run ends there.
-        number: the end of the interval that settles it: the lower one of what is satisfied.
-        samples: the newest; from `start` on they count, and they are all of them if `is_whole`.
+        verdict: permanently satisfied or violated; or unknown, for a run that ends there.
+        number: end of the interval that settles the verdict: the lower end of a satisfied part, the upper end
+            of a violated one.
+        samples: newest samples of the run.
+        start: index of the first evaluated sample.
+        is_whole: whether `samples` begins with the first sample of the run.
     """
 
     spec: NamedSpec
@@ -684,7 +686,7 @@ class Settled:
 
     @property
     def reason(self) -> str:
-        """The atom that settled it and by how much, in words; "" if it was not found."""
+        """The deciding atom and its margin in words; "" if it was not found."""
         witness = self.witness
         if witness is not None and self.verdict is Verdict.UNKNOWN:
             return str(reason_sentence(witness, first_ns=self.first_ns))
@@ -694,7 +696,7 @@ class Settled:
 
     @cached_property
     def witness(self) -> Witness | None:
-        """Return the witness on the fewest of the newest samples that give the part its number."""
+        """The witness on the newest samples, as few as give the part the same number; None if none do."""
         for begin in self._begins():
             witness = self._witness_from(begin)
             number = witness.upper if self.verdict is Verdict.VIOLATED else witness.lower
@@ -704,7 +706,7 @@ class Settled:
         return None
 
     def _begins(self) -> Iterator[int]:
-        """Yield the samples at which to begin the evaluation, the latest first: few are often enough."""
+        """Yield samples at which to begin the evaluation, the latest first: few samples often suffice."""
         count = len(self.samples)
         if self.is_whole and count - self.start <= _AT_ONCE:
             yield self.start
@@ -732,7 +734,7 @@ class Settled:
 
 
 def rehearse(specification: Specification) -> None:
-    """Explain trial violations, so that a real one waits for no code to be loaded or compiled."""
+    """Explain trial violations, so that the code is loaded and compiled before a real violation."""
     box = TrackedObject(Footprint.box(0.0, 0.0, 1.0, 1.0), height=(0.0, 1.0), yaw=0.0)
     objects = dict.fromkeys(object_names(specification), box)
     sample = Sample(0, objects, dict.fromkeys(signal_names(specification), 0.0))
@@ -747,7 +749,7 @@ def rehearse(specification: Specification) -> None:
 
 
 def _run_trial(specification: Specification, semantics: Semantics) -> None:
-    """Load every kernel, so that no sample has to wait for one."""
+    """Load every kernel before the first sample."""
     trial = LiveStream(specification, semantics, 0)
     # the second sample takes branches that the first one does not
     for time_ns in range(2):
@@ -757,15 +759,15 @@ def _run_trial(specification: Specification, semantics: Semantics) -> None:
 
 
 class ViolationLog:
-    """The newest samples of one monitor, and what they made certain.
+    """The newest samples of one monitor, and the verdicts that became certain.
 
     Attributes:
-        settled: the violations, of each part of a conjunction its own.
-        satisfied: the results that are satisfied.
+        settled: the violations, one for each conjunct.
+        satisfied: the satisfied results.
     """
 
     def __init__(self, specification: Specification, start_ns: int, units: Mapping[str, str]) -> None:
-        """Start before the first sample; `units` are those that are declared."""
+        """Start before the first sample, with the declared units."""
         self._units = units
         self._specification = specification
         self._start_ns = start_ns
@@ -780,7 +782,7 @@ class ViolationLog:
         self.satisfied: tuple[Settled, ...] = ()
 
     def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> bool:
-        """Take in a sample and the numbers (N, 4) of each result after it; return whether it settled any."""
+        """Add a sample and the numbers (N, 4) of each result after it; return whether a verdict settled."""
         if self._first_ns is None:
             self._first_ns = sample.time_ns
         self._samples.append(sample)
@@ -801,7 +803,7 @@ class ViolationLog:
         return self.settled is not settled or self.satisfied is not satisfied
 
     def unknown(self, spec: NamedSpec) -> Settled:
-        """Return a result that is unknown since the newest sample, if the run ends there."""
+        """Return the unknown verdict of a spec for a run that ends with the newest sample."""
         conjunct = Conjunct(0, spec.name, spec.formula)
         return self._verdict_with_samples(spec, conjunct, Verdict.UNKNOWN, float("nan"))
 
@@ -826,7 +828,7 @@ class ViolationLog:
             verdict,
             number,
             samples,
-            # samples before the start are only there to be looked back at
+            # terms only look back at samples before the start
             next(k for k, sample in enumerate(samples) if sample.time_ns >= self._start_ns),
             samples[0].time_ns == first_ns,
             first_ns,

@@ -1,4 +1,4 @@
-"""A specification evaluated over a trace: the results of its specs, and on request signals and witnesses."""
+"""Evaluate a specification over a trace: results of its specs, signals and witnesses on request."""
 
 from __future__ import annotations
 
@@ -88,17 +88,17 @@ class NodeResult:
     """One node of a specification's tree over the evaluated samples.
 
     Attributes:
-        id: its number in the order of the text, from 0 for the root.
-        parent: its parent's id; None for the root.
+        id: its number in the order of the text; 0 for the root.
+        parent: id of its parent; None for the root.
         operator: "and", "F", a relation's name, …
-        name: the name of the spec whose root it is, or None.
+        name: name of the spec whose root it is, or None.
         text: its canonical text.
-        requirement, title: of the spec whose root it is ("REQ-12" and its words), or None.
-        value: (T,), its robustness at the first sample, given the samples up to each (NaN: not determined).
-        now: (T,), its robustness at each sample, given the samples up to that one.
-        lower, upper: (T,), the ends of `value` over every continuation and everything unknown.
-        robustness: `value` on the whole log; NaN if not determined.
-        final_lower, final_upper: the ends of its interval for the finished log.
+        requirement, title: id ("REQ-12") and title of the requirement of that spec, or None.
+        value: (T,), robustness at the first sample, given the samples up to each; NaN if undetermined.
+        now: (T,), robustness at each sample, given the samples up to that one.
+        lower, upper: (T,), bounds of `value` over all continuations and unknown values.
+        robustness: `value` on the whole log; NaN if undetermined.
+        final_lower, final_upper: bounds of the robustness on the finished log.
     """
 
     id: int
@@ -126,17 +126,18 @@ class SpecResult(Displayed):
     """One spec evaluated over a log, or one object's instance of a template.
 
     Attributes:
-        name: the spec's name; preceded by its file's stem if two files have a spec of that name.
-        object: the object that a template's parameter stands for, or None.
-        values: (N,), each node's value on the whole log.
-        final: (N, 2), lower and upper end of each node for the finished log.
-        first_satisfied_ns: the first sample with a value of at least 0, even if that is lost later, or None.
+        name: name of the spec, after the stem of its file if two files have a spec of that name.
+        object: object of a template's instance; else None.
+        values: (N,), value of each node on the whole log.
+        final: (N, 2), lower and upper end of each node's value on the finished log.
+        first_satisfied_ns: time of the first sample with a value of at least 0, or None. Later values may be
+            below 0.
         settled_ns: (N, 2), see `InstanceStream`.
-        times_ns: (T,) int64, the samples evaluated; empty if nothing was stored of each sample.
-        series: (N, 4, T): value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
-        leaves: (C, A, T), the instance's leaves, from which the methods compute; None if not stored.
-        evidence: the samples, to be read again.
-        doubts: assumptions that its verdict rests on, and that the log contradicts.
+        times_ns: (T,) int64, times of the evaluated samples; empty if no numbers of samples were stored.
+        series: (N, 4, T), value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
+        leaves: (C, A, T), leaves of the instance, from which the methods compute; None if not stored.
+        evidence: access to the samples, to read them again.
+        doubts: assumptions under the verdict that the log contradicts.
     """
 
     name: str
@@ -169,10 +170,10 @@ class SpecResult(Displayed):
         """Collect the result of a stream that has seen all samples.
 
         Args:
-            block: what was stored of every sample, if anything.
-            name: of the spec, unless it is the instance's.
-            has_series, has_leaves: whether the block holds its series, and its leaves.
-            doubts: those that its verdict rests on.
+            block: stored numbers of every sample, if any.
+            name: name of the result; by default that of the instance.
+            has_series, has_leaves: whether the block holds the series, and the leaves.
+            doubts: doubts that affect its verdict.
         """
         instance = stream.instance
         has_series = has_series and block is not None
@@ -196,12 +197,12 @@ class SpecResult(Displayed):
 
     @property
     def spec(self) -> NamedSpec:
-        """The `spec` statement that it is the result of, with its requirement's id and title."""
+        """The `spec` statement of the result, with its requirement's id and title."""
         return self.evidence.instance.spec
 
     @property
     def title(self) -> str:
-        """Its name, with the object it is about."""
+        """The name of the result, with the object of a template's instance."""
         return self.name if self.object is None else f"{self.name}({self.object})"
 
     @cached_property
@@ -240,17 +241,17 @@ class SpecResult(Displayed):
 
     @property
     def robustness(self) -> float:
-        """The root's value on the whole log; NaN if not determined."""
+        """The root's value on the whole log; NaN if undetermined."""
         return float(self.values[0])
 
     @property
     def lower(self) -> float:
-        """The least possible value of the root, given what is unknown."""
+        """The least possible value of the root over all unknown values."""
         return float(self.final[0, 0])
 
     @property
     def upper(self) -> float:
-        """The greatest possible value of the root, given what is unknown."""
+        """The greatest possible value of the root over all unknown values."""
         return float(self.final[0, 1])
 
     @property
@@ -259,21 +260,21 @@ class SpecResult(Displayed):
 
     @property
     def unit(self) -> str:
-        """The declared unit of its robustness; "" where its atoms have several or none is declared."""
+        """The declared unit of its robustness; "" if its atoms have several units or none is declared."""
         return declared_unit(self.formula, self.evidence.units)
 
     @property
     def satisfied_at_ns(self) -> int | None:
-        """When it became certain that it is satisfied; None if only the end decided."""
+        """Time at which satisfaction became certain; None if only the end decided, and for other verdicts."""
         return self.certain_ns() if self.verdict is Verdict.SATISFIED else None
 
     @property
     def violated_at_ns(self) -> int | None:
-        """When it became certain that it is violated; None if only the end decided."""
+        """Time at which violation became certain; None if only the end decided, and for other verdicts."""
         return self.certain_ns() if self.verdict is Verdict.VIOLATED else None
 
     def certain_ns(self, node: int = 0) -> int | None:
-        """Return when a node's verdict became certain; None if only the end decided, or it is unknown."""
+        """Return the time at which a node's verdict became certain; None if unknown or decided by the end."""
         verdict = final_verdict(*self.final[node].tolist())
         settled_ns = (
             NEVER if verdict is Verdict.UNKNOWN else self.settled_ns[node, int(verdict is Verdict.VIOLATED)]
@@ -282,27 +283,27 @@ class SpecResult(Displayed):
 
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
-        """Why it is violated or unknown, one cause for each named spec that fails in it; else none.
+        """The causes of a violated or unknown verdict, one for each named spec that fails in it.
 
-        Causes that settled it come first, by time. Causes that only the end of the log decided follow, the
-        least robustness first, then unknown ones.
+        Causes that settled before the end come first, by time. Causes that only the end of the log decided
+        follow, the least robustness first. Unknown causes come last.
         """
         return self.causes_of(0)
 
     def causes_of(self, node: int) -> tuple[Cause, ...]:
-        """Return why a node is violated or unknown, as `causes` does for the root."""
+        """Return the causes of a node's verdict, as `causes` does for the root."""
         return self._causes(node, self._witnesses)
 
     @cached_property
     def violated_invariants(self) -> tuple[ViolatedInvariant, ...]:
-        """How often and where each violated part `G p` is violated; empty under the paper's semantics."""
+        """The violated intervals of each violated part `G p`; empty under the paper's semantics."""
         return self.violated_invariants_of(0)
 
     def violated_invariants_of(self, node: int, *, goes_on: bool = False) -> tuple[ViolatedInvariant, ...]:
         """Return the violated parts `G p` of a node, as `violated_invariants` does for the root.
 
         Args:
-            goes_on: whether samples may follow those evaluated.
+            goes_on: whether samples may follow the evaluated ones.
         """
         return tuple(self._violated_invariants(self._conjuncts_of(node), goes_on=goes_on))
 
@@ -317,11 +318,11 @@ class SpecResult(Displayed):
         )
 
     def _conjuncts_of(self, node: int) -> Sequence[Conjunct]:
-        """Return the parts of a node that have to hold for it to hold."""
+        """Return the conjuncts of a node."""
         return conjuncts_of(nodes_of(self.formula)[node], self._name_of(node), node)
 
     def first_cause(self, node: int) -> Cause | None:
-        """Return the first of `causes_of` a node, without its witness: no sample is read for it."""
+        """Return the first cause of a node without its witness, so that no sample is read."""
         return next(iter(self._causes(node, lambda *_: (None, None))), None)
 
     def _causes(
@@ -337,60 +338,60 @@ class SpecResult(Displayed):
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
 
-        Its columns are `seconds` since the log's first sample, and for each node `NAME value`, `NAME
-        now`, `NAME lower` and `NAME upper`. NAME is the spec's name, or else the node's id and text.
+        The column `seconds` counts from the log's first sample. Each node has the columns `NAME value`,
+        `NAME now`, `NAME lower` and `NAME upper`. NAME is the spec's name, or else the node's id and text.
 
         Raises:
-            UsageError: pandas is not installed, or the numbers of each sample were not kept.
+            UsageError: pandas is not installed, or the numbers of each sample were not stored.
         """
         return data_frame(self)
 
     def gaps(self) -> tuple[Gap, ...]:
-        """Return when each object and signal that the formula names is missing, for those that ever are."""
+        """Return the gaps of objects and signals in the formula, one for each that is ever missing."""
         return self.evidence.gaps(self.formula)
 
     @property
     def least(self) -> LeastPart | None:
-        """The part with the least robustness, if that is another than the first cause."""
+        """The conjunct with the least robustness; None if the first cause has it."""
         return self._least(0, self.causes)
 
     @property
     def least_at_ns(self) -> int | None:
-        """When the first cause became as bad as it is, if after it settled the verdict; else None."""
+        """Time at which the first cause reached its least robustness; None if it settled with it."""
         return self._least_at_ns(self.causes)
 
     @cached_property
     def worst(self) -> Witness | None:
-        """The deciding witness: that of the first cause, or of a satisfied result.
+        """The witness of the first cause, or of a satisfied result.
 
         None if the leaves were not stored, and under the paper's semantics.
         """
         return self.worst_of(0, self.causes)
 
     def worst_of(self, node: int, causes: Sequence[Cause]) -> Witness | None:
-        """Return what decided the verdict of a node, given why it failed, if it did (see `worst`)."""
+        """Return the witness of a node's verdict, given its causes (see `worst`)."""
         return causes[0].witness if causes else self._settled_witness(node, self.certain_ns(node))
 
     @cached_property
     def vacuous(self) -> tuple[UntestedPart, ...]:
         """The parts that decided nothing, by node.
 
-        Where the leaves were not stored, the log is read again.
+        The log is read again if the leaves were not stored.
         """
         leaves, times_ns = self._stored
         lower, upper = self.final[0].tolist()
         infinite_end = End.LOW if lower == np.inf else End.HIGH if upper == -np.inf else None
-        # no path leads through atoms that the paper's semantics leaves out
+        # NaN marks leaves that the paper's semantics leaves out: no path leads through them
         infinite_end = None if np.isnan(leaves).any() else infinite_end
         return find_vacuous(self.evidence, leaves, times_ns, infinite=infinite_end)
 
     @property
     def tested(self) -> Tested:
-        """Whether the whole formula, a cut window, or nothing tested the verdict. An unknown one is "full",
-        since it claims nothing.
+        """By how much of the log the verdict was tested: "full", "cut" or "nothing".
 
-        "nothing": it is the same whatever the atoms are, where the antecedents of a satisfied formula stay as
-        they are. "cut": it could be another one if windows beyond the end of the log were whole. Else "full".
+        "nothing": the verdict is the same for all values of the atoms, while antecedents of a satisfied
+        formula keep theirs. "cut": the verdict could change if windows beyond the end of the log were
+        complete. "full": all other verdicts, and unknown ones.
         """
         if self._is_untested:
             return "nothing"
@@ -405,8 +406,7 @@ class SpecResult(Displayed):
 
     @property
     def remarks(self) -> tuple[Sentence, ...]:
-        """Sentences on doubts, the parts that decided nothing, the window that the end of the log cut, and
-        goals that hold in the first sample already."""
+        """Sentences on doubts, untested parts, a cut window, and goals that hold at the first sample."""
         doubts = [Sentence("The verdict is doubtful: ", doubt.text, ".") for doubt in self.doubts]
         parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
         untested_remarks = [_UNTESTED] if self._is_untested else []
@@ -414,7 +414,7 @@ class SpecResult(Displayed):
 
     @cached_property
     def goals_at_the_start(self) -> tuple[Sentence, ...]:
-        """Sentences on the goals (`F`) that hold in the first sample already."""
+        """Sentences on the goals (`F`) that already hold at the first sample."""
         return goals_at_the_start(self.evidence, *self._stored)
 
     @cached_property
@@ -432,42 +432,42 @@ class SpecResult(Displayed):
 
     @property
     def _stored(self) -> tuple[Floats, Integers]:
-        """The leaves of every sample and its times, read again where they were not stored."""
+        """The leaves and times of the samples, read again if they were not stored."""
         if self.leaves is not None:
             return self.leaves, self.times_ns
         return self.evidence.columns(self.evidence.instance.program.leaves), self.evidence.times_ns()
 
     @property
     def can_explain(self) -> bool:
-        """Whether it has a witness: the leaves are stored, and the semantics is "ltlf"."""
+        """Whether it can have a witness: the leaves are stored, and the semantics is "ltlf"."""
         return self.leaves is not None and self.semantics == "ltlf"
 
     def full_signal(self) -> Floats:
-        """Return each node's robustness at each sample, from there to the end, (N, T); NaN: not determined.
+        """Return each node's robustness (N, T) from each sample to the end; NaN if undetermined.
 
         Raises:
-            UsageError: under the paper's semantics.
+            UsageError: the semantics is the paper's, or the leaves were not stored.
         """
         leaves = self._leaves("the signal of a whole log")
         return full_signal(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
 
     def window_signal(self, width_ns: int) -> Floats:
-        """Return each node's robustness over the samples in (t - width, t], for the sample at each t, (N, T).
+        """Return each node's robustness (N, T) over the window (t - width, t] of each sample t.
 
-        Past operators start where the window does; `a[-3]` may look before it. NaN: not determined.
+        Past operators start with the window; `a[-3]` may look before it. Undetermined values are NaN.
 
         Raises:
-            UsageError: a width below 1 ns, or under the paper's semantics.
+            UsageError: the width is below 1 ns, the semantics is the paper's, or the leaves were not stored.
         """
         leaves = self._leaves("a sliding window")
         order = self.evidence.instance.program.leaves
         return window_signal(self.formula, order, leaves, self.times_ns, width_ns)
 
     def witness(self, node: str | int | None = None) -> Witness:
-        """Return what decides the verdict of a node, by name or id, or of the root.
+        """Return the witness of a node's verdict, by name or id; by default of the root's.
 
         Raises:
-            UsageError: no such node, or under the paper's semantics.
+            UsageError: no such node, the semantics is the paper's, or the leaves were not stored.
         """
         identifier = self.node(node).id if isinstance(node, str) else node or 0
         leaves = self._leaves("a witness")
@@ -476,19 +476,19 @@ class SpecResult(Displayed):
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
 
     def deciding_node(self) -> int:
-        """Return the id of the node that decides the verdict, as `witness` does, which looks into more.
+        """Return the id of the node that decides the verdict; cheaper than `witness`.
 
         Raises:
-            UsageError: under the paper's semantics.
+            UsageError: the semantics is the paper's, or the leaves were not stored.
         """
         leaves = self._leaves("what decides a verdict")
         nodes = evaluate_offline(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
         return deciding_path(nodes, 0, End.of(final_verdict(*nodes.interval(0)))).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
-        """Return what gave the verdict its robustness, and how a violation began where that was earlier.
+        """Return sentences on the atom behind the robustness, and on an earlier beginning of a violation.
 
-        "" without a witness (see `worst`).
+        They are "" without a witness (see `worst`).
         """
         if self.causes:
             return cause_reason(self.causes[0], first_ns)
@@ -504,10 +504,10 @@ class SpecResult(Displayed):
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.
 
         A result that is not satisfied lists each cause, its deciding atom, and the change that would flip it.
-        A satisfied one names its deciding atom. The parts that decided nothing follow.
+        A satisfied result names its deciding atom. Remarks follow (see `remarks`).
 
         Args:
-            first_ns: the time that others are counted from; by default that of the log's first sample.
+            first_ns: reference time of the sentences; by default the time of the log's first sample.
         """
         first_ns = self.evidence.first_ns() if first_ns is None else first_ns
         return "\n".join(self.sentences(first_ns))
@@ -520,16 +520,16 @@ class SpecResult(Displayed):
     def sentences_about(
         self, node: int, causes: Sequence[Cause], first_ns: int, *, goes_on: bool = False
     ) -> tuple[Sentence, ...]:
-        """Return the sentences on the verdict of a node, given why it failed, if it did.
+        """Return the sentences on the verdict of a node, given its causes.
 
         Args:
-            goes_on: whether samples may follow those evaluated.
+            goes_on: whether samples may follow the evaluated ones.
         """
         conjuncts = {part.node: part for part in self._conjuncts_of(node)}
         sentences = [self._headline(node, causes, first_ns)]
         for cause in causes:
             cause_lines = cause_sentences(cause, first_ns=first_ns, object=self.object)
-            # the headline stands for the first sentence on the whole formula
+            # the headline replaces the first sentence of a cause that is the node itself
             sentences += cause_lines if cause.node != node else cause_lines[1:]
             part = [conjuncts[cause.node]]
             for invariant in self._violated_invariants(part, goes_on=goes_on, most=LISTED):
@@ -584,7 +584,7 @@ class SpecResult(Displayed):
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
 
     def _settled_witness(self, node: int, settled_ns: int | None) -> Witness | None:
-        """Return what settled the verdict of a node at a time, or decides it on the whole log."""
+        """Return the witness of a node's verdict at its settling time; on the whole log if that is None."""
         if self.leaves is None or not self.can_explain:
             return None
         if settled_ns is None:
@@ -595,7 +595,7 @@ class SpecResult(Displayed):
         return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole_log)
 
     def _witnesses(self, node: int, settled_ns: int | None) -> tuple[Witness | None, Witness | None]:
-        """Return what settled the verdict of a node and, of a violation that grew later, what it grew by."""
+        """Return the settling witness of a node's verdict, and the witness of a violation that grew later."""
         settling = self._settled_witness(node, settled_ns)
         if (
             self.leaves is None
@@ -625,7 +625,7 @@ class SpecResult(Displayed):
 
 
 def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
-    """Return the message for an unknown node: the nearest name, and all of them."""
+    """Return the message for an unknown node, with the nearest name and all names."""
     existing_names = tuple(names)
     listing = f"there are {', '.join(existing_names)}" if existing_names else "there are none yet"
     hint = nearest_hint(name, existing_names) if isinstance(name, str) else ""
@@ -633,11 +633,10 @@ def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
 
 
 def worst_first(results: Sequence[SpecResult]) -> list[int]:
-    """Return the places of results: those violated, those unknown, the others.
+    """Return the indices of results, worst first: violated, then unknown, then others.
 
-    Violated results come by the time of their verdict, and results that only the end of the log decided come
-    last. Otherwise they keep the order of the files. Robustness of different results is not compared: their
-    units may differ.
+    Violated results are in the order of their settling times; those decided only by the end come last.
+    Otherwise results keep the order of the files. Robustness is not compared, because units may differ.
     """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
 
@@ -653,11 +652,11 @@ class Evaluation(Displayed):
     """One result per spec, and per object for a template.
 
     Attributes:
-        specification: what was evaluated.
-        objects, signals, classes: the names in the trace.
-        each: the objects that templates were evaluated for, by parameter.
-        left_out: sentences on the samples that were left out at the ends.
-        doubts: assumptions that the log contradicts; each result has those that it rests on.
+        specification: the evaluated specification.
+        objects, signals, classes: names in the trace.
+        each: choice of objects for each template parameter.
+        left_out: sentences on samples that were left out at the ends.
+        doubts: assumptions that the log contradicts; each result has the doubts that affect it.
     """
 
     results: tuple[SpecResult, ...]
@@ -674,9 +673,8 @@ class Evaluation(Displayed):
     def remarks(self) -> tuple[Diagnostic, ...]:
         """Warnings about the specification's text (see `Specification.warnings`) and its names in this trace.
 
-        A warning for each object and signal that the trace never has, which is therefore unknown in every
-        sample. Also for each class of a template without an object, and for each object hidden by a
-        definition of the same name.
+        Objects and signals that the trace never has get a warning: they are unknown in every sample. Warnings
+        also name classes of templates without an object, and objects hidden by a definition of the same name.
         """
         # computed on demand: it takes as long as the evaluation itself
         diagnostics = check_names(
@@ -696,17 +694,17 @@ class Evaluation(Displayed):
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the results': violated before unknown before satisfied."""
+        """The worst verdict of the results, in the order violated, unknown, satisfied."""
         return worst_verdict(result.verdict for result in self.results)
 
     def __iter__(self) -> Iterator[SpecResult]:
         return iter(self.results)
 
     def result(self, name: str | None = None, object: str | None = None) -> SpecResult:
-        """Return the result of a spec by name and, for a template, by object; with neither, the only one.
+        """Return one result, by spec name and, for a template, by object.
 
         Raises:
-            UsageError: no result fits, or several.
+            UsageError: no result fits, or several results fit.
         """
         fitting = [
             result
@@ -737,7 +735,7 @@ class Evaluation(Displayed):
         """Return the root node of a named spec, wherever it occurs.
 
         Raises:
-            UsageError: no node, or nodes of several objects, have the name.
+            UsageError: no node has the name, or nodes of several objects have it.
         """
         nodes = [
             node
@@ -756,13 +754,13 @@ class Evaluation(Displayed):
         return nodes[0]
 
     def witness(self, node: str | None = None, object: str | None = None) -> Witness:
-        """Return what decides the verdict: of a named node or, by default, of the worst result.
+        """Return the witness of a named node's verdict or, by default, of the worst result's.
 
         Args:
-            object: selects one instance of a template.
+            object: object of one instance of a template.
 
         Raises:
-            UsageError: no such node or object, nothing was evaluated, or under the paper's semantics.
+            UsageError: no such node or object, nothing was evaluated, or the semantics is the paper's.
         """
         results = [result for result in self.results if object in (None, result.object)]
         if node is not None:
@@ -802,19 +800,19 @@ def evaluate(
     reuses them.
 
     Args:
-        semantics: "ltlf", finite-trace robustness, or "paper", Def. 16 of the paper to the letter.
-        start_ns, end_ns: evaluate the samples from start to before end; terms that look back (`a[-3]`) may
-            look before the start. Without them, samples of a mapped log are left out at an end where a needed
-            topic has not begun, or has ended (`ends: trim` of the mapping); `Evaluation.left_out` names them.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
-        strict_names: names that the trace never has are errors; otherwise objects and signals are unknown, a
-            template has no result for a class, and `Evaluation.remarks` warns of them.
+        semantics: "ltlf" for finite-trace robustness, or "paper" for Definition 16 of the paper.
+        start_ns, end_ns: evaluated samples, from start to before end. Terms (`a[-3]`) may look before the
+            start. By default, a mapped log is trimmed where a needed topic has not begun, or has ended
+            (`ends: trim` of the mapping); `Evaluation.left_out` names the trimmed samples.
+        each: choice of objects for each template parameter: "all", "class:NAME" or a name.
+        strict_names: whether names that the trace never has are errors. Otherwise `Evaluation.remarks` warns:
+            such objects and signals are unknown, and a template has no result for such a class.
 
     Raises:
-        SpecificationError: with `strict_names`, names that the trace never has; a name that no number of a
-            signal has, if the trace declares such names.
+        SpecificationError: a name that no number of a signal has, if the trace declares such names. With
+            `strict_names`, also names that the trace never has.
         UsageError: no sample in the window, a template without its objects, unknown semantics, an
-            operator without a meaning, an argument of another type.
+            operator that the semantics does not define, or an argument of another type.
     """
     require_specification(specification)
     _require_trace(trace)
@@ -852,8 +850,8 @@ def _evaluation_of(
     """Return the results of streams that have seen all samples of a trace.
 
     Args:
-        first_ns: the time that sentences count from.
-        blocks: the numbers of each stream.
+        first_ns: reference time of the sentences.
+        blocks: numbers of each stream.
     """
     doubts = distinct_doubts(trace.doubts, first_ns)
     instances = [stream.instance for stream in streams]
@@ -880,7 +878,7 @@ def _evaluation_of(
 
 
 _MOST_TOGETHER: Final = 2**14
-"""Samples that `evaluate_many` measures together: they bound its memory."""
+"""Limit on samples that `evaluate_many` measures together, which bounds its memory."""
 
 
 def evaluate_many(
@@ -892,7 +890,7 @@ def evaluate_many(
     evaluated trace by trace.
 
     Raises:
-        UsageError: see `evaluate`; a trace without samples.
+        UsageError: as for `evaluate`, and for a trace without samples.
     """
     require_specification(specification)
     is_apart = any(spec.parameter is not None for spec in specification.results) or bool(
@@ -917,7 +915,7 @@ def evaluate_many(
 def _evaluate_group(
     specification: Specification, traces: Sequence[Trace], semantics: Semantics
 ) -> Iterator[Evaluation]:
-    """Evaluate traces with the same units, of which no sample needs another one to be measured."""
+    """Evaluate traces with equal units, whose samples are measured independently of each other."""
     if not traces:
         return
     checked_semantics(semantics, [specification])
