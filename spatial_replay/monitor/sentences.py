@@ -1,4 +1,4 @@
-"""Why a result has its verdict: one cause for each named spec that fails in it, and witnesses in words."""
+"""Explain verdicts: one cause for each named spec that fails in a result, and witnesses in words."""
 
 from __future__ import annotations
 
@@ -36,18 +36,16 @@ class Cause:
     """One reason why a result is violated or unknown.
 
     Attributes:
-        spec: the innermost named spec that the conjunct belongs to.
+        spec: innermost named spec that contains the conjunct.
         node: id of the conjunct.
         text: its canonical text.
-        verdict: violated, or unknown.
-        robustness: of the conjunct on the whole log; NaN if not determined.
-        settled_ns: when its violation became certain; None if only the end of the log
-            decided.
-        witness: the atom that decides it: at `settled_ns`, on the samples up to there, or else on the
-            whole log. None if the leaves were not stored, and under the paper's semantics.
-        least: the atom that gives it the robustness of the whole log, where that is less than at
-            `settled_ns`; else None.
-        requirement, title: of the spec ("REQ-12" and its words), or None.
+        verdict: violated or unknown.
+        robustness: robustness of the conjunct on the whole log; NaN if undetermined.
+        settled_ns: time at which its violation became certain; None if only the end of the log decided.
+        witness: witness of the conjunct on the samples up to `settled_ns`; without that time, on the whole
+            log. None if the leaves were not stored, and under the paper's semantics.
+        least: witness of the robustness on the whole log if that is less than at `settled_ns`; else None.
+        requirement, title: id ("REQ-12") and title of the spec's requirement, or None.
     """
 
     spec: str
@@ -63,7 +61,7 @@ class Cause:
 
     @property
     def robustness_witness(self) -> Witness | None:
-        """The atom that its robustness is of."""
+        """The witness of its robustness on the whole log."""
         return self.least or self.witness
 
 
@@ -72,8 +70,8 @@ class LeastPart:
     """The conjunct of a result that has the least robustness.
 
     Attributes:
-        spec: the innermost named spec that it belongs to.
-        name: what to call it: the spec's name or, if that is the first cause's too, its own text, shortened.
+        spec: innermost named spec that contains it.
+        name: its name in sentences: the spec's name or, if the first cause has that name, its shortened text.
         node: its id.
     """
 
@@ -89,7 +87,7 @@ class Conjunct:
 
     Attributes:
         node: its id.
-        spec: the innermost named spec that it belongs to.
+        spec: innermost named spec that contains it.
     """
 
     node: int
@@ -101,8 +99,8 @@ def conjuncts_of(formula: Formula, name: str, node: int = 0) -> tuple[Conjunct, 
     """Split a formula at its conjunctions, through named specs, in the order of the text.
 
     Args:
-        name: what the formula itself is called.
-        node: its id.
+        name: name of the whole formula.
+        node: id of the whole formula.
     """
     specs: dict[int, str] = {}
     conjuncts = []
@@ -128,15 +126,15 @@ def find_causes(
 ) -> tuple[Cause, ...]:
     """Return one cause for each named spec with a conjunct that is not satisfied.
 
-    First come those that were violated for certain before the log ended, by that time; then those that only
-    its end decided, the least robustness first; then unknown ones.
+    Violations that settled before the end of the log come first, by time. Violations that only the end
+    decided follow, the least robustness first. Unknown conjuncts come last.
 
     Args:
-        values: (N,), each node's value on the whole log.
-        final: (N, 2), the ends of each node's interval for the finished log.
+        values: (N,), value of each node on the whole log.
+        final: (N, 2), ends of each node's interval on the finished log.
         settled_ns: (N, 2), see `InstanceStream`.
-        witnesses: returns those of a node: what settled it at a time, or decides it on the whole log, and
-            what gave it its robustness later.
+        witnesses: returns two witnesses of a node, given its settling time: the deciding witness, and the
+            witness of a lower robustness later.
         named: specs by name.
     """
     failing = [conjunct for conjunct in conjuncts if _verdict(final, conjunct.node) is not Verdict.SATISFIED]
@@ -168,10 +166,10 @@ def find_causes(
 def find_least(
     conjuncts: Sequence[Conjunct], values: Floats, final: Floats, first: Cause, whole: str
 ) -> LeastPart | None:
-    """Return the conjunct that has the least robustness; None if that is the first cause.
+    """Return the conjunct with the least robustness; None if the first cause has it.
 
     Args:
-        whole: what the formula itself is called.
+        whole: name of the whole formula.
     """
     least_conjunct = min(conjuncts, key=lambda each: _number(each.node, values, final))
     robustness = _number(least_conjunct.node, values, final)
@@ -183,7 +181,7 @@ def find_least(
 
 
 def settled_time(settled_ns: Integers, node: int) -> int | None:
-    """Return when the violation of a node became certain, or None."""
+    """Return the time at which the violation of a node became certain, or None."""
     at = int(settled_ns[node, 1])
     return None if at == NEVER else at
 
@@ -214,7 +212,7 @@ _ENDS = {
     "max_z": "top edge",
     **dict.fromkeys(("centroid_min_x", "centroid_max_x", "centroid_min_y", "centroid_max_y"), "centroid"),
 }
-"""Coordinates, as sentences name them; every other quantity is named as it is."""
+"""Names of coordinates in sentences; other quantities keep their own names."""
 
 
 def sentences_of(
@@ -226,14 +224,14 @@ def sentences_of(
     has_ended: bool = False,
     least: Witness | None = None,
 ) -> tuple[Sentence, ...]:
-    """Return sentences on why a node has its verdict: what decided it, and what would flip it.
+    """Return sentences on the verdict of a node: the deciding atom, and the change that would flip it.
 
     Args:
-        first_ns: the time that others are counted from.
-        requirement: what its spec stands for, see `requirement_text`.
-        is_open: whether it is pending: samples after those evaluated decide it.
-        has_ended: whether it was pending until the log ended, and is violated for that.
-        least: the atom by which a violation grew after it was settled.
+        first_ns: reference time of the sentences.
+        requirement: requirement of its spec in words (see `requirement_text`).
+        is_open: whether the verdict is pending, so that later samples decide it.
+        has_ended: whether it was pending until the log ended, and is violated because the log ended.
+        least: witness of a lower robustness after a violation had settled.
     """
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
     title += f" for {witness.object}" if witness.object is not None else ""
@@ -284,7 +282,7 @@ def sentences_of(
 
 
 def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -> tuple[Sentence, ...]:
-    """Return sentences on one cause of a verdict: since when, what decided it, and what would flip it."""
+    """Return sentences on one cause: its time, its deciding atom, and the change that would flip it."""
     requirement = requirement_text(cause.requirement, cause.title)
     if cause.witness is not None:
         has_ended = cause.settled_ns is None and cause.verdict is Verdict.VIOLATED
@@ -317,13 +315,13 @@ def verdict_sentence(
     """Return a sentence on the verdict of a result as a whole.
 
     Args:
-        title: what the result is called.
-        ends: of its interval for the finished log.
-        unit: the declared one of these, or "".
-        certain_since: since when it is certain.
-        has_ended: whether it was pending until the log ended, and is violated for that.
-        least: the part that its number is of, if that is another than the first cause.
-        least_at: when the first cause reaches its number, if that is later than what settled it.
+        title: name of the result.
+        ends: ends of its interval on the finished log.
+        unit: declared unit of its robustness, or "".
+        certain_since: time at which the verdict became certain.
+        has_ended: whether it was pending until the log ended, and is violated because the log ended.
+        least: conjunct with the least robustness, if the first cause does not have it.
+        least_at: time at which the first cause reached its least robustness, if it had settled earlier.
     """
     since_parts = (", certain since ", certain_since) if certain_since is not None else ()
     part_text = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
@@ -346,10 +344,10 @@ def verdict_text(
     *,
     is_doubtful: bool = False,
 ) -> str:
-    """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03 m".
+    """Return a verdict with its robustness for a log's metadata: "violated, robustness -0.03 m".
 
     Args:
-        numbers: the robustness, and both ends of its interval.
+        numbers: robustness, lower end and upper end of its interval.
     """
     doubtful = ", doubtful" if is_doubtful else ""
     number = interval_text(*numbers, unit)
@@ -357,16 +355,16 @@ def verdict_text(
 
 
 def divisor_of(atom: Formula) -> float:
-    """Return what `scale` divides the number of an atom by; 1 for others."""
+    """Return the divisor of an atom with `scale`; 1 for other formulas."""
     expression = atom.expression if isinstance(atom, Atom) else None
     return expression.divisor if isinstance(expression, Scaled) else 1.0
 
 
 def amount_text(number: float, atom: Formula, units: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a number of an atom in the unit of the log: what `scale` divided it by is said beside it.
+    """Return a number of an atom in the unit of the log; with `scale`, also the scaled number.
 
     Args:
-        units: those that are declared, see `declared_unit`.
+        units: declared units (see `declared_unit`).
     """
     divisor, number = divisor_of(atom), without_residue(number, atom)
     amount = with_unit(number * divisor, declared_unit(atom, units, is_scaled=False))
@@ -378,10 +376,11 @@ def amount_text(number: float, atom: Formula, units: Mapping[str, str] = Mapping
 def how_text(
     number: float, atom: Formula, units: Mapping[str, str], *, past: bool = False, is_violated: bool = False
 ) -> str:
-    """Return how well an atom holds, as in "fails by 3.2"; arguments as of `amount_text`.
+    """Return how well an atom holds, as in "fails by 3.2"; other arguments as for `amount_text`.
 
     Args:
-        is_violated: whether it decides a violation: one that holds must not.
+        past: whether the text is in the past tense.
+        is_violated: whether the atom decides a violation; an atom that holds then "must not hold".
     """
     outcome = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
     unwanted = "must not hold, and " if is_violated and number >= 0.0 else ""
@@ -392,12 +391,12 @@ def how_text(
 
 
 def uncertain_text(least: str) -> str:
-    """Return what follows the number of an atom that is uncertain: how much it is at least."""
+    """Return the clause with the least amount, for an atom whose number is uncertain."""
     return f", at least {least} with what is uncertain"
 
 
 def without_residue(number: float, atom: Formula) -> float:
-    """Return a number of an atom, but 0 where it is no more than a rounding error."""
+    """Return a number of an atom, or 0 if it is within rounding error."""
     limits = [abs(part.value) for part in iter_parts(atom) if isinstance(part, Number)]
     limits = [limit for limit in limits if math.isfinite(limit)]
     scale = max(limits, default=0.0) or 1.0
@@ -416,7 +415,7 @@ def _permanence_sentence(title: str, verdict: Verdict, since: Instant) -> Senten
 
 
 def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
-    """Return one sentence on what decided a verdict or, for an unknown one, on what was not known."""
+    """Return the reason of a verdict: its deciding atom or, if the verdict is unknown, the unknown values."""
     deciding = witness.deciding
     missed = () if witness.missed is None else missed_sentences(witness, witness.missed, first_ns)
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
@@ -435,7 +434,7 @@ def _join(first: Sentence, *others: Sentence) -> Sentence:
 
 
 def cause_reason(cause: Cause, first_ns: int) -> Sentence:
-    """Return what gave a cause its robustness, and how it began if that was earlier; "" without a witness."""
+    """Return sentences on the robustness of a cause, and on its earlier beginning; "" without a witness."""
     if cause.robustness_witness is None:
         return Sentence("")
     reason = reason_sentence(cause.robustness_witness, first_ns=first_ns)
@@ -445,7 +444,7 @@ def cause_reason(cause: Cause, first_ns: int) -> Sentence:
 
 
 def _first_failure(settled: Witness, first_ns: int) -> Sentence:
-    """Return a sentence on the sample that settled a violation, which grew later."""
+    """Return a sentence on the sample that settled a violation, for a violation that grew later."""
     amount, deciding = with_unit(abs(settled.upper), settled.unit), settled.deciding
     if deciding is not None and math.isfinite(deciding.value):
         amount = amount_text(abs(deciding.value), deciding.atom, settled.units)
@@ -456,10 +455,7 @@ def _first_failure(settled: Witness, first_ns: int) -> Sentence:
 
 
 def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) -> tuple[Sentence, ...]:
-    """Return sentences on a response that did not follow its condition.
-
-    The response and what came closest to it are first, what the condition was measured by is last.
-    """
+    """Return sentences on a missed response: the response, its closest atom, and the condition's atom."""
     clause = _missed_clause(missed, first_ns)
     deciding, closest = witness.deciding, []
     if witness.closest is not None:
@@ -505,7 +501,7 @@ def _how_it_decides(
 
 
 def measurement_clause(deciding: DecidingAtom, units: Mapping[str, str], first_ns: int) -> Sentence:
-    """Return a clause on what decided an atom, without a full stop."""
+    """Return a clause on the measurements of an atom, without a full stop."""
     if any(is_text_number(number.value) for number in deciding.measured):
         signal, sign, text = deciding.atom.parameters
         is_equal = (deciding.value > 0.0) == (sign == "==")
@@ -519,7 +515,7 @@ def measurement_clause(deciding: DecidingAtom, units: Mapping[str, str], first_n
 
 
 def _change(measured: Measured, units: Mapping[str, str], first_ns: int) -> Sentence:
-    """Return by how much something changed between two reports, and at which rate."""
+    """Return a clause on a change between two reports, with its amount and rate."""
     before_ns, now_ns = measured.reports_ns or (0, 0)
     names, signal_name = measured.names, measured.names[0] if measured.quantity == "rate" else ""
     change = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(signal_name, ""))
@@ -538,7 +534,7 @@ def _end(deciding: DecidingAtom) -> float:
 
 
 def _in_time(witness: Witness) -> str:
-    """Name the temporal operator that chose the sample."""
+    """Name the innermost temporal operator of the path, in parentheses."""
     for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
             return f" (within `{_step_title(witness, place)}`)"
@@ -546,7 +542,7 @@ def _in_time(witness: Witness) -> str:
 
 
 def _step_title(witness: Witness, place: int) -> str:
-    """Return what a step of a path is called: its name, its text, or the name around a text that is long."""
+    """Return the name or the text of a path's step; for a long text, the innermost name around it."""
     step = witness.path[place]
     names = [node.name for node in witness.path[: place + 1] if node.name]
     if step.name or shortened_formula(step.text) == step.text or not names:
@@ -555,7 +551,7 @@ def _step_title(witness: Witness, place: int) -> str:
 
 
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
-    """Name it, and say that the atom is greatest or least within it, where that is so."""
+    """Name the operator within which an atom is greatest or least; else as `_in_time`."""
     passed: set[str] = set()
     # one sample may settle a failing G or a holding F, and later ones may be more extreme
     unsure = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
@@ -653,14 +649,14 @@ def _flip(
 
 
 def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
-    """Return whether only a distance below 0 would flip a verdict, which is a depth of overlap."""
+    """Return whether only a distance below 0, a depth of overlap, would flip a verdict."""
     is_distance = deciding.atom.relation in ("dist", "closeto", "farfrom") and threshold.is_written
     is_settled = threshold.verdict is not Verdict.UNKNOWN
     return is_distance and is_settled and threshold.flips_at < 0.0 <= threshold.value
 
 
 def _limit(threshold: Threshold) -> str:
-    """Return which numbers flip a verdict, instead of the one that is written."""
+    """Return the numbers that flip a verdict instead of the written number."""
     number, value = format_number(threshold.flips_at), format_number(threshold.value)
     is_more = threshold.flips_at > threshold.value
     if threshold.is_exact:
@@ -671,7 +667,7 @@ def _limit(threshold: Threshold) -> str:
 
 
 def _place(deciding: DecidingAtom, threshold: Threshold) -> str:
-    """Return where the number is written that would flip a verdict."""
+    """Return the place of the number that would flip a verdict: a constant or an atom."""
     return f"for `{threshold.constant}`" if threshold.constant else f"in `{deciding.text}`"
 
 
@@ -685,9 +681,9 @@ def _unknown_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int) -
 
 
 def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
-    """Return in how many samples an object or a signal is missing, or where the samples pause.
+    """Return a sentence on the missing samples of an object or signal, or on a pause of the samples.
 
-    If the window of a replay can leave that out, name the window.
+    It names the options of a replay that leave the missing samples out, if there are any.
     """
     begin_ns, end_ns = gap.longest_ns
     length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"
@@ -721,7 +717,7 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
 
 
 def open_text(witness: Witness) -> str:
-    """Return between which numbers an atom lies whose uncertainty leaves a verdict open; "" if none does."""
+    """Return the bounds of the atom whose uncertainty leaves a verdict open; "" for other verdicts."""
     deciding = witness.deciding
     if witness.verdict is not Verdict.UNKNOWN or deciding is None or deciding.unknown:
         return ""
@@ -742,7 +738,7 @@ def _uncertain_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int)
 
 
 def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
-    """Name what leaves the robustness open, where the verdict is known."""
+    """Return a sentence on the atom that leaves the robustness open, for a known verdict."""
     instant = Instant(time_ns, first_ns)
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)

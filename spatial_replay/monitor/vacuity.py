@@ -1,4 +1,4 @@
-"""Tests of a verdict: parts that decided nothing, windows that the end of the log cut short."""
+"""Find untested parts of a formula, and windows that the end of the log cuts short."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ from spatial_replay.text import (
 )
 
 Tested: TypeAlias = Literal["full", "cut", "nothing"]
-"""By how much of the log a verdict was tested; see `SpecResult.tested`."""
+"""By how much of the log a verdict was tested (see `SpecResult.tested`)."""
 Reason: TypeAlias = Literal[
     "empty window",
     "antecedent never held",
@@ -87,14 +87,14 @@ class UntestedPart:
     Attributes:
         node: its id; None for a template without instances.
         text: its canonical text.
-        reason: "empty window": no sample lies in the window of an operator, wherever it counts. "antecedent
-            never held": of an implication, in any of its spellings. "no members": an open group is empty.
-            "past the end": the result is infinite, because its deciding part looks past an end of the log.
-            "no rate": it is infinite, because its deciding part leaves all samples or members out.
-            "no instances": no object fits a template. "cut window": it decides at a sample whose window ends
-            after the log.
+        reason: "empty window": an operator's window has no sample, at each sample where the operator counts.
+            "antecedent never held": the part is an implication, in any spelling. "no members": an open group
+            is empty. "past the end": the result is infinite, because the deciding part looks beyond the log.
+            "no rate": the result is infinite, because the deciding part leaves all samples or members out.
+            "no instances": no object fits a template. "cut window": the part decides at a sample whose window
+            ends after the log.
         message: a sentence.
-        time_ns: the sample at which it decides; None where it decides at none.
+        time_ns: time of the sample at which it decides; None if it decides at no sample.
     """
 
     node: int | None
@@ -113,9 +113,9 @@ def idle_templates(
     """Return the templates without instances: no object fits them, so they decided nothing.
 
     Args:
-        evaluated: the formulas that have a result.
-        each: the objects that parameters stand for, such as "class:person".
-        classes: of the log.
+        evaluated: formulas that have a result.
+        each: choice of objects for each template parameter, such as "class:person".
+        classes: classes of the log.
     """
     untested, evaluated_ids = [], {id(formula) for formula in evaluated}
     for spec in specs:
@@ -137,11 +137,11 @@ def find_vacuous(
     """Return the parts of an instance's formula that decided nothing, in the order of the text.
 
     Args:
-        evidence: the samples that it was evaluated over.
-        leaves: (C, A, T), its leaves in them.
+        evidence: evidence of the instance.
+        leaves: (C, A, T), leaves of the instance.
         times_ns: (T,), T at least 1.
-        infinite: the end that decides an infinite robustness at the first sample: the lower one of inf, the
-            upper one of -inf.
+        infinite: deciding end of an infinite robustness: the lower end for inf, the upper end for -inf. None
+            for a finite robustness.
     """
     instance = evidence.instance
     if infinite is None and not _may_decide_nothing(instance):
@@ -176,9 +176,9 @@ def find_vacuous(
 
 @lru_cache(maxsize=256)
 def _may_decide_nothing(instance: Instance) -> bool:
-    """Return whether a part of a formula decides nothing in some log.
+    """Return whether a part of a formula can be untested in some log.
 
-    That needs a window that may be empty, an implication, a quantifier or an open group.
+    Such a formula has a window that may be empty, an implication, a quantifier, or an open group.
     """
     nodes = nodes_of(instance.formula)
     leaves = [substitute(leaf, instance.bindings) for leaf in instance.program.leaves]
@@ -190,12 +190,12 @@ def _may_decide_nothing(instance: Instance) -> bool:
 
 
 def _may_be_empty(node: Temporal) -> bool:
-    """Return whether the window of an operator may have no sample: without a gap, it has its own sample."""
+    """Return whether an operator's window may be empty: it does not include the operator's own sample."""
     return node.operator in _NEXT or (node.bound is not None and node.bound.lower > 0)
 
 
 class _Idle(NamedTuple):
-    """A part that was not tested, and the rest of the sentence that begins with its text."""
+    """An untested part; `what` continues the sentence that begins with its text."""
 
     node: int
     reason: Reason
@@ -212,17 +212,17 @@ def _part(idle: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
 
 
 class _Implications(NamedTuple):
-    """A formula in which each implication is written with `->`; its numbers are the same.
+    """A formula in which each implication is written with `->`, with the same numbers.
 
     Attributes:
-        nodes: for each of its nodes, the id of the node as written that it stands for.
+        nodes: for each of its nodes, the id of the original node that it stands for.
     """
 
     formula: Formula
     nodes: tuple[int, ...]
 
     def by_node(self, scopes: Sequence[_Samples], count: int) -> list[_Samples]:
-        """Return for each of `count` nodes as written the samples (T,) of the nodes that stand for it."""
+        """Return for each of `count` original nodes the samples (T,) of the nodes that stand for it."""
         samples_by_node = [np.zeros(len(scopes[0]), np.bool_) for _ in range(count)]
         for node, scope in zip(self.nodes, scopes, strict=True):
             samples_by_node[node] |= scope
@@ -232,12 +232,13 @@ class _Implications(NamedTuple):
 def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
     """Write `->` for each implication of a formula.
 
-    `not a or b` and `not (a and not b)` are `a -> b`. In `not (a and b)` each part is a condition for the
-    other: it is `(a or b) -> not (a and b)`. `not F p` is `G not p`.
+    `not a or b` and `not (a and not b)` become `a -> b`. In `not (a and b)` each part is a condition for the
+    other, so it becomes `(a or b) -> not (a and b)`. `not F p` is treated like `G not p`.
 
     Args:
-        node: its id as written.
-        sign: 1 if it has to hold, -1 if it must not, 0 if neither, as for a goal. The last is none.
+        node: id of the original formula.
+        sign: 1 if the formula has to hold, -1 if it must not hold, 0 for neither, as in a goal. A formula
+            with sign 0 is not an implication.
     """
     operands = list(_operands_with_ids(formula, node))
     operator = operator_of(formula)
@@ -294,9 +295,9 @@ def _without_negation(formula: Formula, node: int) -> tuple[Formula, int]:
 
 
 _GOALS = frozenset({("F", 0), ("O", 0), ("U", 1), ("S", 1), ("W", 1), ("R", 0)})
-"""Operators and the places of their operands that hold in some sample, not in all."""
+"""Operators, and places of their operands that need to hold at only one sample."""
 _EVERYWHERE = frozenset({"F", "G", "U", "R", "W", "O", "H", "S"})
-"""Operators over several samples."""
+"""Operators whose windows have several samples."""
 
 
 def _body(node: Quantified) -> Formula:
@@ -323,7 +324,7 @@ def _join_implications(
 
 
 class _Holding:
-    """In which samples (T,) each condition holds or may hold, computed once."""
+    """The samples (T,) at which each condition may hold, computed once."""
 
     def __init__(self, instance: Instance, leaves: Floats, times_ns: Integers) -> None:
         self._order = instance.program.leaves
@@ -359,10 +360,10 @@ def _scopes(
 ) -> list[_Samples]:
     """Return for each node the samples (T,) at which the number of the formula depends on it.
 
-    Samples that an operator leaves out, because a rate has no value there, are not among them.
+    Samples are excluded if an operator leaves them out because a rate has no value.
 
     Args:
-        is_conditional: only those at which the verdict depends on a node, where antecedents may hold.
+        is_conditional: whether consequents count only at samples where their antecedents may hold.
     """
     tree = nodes_with_operands(formula)
     # the verdict is the number of the root at the first sample
@@ -382,7 +383,7 @@ def _scopes(
 
 
 def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) -> _Samples:
-    """Return the samples at which an operand counts, if its operator does so in the samples of `scope`."""
+    """Return the samples at which an operand counts, given the samples `scope` of its operator."""
     begin, end = windows(formula)
     counting = np.flatnonzero(scope & (begin < end))
     begin, end = begin[counting], end[counting]
@@ -412,11 +413,11 @@ def _empty_windows(
     windows: _Windows,
     evidence: Evidence,
 ) -> Iterator[_Idle]:
-    """Find the operators whose windows are empty in all samples at which they count.
+    """Find operators whose windows are empty at all samples where they count.
 
     Args:
-        scopes: for each node, the samples at which the robustness depends on it.
-        active: for each node, the samples at which the verdict depends on it, because conditions hold.
+        scopes: samples at which the robustness depends on each node.
+        active: samples at which conditions hold, so that the verdict depends on each node.
     """
     for identifier, (node, scope, active_scope) in enumerate(zip(nodes, scopes, active, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
@@ -461,7 +462,7 @@ def _untested_implication(
 
 
 def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence) -> Iterator[_Idle]:
-    """Find implications in the bodies of quantifiers, whose antecedent held for none of the members."""
+    """Find implications in bodies of quantifiers whose antecedent never held for any member."""
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Quantified) or not scope.any():
             continue
@@ -478,9 +479,9 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
-    """Yield each implication in a quantifier's body, with the formula that its antecedent ever holds.
+    """Yield each implication in a quantifier's body, with the formula that its antecedent holds for a member.
 
-    Within the consequent of another one, which is said as well, both antecedents have to hold.
+    For an implication in another one's consequent, both antecedents have to hold; the flag is then True.
     """
     stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
     while stack:
@@ -528,7 +529,7 @@ def _empty_groups(
 
 
 def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
-    """Yield the open groups that a leaf is about, as they are for any binding of its variables."""
+    """Yield the open groups of a leaf; groups do not exclude variables, so that they fit any binding."""
     for term in map(standing, iter_terms([formula])):
         group = term.term if isinstance(term, Earlier) else term
         if isinstance(group, Group) and group.members is None:
@@ -540,7 +541,7 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
 
 
 def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence) -> bool:
-    """Return whether the last operator of a path leaves out all samples of its window, or all members."""
+    """Return whether the last operator of a path leaves out all its samples or all its members."""
     node, sample = path.steps[-1]
     formula, operands = nodes.tree[node]
     if isinstance(formula, Quantified):
@@ -556,7 +557,7 @@ def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence)
 
 
 def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idle]:
-    """Yield why a result is infinite, from the node that its number is of."""
+    """Yield the reason of an infinite result, from its deciding node."""
     if leaves_out(node):
         member = "object in its group" if isinstance(node, Quantified) else "sample in its window"
         predicate = ("decides at ", instant, f", where no {member} has a rate.")
@@ -576,7 +577,7 @@ def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idl
 
 
 def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Sentence, ...]:
-    """Return remarks on the goals of a formula (`F`) that hold in its first sample already."""
+    """Return remarks on the goals (`F`) of a formula that already hold at the first sample."""
     order = evidence.instance.program.leaves
     sentences: list[Sentence] = []
     waiting = [evidence.instance.formula]
@@ -602,15 +603,15 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
 # ------------------------------------------------------------------------------------- tested by nothing
 
 _UNKNOWN: Final = Atom("", "signal", Signal("\0"))
-"""An atom that is unknown in every log, since none has such a signal."""
+"""An atom that is unknown in every log, because no log has such a signal."""
 
 
 def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict) -> bool:
-    """Return whether a verdict stays the same whatever the leaves are.
+    """Return whether a verdict is the same for all values of the leaves.
 
-    Leaves in antecedents keep their numbers where it is satisfied: if no antecedent held, nothing was tested.
-    Leaves over an open group keep them where the group is empty. Whether a rate has a value is always known:
-    samples that are left out test nothing.
+    For a satisfied verdict, leaves in antecedents keep their numbers: if no antecedent held, nothing was
+    tested. Leaves over an open group keep their numbers where the group is empty. Conditions that a rate has
+    a value keep theirs, because samples that are left out test nothing.
 
     Args:
         leaves: (C, A, T), the leaves of the instance's formula.
@@ -653,7 +654,10 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 
 
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
-    """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers, empty groups, rates."""
+    """Return unknown leaves (2, A, T).
+
+    Only antecedents in quantifiers, leaves of empty groups and rate conditions are known.
+    """
     low, high = low_and_high(len(leaves), wide=True)
     unknown_leaves = roomy((2, *leaves.shape[1:]), np.float64)
     unknown_leaves[0], unknown_leaves[1] = -np.inf, np.inf
@@ -672,7 +676,7 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
 
 
 def _without_tests(formula: Formula) -> Formula:
-    """Return a quantifier whose body has unknown atoms, but for those in antecedents."""
+    """Return a quantifier with unknown atoms in its body, except in antecedents."""
     match formula:
         case Atom():
             return _UNKNOWN
@@ -693,10 +697,10 @@ def _without_tests(formula: Formula) -> Formula:
 def find_cut_window(
     evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict
 ) -> UntestedPart | None:
-    """Return the operator whose window ends after the log and thereby decides a verdict; None if none does.
+    """Return the operator whose cut window decides a verdict; None if no cut window does.
 
-    Samples beyond the end of the log may be anything there, within the windows of operators with an upper
-    bound and for X. All other operators end with the log.
+    Windows with an upper bound, and that of X, may see any samples beyond the end of the log. All other
+    operators end with the log.
 
     Args:
         leaves: (C, A, T), the leaves of the instance's formula.
@@ -714,7 +718,7 @@ def find_cut_window(
     ranks = _rank_by_verdict(cut_nodes, whole_nodes, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
-    # ranks 1 and -1: a cut window decides, and a whole one would not
+    # rank 1 or -1: decided by the cut window, but not by the whole one
     decided = [step for step in cut if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}]
     step = decided[-1] if decided else path.steps[0]
     return _part(_cut(step, nodes[step.node], times_ns, evidence), nodes[step.node], evidence)
@@ -725,7 +729,7 @@ def _is_cut_at(node: Formula, sample: int, times_ns: Integers) -> bool:
 
 
 def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) -> _Idle:
-    """Return that a window is cut at a sample, and how far it reaches beyond the log."""
+    """Return the cut window of a node at a sample, with its length beyond the log."""
     identifier, sample = step.node, step.sample
     instant = Instant(int(times_ns[sample]), evidence.first_ns())
     bound = node.bound if isinstance(node, Temporal) else None
@@ -753,9 +757,9 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
 
 
 def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> OfflineNodes:
-    """Return nodes by verdict instead of by number: decided by whole windows, by cut ones, or not decided.
+    """Return nodes with ranks as numbers: decided by whole windows, only by cut windows, or undecided.
 
-    Ranks go through minima, maxima and negations as numbers do, so that a path by them leads to a cut window.
+    Minima, maxima and negations preserve the order of ranks, so their deciding path ends at a cut window.
     """
     holds = np.greater if is_violated else np.greater_equal
     end_pairs = [
