@@ -481,7 +481,7 @@ class SpecResult(Displayed):
         Raises:
             UsageError: the semantics is the paper's, or the leaves were not stored.
         """
-        leaves = self._leaves("what decides a verdict")
+        leaves = self._leaves("the deciding node")
         nodes = evaluate_offline(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
         return deciding_path(nodes, 0, End.of(final_verdict(*nodes.interval(0)))).steps[-1].node
 

@@ -460,7 +460,7 @@ class LiveStream:
         """
         room = self._leaves.room
         if not (room.channels and self._is_online):
-            raise UsageError("no sample has been evaluated, or under the paper's semantics; add a sample")
+            raise UsageError("leaves need an evaluated sample and the semantics 'ltlf'; add a sample")
         return room.leaves[: room.channels, self._leaf_ranges[place]].copy()
 
     def _extend_apart(self, sample: Sample) -> list[Floats | None]:
