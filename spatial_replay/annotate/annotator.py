@@ -21,8 +21,9 @@ from spatial_replay.annotate.deciding_leaf import NewestSamples, leaf_pairs
 from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_occurrence
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
+from spatial_replay.annotate.scene.extent import SceneBounds, map_area
 from spatial_replay.annotate.scene.scene_frames import SceneFrames
-from spatial_replay.annotate.scene.scene_template import SceneBounds, encode_frame
+from spatial_replay.annotate.scene.scene_template import encode_frame
 from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.standing import StandingEncoder
@@ -119,9 +120,6 @@ class Annotator:
     """Encodes the results of an evaluation as messages, sample after sample.
 
     Cutting the samples into blocks changes no message.
-
-    Attributes:
-        extent: of all footprints so far; None before any.
     """
 
     def __init__(
@@ -169,7 +167,6 @@ class Annotator:
         requirements = [requirement for result in self._results for requirement in result.requirements]
         named = frozenset(name for requirement in requirements for name in requirement.objects)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
-        self.extent: SceneBounds | None = None
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self.standing.zero_ns = self._scene.zero_ns
@@ -181,6 +178,15 @@ class Annotator:
     def scene(self) -> SceneState:
         """State of a viewer after the messages so far."""
         return self._scene
+
+    @property
+    def extent(self) -> SceneBounds | None:
+        """The box of all footprints so far, and of the planner's map; None before any."""
+        return self._scene.extent.bounds
+
+    def add_map(self, plan: Mapping[str, str]) -> None:
+        """Add the area of a planner's map to the extent, by the metadata of its plan."""
+        self._scene = replace(self._scene, extent=self._scene.extent.with_area(map_area(plan)))
 
     @property
     def has_samples(self) -> bool:
@@ -207,7 +213,6 @@ class Annotator:
         Args:
             blocks: their evaluation, one for each tree.
         """
-        self.extent = SceneBounds.of(trace, self.extent)
         if not len(trace):
             return []
         self._find_zero(trace)

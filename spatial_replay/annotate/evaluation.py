@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from spatial_replay.annotate.annotator import Annotator
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.foxglove_layout import LayoutContents
+    from spatial_replay.annotate.scene.extent import SceneBounds
     from spatial_replay.annotate.scene.scene_frames import SceneFrames
-    from spatial_replay.annotate.scene.scene_template import SceneBounds
     from spatial_replay.annotate.scene.scene_update import SceneState
 
 _MOST_NAMED: Final = 10
@@ -54,6 +54,7 @@ class AnnotatedEvaluation:
         show: Callable[[SceneFrames], None] = lambda frames: None,
         arrow: str = "",
         units: Mapping[str, str] = MappingProxyType({}),
+        plan: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Start before the first sample.
 
@@ -64,6 +65,7 @@ class AnnotatedEvaluation:
             show: takes what the messages of the scene show.
             arrow: the title of the result whose violation the scene points at; "" for the first one.
             units: those that are declared, see `unit_of`.
+            plan: the metadata of the plan that the log was recorded with, whose map the scene has room for.
 
         Raises:
             UsageError: no result has that title.
@@ -73,7 +75,7 @@ class AnnotatedEvaluation:
         self._compiled_before = compiled_before
         self._known = known
         self._show = show
-        self._arrow, self.units = arrow, units
+        self._arrow, self.units, self._plan = arrow, units, plan
 
         self._evaluations = [
             EvaluationStream(file_instances, file.regions, semantics)
@@ -216,4 +218,6 @@ class AnnotatedEvaluation:
     @cached_property
     def annotator(self) -> Annotator:
         """The encoder of messages beside samples, which takes in what `extend` returns for these."""
-        return self.new_annotator(arrow=self._arrow)
+        annotator = self.new_annotator(arrow=self._arrow)
+        annotator.add_map(self._plan)
+        return annotator

@@ -10,8 +10,9 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from spatial_replay.annotate.robustness import curved_nodes
+from spatial_replay.annotate.scene.extent import VIEW, SceneBounds
 from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
-from spatial_replay.annotate.scene.scene_template import FRAMES, SceneBounds
+from spatial_replay.annotate.scene.scene_template import FRAMES
 from spatial_replay.annotate.specification import FOOTPRINT_UNITS, MIXED, ReportedTree, unit_of, unit_words
 from spatial_replay.annotate.standing import FinalStanding, part_title
 from spatial_replay.logs.messages import Attachment
@@ -320,10 +321,6 @@ def _quote(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-_MARGIN = 1.5
-"""The height of the picture by the size of what is in it; a panel may be narrower than it is high."""
-
-
 class TextZero(NamedTuple):
     """The time that texts count from, and the one that the axes of a viewer do.
 
@@ -593,7 +590,7 @@ def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
 def _camera(extent: SceneBounds | None) -> dict[str, Any]:
     """Return a camera that looks straight down and fits the box."""
     box = extent or SceneBounds(-1.0, -1.0, 1.0, 1.0)
-    distance = _MARGIN * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
+    distance = VIEW * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
     return {
         "perspective": False,
         "distance": distance,

@@ -232,6 +232,7 @@ class Recording:
             self._doubts = tuple(data)
         if name == PLAN_METADATA:
             self._plan = dict(data)
+            self._evaluation.annotator.add_map(data)
 
     def end(self, end: RunEnd = _WHOLE) -> None:
         """Write the records after the last sample; the certificate equals the certificate of a replay."""

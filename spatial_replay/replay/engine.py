@@ -355,6 +355,7 @@ class Replay:
             show=show,
             arrow=options.arrow,
             units=source.axes.units,
+            plan=plan_of(source),
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
@@ -631,14 +632,19 @@ _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
 """Prefixes of the attachments that a replay replaces."""
 
 
+def plan_of(source: Source) -> Mapping[str, str]:
+    """Return the metadata of the plan that a log was recorded with; empty without any."""
+    return dict(source.metadata()).get(PLAN_METADATA, {})
+
+
 def planned_result(source: Source) -> str:
     """Return the name of the result that a planner worked for; "" without any."""
-    return dict(source.metadata()).get(PLAN_METADATA, {}).get("specification", "")
+    return plan_of(source).get("specification", "")
 
 
 def planned_for(source: Source, files: Sequence[Specification]) -> str:
     """Return the name of the file that decisions were made for, if none of these says the same; else ""."""
-    name = dict(source.metadata()).get(PLAN_METADATA, {}).get("file", "")
+    name = plan_of(source).get("file", "")
     recorded = {
         attachment.name: attachment.data.decode("utf-8", "replace") for attachment in source.attachments()
     }

@@ -21,8 +21,8 @@ from spatial_replay.annotate.annotator import shown_regions
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
 from spatial_replay.annotate.robustness import encode_curves
-from spatial_replay.annotate.scene.scene_template import SceneBounds
-from spatial_replay.annotate.scene.scene_update import scene_start
+from spatial_replay.annotate.scene.extent import SceneBounds, SceneExtent, map_area
+from spatial_replay.annotate.scene.scene_update import SceneState, scene_start
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
@@ -37,7 +37,7 @@ from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import (
     Replayed,
     dropped_samples,
-    planned_result,
+    plan_of,
     replayed_specs,
     with_stretches,
 )
@@ -246,7 +246,7 @@ class LoadedLog:
         doubts: assumptions that the log contradicts.
         missing: a warning for each name in the specifications that the log never has.
         dropped: the samples that its recorder had no time for.
-        planned: the name of the result that a planner worked for; "" without any.
+        plan: the metadata of the plan that it was recorded with; empty without any.
     """
 
     def __init__(
@@ -295,7 +295,7 @@ class LoadedLog:
             raise selection.nothing_to_evaluate(self.faults)
         self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
-        self.planned = planned_result(source)
+        self.plan = plan_of(source)
         self.first_ns = log_zero_ns(source, options.window, ends)
         self.doubts = distinct_doubts(doubts, self.first_ns)
         self._needs, self._has_spans = ends.needs, ends.has_spans
@@ -521,10 +521,13 @@ class Evaluated:
     def layout(self) -> Attachment:
         """The viewer layout for a server of this log."""
         topics = {channel.topic for channel in self.loaded.own.channels}
-        contents = self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics)
+        extent = SceneBounds.of(self.loaded.inside, map_area(self.loaded.plan))
+        contents = self.evaluation.contents(extent, topics)
         order = worst_first(self.replayed.results)
         zero = TextZero(self.loaded.first_ns, int(self.loaded.inside.times_ns[0]), "this playback")
-        contents = contents._replace(order=order, zero=zero, planned=self.loaded.planned)
+        contents = contents._replace(
+            order=order, zero=zero, planned=self.loaded.plan.get("specification", "")
+        )
         return layout_attachment(contents, live=True)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
@@ -618,11 +621,17 @@ class Playback:
         self.evaluated = evaluated
         self.arrow = ""
         self._regions = shown_regions(evaluated.edited.files)
-        self._start = scene_start(evaluated.loaded.inside, self._regions, evaluated.loaded.first_ns)
+        self._start = self._scene_start()
         self._annotator = evaluated.evaluation.new_annotator(self._start)
         self._own = MessageCursor(log_messages, self.start_ns)
         self._next = 0
         self._has_ended = False
+
+    def _scene_start(self) -> SceneState:
+        """Return the state of the scene before its first message."""
+        loaded = self.evaluated.loaded
+        start = scene_start(loaded.inside, self._regions, loaded.first_ns)
+        return replace(start, extent=SceneExtent().with_area(map_area(loaded.plan)))
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -646,9 +655,9 @@ class Playback:
         sample = max(self._next - 1, 0)
         regions = shown_regions(self.evaluated.edited.files)
         if regions != self._regions:
-            loaded = self.evaluated.loaded
-            self._start, self._regions = scene_start(loaded.inside, regions, loaded.first_ns), regions
-        scene = replace(self._annotator.scene, written_ns=None, last={}, top=self._start.top)
+            self._regions = regions
+            self._start = self._scene_start()
+        scene = replace(self._annotator.scene, written_ns=None, last={}, extent=self._start.extent)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
         before = merge(self._annotator.pass_over(*self.evaluated.part(0, sample), _MOST_CHANGES))

@@ -6,7 +6,9 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -148,6 +150,16 @@ def test_a_planned_run_opens_on_the_planned_result_and_its_decisions(tmp_path, c
     tabs = config["Tab!details"]
     assert tabs["tabs"][tabs["activeTabIdx"]]["layout"] == "RawMessages!decision"
     assert config["RawMessages!automaton"]["foxglovePanelTitle"] == "Automaton of push"
+    camera = config["3D!scene"]["cameraState"]
+    with log.open("rb") as stream:
+        maps = [record.data for *_, record in make_reader(stream).iter_messages(["/plan/gradient_map"])]
+    for grid in map(Grid.FromString, maps):
+        low = np.array([grid.pose.position.x, grid.pose.position.y])
+        cells = np.array([grid.column_count, len(grid.data) // grid.row_stride])
+        high = low + cells * grid.cell_size.x
+        # axes and the colour bar beside the map take a fifth
+        reach = np.abs([low, high] - np.array(camera["targetOffset"][:2])).max()
+        assert 1.2 * reach <= camera["distance"] / 2.0
     capsys.readouterr()
     assert run_command(["info", str(log), "--layout", "--panels"]) == 0
     config = json.loads(capsys.readouterr().out)["configById"]
@@ -303,7 +315,7 @@ def test_a_curve_is_labelled_with_the_id_of_its_requirement(tmp_path):
 def test_the_camera_looks_at_everything_from_above(tmp_path):
     camera = layout_of(run(tmp_path, TEXT))["configById"]["3D!scene"]["cameraState"]
     assert camera["target"] == [0, 0, 0]
-    assert camera["targetOffset"] == pytest.approx([5, 1, 0])
+    assert camera["targetOffset"] == pytest.approx([5.5, 1.5, 0])
     assert camera["phi"] == 0
     assert camera["distance"] >= 10
 

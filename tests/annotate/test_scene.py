@@ -417,15 +417,6 @@ def test_an_arrow_with_its_number_points_at_the_worst_violation():
     assert begin[1] == end[1]
 
 
-@given(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0), st.floats(0.05, 3.0))
-def test_the_label_of_an_arrow_stands_off_the_objects_that_it_joins(x, y, side):
-    there = Footprint.box(x, y, x + side, y + side)
-    for message in pointed("spec s = G (a dist b >= 99)", {"a": box_at(0.0), "b": there}):
-        label = entity(message, "witness").texts[-1].pose.position
-        lines = [ring.points for name in ("object/a", "object/b") for ring in entity(message, name).lines]
-        assert all(not min(p.y for p in ring) <= label.y <= max(p.y for p in ring) for ring in lines)
-
-
 def test_a_name_stands_below_an_object_that_is_too_small_for_it():
     [message] = pointed(
         "spec s = G (a dist big >= 0)",

@@ -27,60 +27,85 @@ TEXTS = {
 }
 
 
-def scenes(seed: int, count: int = 125) -> sr.Trace:
-    """Samples of boxes and discs of all sizes, anywhere; the first fills the whole scene."""
+def scenes(seed: int, count: int = 125, *, grows: bool = False) -> sr.Trace:
+    """Samples of boxes and discs of all sizes, anywhere; the first fills the scene, or the scene grows."""
     draw = np.random.default_rng(seed)
 
-    def outline() -> sr.Footprint:
-        x, y = draw.uniform(0.0, 40.0, 2)
-        side, other = draw.choice([0.2, 1.0, 4.0, 15.0], 2)
+    def outline(room: float) -> sr.Footprint:
+        x, y = draw.uniform(0.0, 40.0, 2) * room
+        side, other = draw.choice([0.2, 1.0, 4.0, 15.0], 2) * room
         return (
             sr.Footprint.disc(x, y, side)
             if draw.random() < 0.3
             else sr.Footprint.box(x, y, x + side, y + other)
         )
 
-    first = {name: sr.Footprint.box(0.0, 0.0, 40.0, 40.0) for name in NAMES}
+    rooms = np.linspace(0.02, 1.0, count) if grows else np.ones(count)
+    first = {name: sr.Footprint.box(0.0, 0.0, *2 * [40.0 * rooms[0]]) for name in NAMES}
     samples = [sr.Sample(0, first)]
-    samples += [sr.Sample(10**8 * time, {name: outline() for name in NAMES}) for time in range(1, count + 1)]
+    samples += [
+        sr.Sample(10**8 * time, {name: outline(room) for name in NAMES})
+        for time, room in enumerate(rooms.tolist(), 1)
+    ]
     return sr.Trace.from_samples(samples)
 
 
-def name_box(text: str, x: float, y: float) -> shapely.Polygon:
+def name_box(text: str, x: float, y: float, scene: shapely.Polygon) -> shapely.Polygon:
     """The box of a name, a twentieth of the scene high."""
-    return shapely.box(x - len(text) / 2.0, y - 1.0, x + len(text) / 2.0, y + 1.0)
+    line = size_of(scene) / 20.0
+    half = len(text) * line / 4.0
+    return shapely.box(x - half, y - line / 2.0, x + half, y + line / 2.0)
+
+
+def size_of(scene: shapely.Polygon) -> float:
+    xmin, ymin, xmax, ymax = scene.bounds
+    return max(xmax - xmin, ymax - ymin)
 
 
 def shape_of(entity: SceneEntity) -> shapely.Polygon:
     return shapely.union_all([shapely.Polygon([(p.x, p.y) for p in line.points]) for line in entity.lines])
 
 
+@pytest.mark.parametrize("grows", [False, True], ids=["whole", "growing"])
 @pytest.mark.parametrize("text", TEXTS.values(), ids=list(TEXTS))
-def test_names_cover_no_deciding_object_and_no_other_name(text: str) -> None:
-    source = MemorySource(scenes(seed=len(text)), "run")
-    file = sr.parse_specification(f"group robots = all\nregion dock = box(0, 0, 40, 25)\n{text}")
+def test_names_cover_no_deciding_object_and_no_other_name(text: str, *, grows: bool) -> None:
+    source = MemorySource(scenes(seed=len(text), count=60 if grows else 125, grows=grows), "run")
+    regions = "" if grows and "dock" not in text else "region dock = box(0, 0, 40, 25)\n"
+    file = sr.parse_specification(f"group robots = all\n{regions}{text}")
     with TemporaryDirectory() as folder:
         output = Path(folder) / "annotated.mcap"
         run_replay(source, [file], output=output)
         with output.open("rb") as stream:
             messages = [
-                SceneUpdate.FromString(each.data) for *_, each in make_reader(stream).iter_messages([SCENE])
+                SceneUpdate.FromString(record.data)
+                for *_, record in make_reader(stream).iter_messages([SCENE])
             ]
-    pointing = [{each.id: each for each in message.entities} for message in messages]
-    pointing = [entities for entities in pointing if "witness" in entities]
-    assert len(pointing) >= 120
-    for entities in pointing:
-        assert [key for key, each in entities.items() if each.texts] == ["witness"]
+    scene, pointing_count = shapely.Polygon(), 0
+    for message in messages:
+        entities = {entity.id: entity for entity in message.entities}
+        shapes = {name: shape_of(entity) for name, entity in entities.items() if name != "witness"}
+        scene = shapely.box(*shapely.union_all([scene, *shapes.values()]).bounds)
+        if "witness" not in entities:
+            continue
+        pointing_count += 1
+        assert [name for name, entity in entities.items() if entity.texts] == ["witness"]
         *names, label = entities["witness"].texts
-        deciding = [each.text.removesuffix(" ✕") for each in names]
+        deciding = [name.text.removesuffix(" ✕") for name in names]
         assert deciding and all(name in label.text for name in deciding)
-        shapes = {name: shape_of(entities[f"object/{name}"]) for name in deciding if name != "dock"}
-        boxes = [name_box(each.text, each.pose.position.x, each.pose.position.y) for each in (*names, label)]
-        for box in boxes[:-1]:
-            assert not any(box.intersects(shape) for shape in shapes.values())
+        moving = [shapes[f"object/{name}"] for name in deciding if name != "dock"]
+        boxes = [
+            name_box(name.text, name.pose.position.x, name.pose.position.y, scene) for name in (*names, label)
+        ]
+        assert not any(box.intersects(shape) for box in boxes for shape in moving)
         assert not any(one.intersects(other) for one, other in combinations(boxes, 2))
-    if "forall" in text:
-        shapes = {name: shape_of(entities[f"object/{name}"]) for name in NAMES}
-        distances = {pair: shapes[pair[0]].distance(shapes[pair[1]]) for pair in combinations(NAMES, 2)}
-        least = min(distances.values())
-        assert distances[tuple(sorted(deciding))] == pytest.approx(least, abs=1e-9) or least == 0.0
+        view = scene.centroid.buffer(0.75 * size_of(scene) + 1e-9, cap_style="square")
+        assert view.contains(boxes[-1])
+        assert not any(boxes[-1].intersects(shape) for name, shape in shapes.items() if name != "region/dock")
+        if "forall" in text:
+            distances = {
+                pair: shapes[f"object/{pair[0]}"].distance(shapes[f"object/{pair[1]}"])
+                for pair in combinations(NAMES, 2)
+            }
+            least = min(distances.values())
+            assert distances[tuple(sorted(deciding))] == pytest.approx(least, abs=1e-9) or least == 0.0
+    assert pointing_count >= len(messages) - 3

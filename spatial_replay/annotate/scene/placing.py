@@ -1,8 +1,8 @@
-"""Places of names beside what they name, off outlines, arrows and each other."""
+"""Places of names and of an arrow's label: off outlines, arrows and each other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,16 @@ _SIDES.flags.writeable = False
 """The eight positions in the order in which they are tried: above, below, right, left, corners."""
 
 
-def place_names(low: Floats, high: Floats, letters: Floats, blocked: Floats, line: float) -> Floats:
+Box = tuple[Floats, Floats]
+"""Low and high corners (2, K) of a box in each of K scenes; NaN where there is none."""
+
+
+def columns_of(boxes: Floats) -> list[Box]:
+    """Return boxes (K, B, 2, 2) of K scenes, one after the other: numpy compares long columns, not pairs."""
+    return [(box[:, 0].T.copy(), box[:, 1].T.copy()) for box in boxes.swapaxes(0, 1)]
+
+
+def place_names(low: Floats, high: Floats, letters: Floats, blocked: Sequence[Box], line: Floats) -> Floats:
     """Return the middles (K, N, 2) of N names in each of K scenes: each at the first side that is free.
 
     A name without a free side is placed above all of its scene's boxes.
@@ -26,15 +35,13 @@ def place_names(low: Floats, high: Floats, letters: Floats, blocked: Floats, lin
     Args:
         low, high: (K, N, 2), corners of the boxes of what is named.
         letters: (K, N), lengths of the names.
-        blocked: (K, B, 2, 2), low and high corners of boxes that no name may cover; NaN for none.
-        line: the height of a name.
+        blocked: boxes that no name may cover.
+        line: (K,), the heights of names.
     """
     middles = np.empty(low.shape)
-    # x and y apart: numpy compares long columns, not pairs
-    boxes = [(box[:, 0].T.copy(), box[:, 1].T.copy()) for box in blocked.swapaxes(0, 1)]
+    boxes = list(blocked)
     for number in range(low.shape[1]):
-        half = np.full((2, len(low)), line / 2.0)
-        half[0] *= LETTER * letters[:, number]
+        half = half_sizes(letters[:, number], line)
         middle = (low[:, number] + high[:, number]).T / 2.0
         reach = (high[:, number] - low[:, number]).T / 2.0 + half + _GAP * line
         centres = _first_free(middle, reach, half, boxes, line)
@@ -43,11 +50,12 @@ def place_names(low: Floats, high: Floats, letters: Floats, blocked: Floats, lin
     return middles
 
 
-_Box = tuple[Floats, Floats]
-"""Low and high corners (2, K) of a box in each scene."""
+def half_sizes(letters: Floats, line: Floats) -> Floats:
+    """Return half the widths and heights (2, K) of texts."""
+    return np.stack([LETTER * letters * line / 2.0, line / 2.0])
 
 
-def _first_free(middle: Floats, reach: Floats, half: Floats, boxes: Sequence[_Box], line: float) -> Floats:
+def _first_free(middle: Floats, reach: Floats, half: Floats, boxes: Sequence[Box], line: Floats) -> Floats:
     """Return the middles (2, K) of one name in each scene: at the first free side, or above all boxes."""
     centres = np.empty(middle.shape)
     left = np.arange(middle.shape[1])
@@ -65,7 +73,73 @@ def _first_free(middle: Floats, reach: Floats, half: Floats, boxes: Sequence[_Bo
         left = left[is_covered]
         if not len(left):
             return centres
-    top = np.nanmax([high[1, left] for _, high in boxes], axis=0, initial=-np.inf)
-    centres[0, left] = middle[0, left]
-    centres[1, left] = top + half[1, left] + _GAP * line
+    centres[:, left] = _above_all(middle, half, boxes, line)[:, left]
     return centres
+
+
+def _above_all(middle: Floats, half: Floats, boxes: Sequence[Box], line: Floats) -> Floats:
+    """Return the places (2, K) above all boxes."""
+    top = np.nanmax([high[1] for _, high in boxes], axis=0, initial=-np.inf)
+    return np.stack([middle[0], top + half[1] + _GAP * line])
+
+
+_FAR: Final = (0.0, 1.0, 3.0, 6.0)
+"""Distances of labels from what they belong to, by the height of a line."""
+
+
+def place_labels(
+    half: Floats, arrow: Box, blocked: Sequence[Box], others: Box, scene: Box, margin: Floats, line: Floats
+) -> Floats:
+    """Return the middles (K, 2) of one label in each of K scenes.
+
+    A label is at the first free place: beside the arrow, beside all blocked boxes, above or below the scene.
+    It covers other objects only if every place in the view does, and leaves the view only if every place in
+    it covers a blocked box.
+
+    Args:
+        half: (2, K), half the widths and heights of labels.
+        arrow: its box.
+        blocked: boxes that no label may cover.
+        others: (2, K, N) each, boxes that a label avoids.
+        scene: the box of all objects.
+        margin: (K,), how far the view reaches beyond the middle of the scene.
+        line: (K,), the height of a line.
+    """
+    around = (
+        np.nanmin([low for low, _ in blocked], axis=0),
+        np.nanmax([high for _, high in blocked], axis=0),
+    )
+    middle, centre = (arrow[0] + arrow[1]) / 2.0, (scene[0] + scene[1]) / 2.0
+    room = np.maximum(margin - half, 0.0)
+    left, best = np.arange(half.shape[1]), np.full(half.shape[1], 8)
+    labels = _above_all(middle, half, blocked, line)
+    for candidate in _label_places(middle, half, arrow, around, scene, line):
+        places = candidate[:, left]
+        places[0] = np.clip(places[0], (centre - room)[0, left], (centre + room)[0, left])
+        begin, end = places - half[:, left], places + half[:, left]
+        is_outside = np.abs(places[1] - centre[1, left]) > room[1, left]
+        low, high = others[0][:, left], others[1][:, left]
+        covers = np.all((begin[..., None] < high) & (low < end[..., None]), axis=0)
+        rank = 2 * is_outside + np.any(covers, axis=1)
+        for low, high in blocked:
+            rank[np.all((begin < high[:, left]) & (low[:, left] < end), axis=0)] = 8
+        is_better = rank < best[left]
+        labels[:, left[is_better]], best[left[is_better]] = places[:, is_better], rank[is_better]
+        left = left[best[left] > 0]
+        if not len(left):
+            break
+    return labels.T
+
+
+def _label_places(
+    middle: Floats, half: Floats, arrow: Box, around: Box, scene: Box, line: Floats
+) -> Iterator[Floats]:
+    """Yield the places (2, K) that a label may have, the best first."""
+    for far in _FAR:
+        for low, high in (arrow, around):
+            reach = (high - low) / 2.0 + half + (_GAP + far) * line
+            yield from ((low + high) / 2.0 + side[:, None] * reach for side in _SIDES)
+    for far in _FAR:
+        distance = half[1] + (_GAP + far) * line
+        yield np.stack([middle[0], scene[1][1] + distance])
+        yield np.stack([middle[0], scene[0][1] - distance])

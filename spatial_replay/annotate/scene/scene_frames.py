@@ -390,7 +390,7 @@ class SceneContent(NamedTuple):
         observations: (S, names), rows of `rings`, `footprints` and `middles`.
         middles: (R, 2), where names are.
         violations: of the S samples.
-        label: (S,), how high on the plane the arrow's label is.
+        label: (S, 2), the middle of the arrow's label.
         arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
         causes: what decides violations, in words.
         numbers: of each violation that is shown, its number with its unit.

@@ -35,7 +35,6 @@ from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.logs.wire import Payloads, WireTemplate, Words
 from spatial_replay.palette import LABEL, NEGATIVE, NEUTRAL
 from spatial_replay.spec.formula import Outline, RegionName, TrackedName
-from spatial_replay.trace.trace import Trace
 
 ROUND: Final = 32
 """Points on the ring of a rounded part."""
@@ -180,40 +179,6 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
         rings = lengths[footprints.part_start[row] : footprints.part_start[row + 1]]
         forms.append(Form(tuple(rings.tolist()), bool(has_height[row])))
     return form, tuple(forms)
-
-
-class SceneBounds(NamedTuple):
-    """The box that a log's footprints lie in, in footprint units."""
-
-    xmin: float
-    ymin: float
-    xmax: float
-    ymax: float
-
-    @classmethod
-    def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
-        """Return the box of some samples and of those before; None without any footprint."""
-        vertices = trace.footprints.vertices
-        low, high = _corners_of_part(vertices)
-        if not np.isfinite([low, high]).all():
-            vertices = vertices[np.isfinite(vertices).all(axis=1)]
-            low, high = _corners_of_part(vertices)
-        if not len(vertices):
-            return before
-        box = cls(low[0], low[1], high[0], high[1])
-        return box if before is None else before.with_points(np.array([low, high]))
-
-    def with_points(self, points: Floats) -> SceneBounds:
-        """Return the box around this one and some points (P, 2)."""
-        low, high = _corners_of_part(np.vstack([points, [self[:2], self[2:]]]))
-        return SceneBounds(low[0], low[1], high[0], high[1])
-
-
-def _corners_of_part(vertices: Floats) -> tuple[list[float], list[float]]:
-    """Return the least and the greatest coordinates of vertices (V, 2); infinite without any."""
-    columns = [vertices[:, axis] for axis in (0, 1)]
-    low = [float(column.min(initial=np.inf)) for column in columns]
-    return low, [float(column.max(initial=-np.inf)) for column in columns]
 
 
 FRAME: Final = "world"
@@ -631,7 +596,7 @@ def numbers_of_witness(
     points: Floats,
     z: Floats,
     names: Floats,
-    label_y: Floats,
+    label_places: Floats,
     scale: float,
     labels: Sequence[bytes],
     words: Sequence[int],
@@ -642,7 +607,7 @@ def numbers_of_witness(
         points: (S, 2, 2), its begin and its end.
         z: (S,), its height.
         names: (S, names, 2), the middles of the names beside it.
-        label_y: (S,), where the label is on the plane, off the arrow.
+        label_places: (S, 2), the middles of the labels on the plane.
         scale: the size of objects in the scene.
         labels: the ends of S labels, of one length.
         words: where in them words of 8 bytes begin.
@@ -652,7 +617,7 @@ def numbers_of_witness(
     half = 0.5 * np.arctan2(*(end - begin).T[::-1])
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
-    middle = [(begin[:, 0] + end[:, 0]) / 2.0, label_y, z + ARROW_HEAD * scale]
+    middle = [label_places, z + ARROW_HEAD * scale]
     text = b"".join([label[at : at + 8] for label in labels for at in words])
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, names, *middle, label)]

@@ -16,7 +16,8 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.annotate.scene.placing import place_names
+from spatial_replay.annotate.scene.extent import VIEW, SceneExtent
+from spatial_replay.annotate.scene.placing import Box, columns_of, half_sizes, place_labels, place_names
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
@@ -150,8 +151,7 @@ class SceneState:
         is_pointing: whether it has an arrow at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
-        top: the upper edge of the objects of that message and the regions.
-        line: how high a line of text is there, about.
+        extent: of the samples so far, by which texts are placed.
         templates: those of the layouts so far; a cache that changes no message.
     """
 
@@ -161,13 +161,12 @@ class SceneState:
     last: Mapping[str, tuple[FootprintBatch, int]] = field(default_factory=lambda: MappingProxyType({}))
     is_pointing: bool = False
     scale: float | None = None
-    top: float | None = None
-    line: float = 0.0
+    extent: SceneExtent = field(default_factory=SceneExtent)
     templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> SceneState:
-    """Return the scale and the upper edge of a run's scene (see `SceneState`), before its first message.
+    """Return the scale of a run's scene (see `SceneState`), before its first message.
 
     Args:
         trace: from the first sample on.
@@ -208,6 +207,8 @@ class SceneEncoder:
             Region(name, outline, tuple(outlines_of(footprint_from_outline(outline))))
             for name, outline in sorted(regions.items(), key=itemgetter(0))
         )
+        rings = [ring for region in self._drawn for ring in region.rings]
+        self._corners = np.concatenate(rings) if rings else None
         self._encoded, self._unnamed = (encode_regions(self._drawn, named=named) for named in (True, False))
 
     def encode(
@@ -228,8 +229,11 @@ class SceneEncoder:
         if not len(sample_places):
             return SceneMessages(times_ns, [], self.pass_over(trace, state), None)
         state, scales, first = self.with_scale(state, trace, trace.rows[sample_places])
+        extent, corners, sizes = state.extent.grow(trace, self._corners)
+        view = _View(corners[sample_places], _LINE * sizes[sample_places])
+        state = replace(state, extent=extent)
         names = tuple(sorted({*trace.names, *state.shown, *state.last}))
-        missing, state = self._missing(names, trace, state, sample_places)
+        missing, state = self._missing(names, trace, state, sample_places, view.line)
         missing[0][:first] = -1
         scale = state.scale or _UNSCALED
         violations = first_violations(results, trace, sample_places)
@@ -241,7 +245,9 @@ class SceneEncoder:
         labels = has_label, failed_objects(results, names, times_ns)
         arrows = arrow_texts(results, violations, state.zero_ns or 0, self.unit)
         regions_by_name = {region.name: np.concatenate(region.rings) for region in self._drawn}
-        content = _content(trace, names, rows, state, violations, arrows, labels, missing, regions_by_name)
+        content = _content(
+            trace, names, rows, state, violations, arrows, labels, missing, regions_by_name, view
+        )
         shades = colours(objects, scales), colours(regions, scales)
         object_shades = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
         columns = SceneNumbers(times_ns, shades[1], object_shades, content, scale)
@@ -270,64 +276,58 @@ class SceneEncoder:
         return SceneMessages(times_ns, join_in_order(encoded), after, frames)
 
     def pass_over(self, trace: Trace, state: SceneState) -> SceneState:
-        """Take in samples without a message."""
-        return self._missing(trace.names, trace, state, np.empty(0, np.int64))[1]
+        """Return the state after samples without a message."""
+        state = replace(state, extent=state.extent.after(trace, self._corners))
+        return self._missing(trace.names, trace, state, np.empty(0, np.int64), np.empty(0))[1]
 
     def _missing(
-        self, names: tuple[str, ...], trace: Trace, state: SceneState, written: Integers
+        self, names: tuple[str, ...], trace: Trace, state: SceneState, written: Integers, lines: Floats
     ) -> tuple[tuple[Integers, Dashes], SceneState]:
         """Return (S, names) which of some last outlines each object that is missing has, and -1 for others;
         these outlines; and the state after the samples."""
         last, outline_numbers = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
-        outlines = list[tuple[Floats, ...]]()
+        outlines, rows_of = list[tuple[Floats, ...]](), list[Floats]()
         for name in sorted(self.named & {*trace.names, *last}):
             column = trace.names.index(name) if name in trace.names else None
             rows = np.full(len(trace), -1) if column is None else trace.rows[:, column]
             seen = np.maximum.accumulate(np.where(rows >= 0, np.arange(len(rows)), -1))
             last_seen = np.where(rows[written] < 0, seen[written], len(rows))
-            for at in np.unique(last_seen).tolist():
+            for at, line in np.unique([last_seen, lines], axis=1).T.tolist() if len(lines) else []:
                 if at < len(rows) and (at >= 0 or name in last):
-                    batch, row = last[name] if at < 0 else (trace.footprints, int(rows[at]))
-                    outline_numbers[last_seen == at, names.index(name)] = len(outlines)
+                    batch, row = last[name] if at < 0 else (trace.footprints, int(rows[int(at)]))
+                    outline_numbers[(last_seen == at) & (lines == line), names.index(name)] = len(outlines)
                     rings = rings_of(batch.select(np.array([row])), _POINT * (state.scale or _UNSCALED))
                     outlines.append(rings.rings_of(0))
+                    places = np.concatenate(outlines[-1])
+                    middle = (places[:, 0].min() + places[:, 0].max()) / 2.0
+                    under = [[middle, places[:, 1].min() - 0.75 * line]]
+                    rows_of.append(np.concatenate([dashes_of(outlines[-1]), under]))
             if len(seen) and seen[-1] >= 0:
                 last[name] = trace.footprints, int(rows[seen[-1]])
-        places = [np.concatenate(rings) for rings in outlines]
-        under = [
-            [[(ring[:, 0].min() + ring[:, 0].max()) / 2.0, ring[:, 1].min() - 0.75 * state.line]]
-            for ring in places
-        ]
-        rows_of = [
-            np.concatenate([dashes_of(rings), name]) for rings, name in zip(outlines, under, strict=True)
-        ]
         return (outline_numbers, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
 
     def with_scale(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
-        """Return the state with its scale and upper edge, once an object is shown, the scale (S, 1) of each
-        message, and the first message that shows one."""
-        if state.scale is not None and state.top is not None:
+        """Return the state with its scale, once an object is shown, the scale (S, 1) of each message, and the
+        first message that shows one."""
+        if state.scale is not None:
             return state, np.full((len(rows), 1), state.scale), 0
-        scales = np.full((len(rows), 1), state.scale or _UNSCALED)
+        scales = np.full((len(rows), 1), _UNSCALED)
         is_shown = (rows >= 0).any(axis=1)
         if not is_shown.any():
             return state, scales, len(rows)
         first = int(is_shown.argmax())
         footprints = trace.footprints.select(rows[first][rows[first] >= 0])
         # the median size of the objects
-        scale = state.scale or float(np.median(extents(footprints))) or _UNSCALED
+        scale = float(np.median(extents(footprints))) or _UNSCALED
         scales[first:] = scale
-        top, line = self._edge(footprints)
-        return replace(state, scale=scale, top=top, line=line), scales, first
+        return replace(state, scale=scale), scales, first
 
-    def _edge(self, shown: FootprintBatch) -> tuple[float, float]:
-        """Return the upper edge of the objects of one sample and the regions, and a line's height."""
-        points = np.concatenate([shown.vertices, *(ring for region in self._drawn for ring in region.rings)])
-        points = points[np.isfinite(points).all(axis=1)]
-        if not len(points):
-            return 0.0, 0.0
-        (left, low), (right, high) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-        return high, _LINE * max(right - left, high - low)
+
+class _View(NamedTuple):
+    """Extents of S messages: low and high corners (S, 2, 2), and the height of a line of text (S,)."""
+
+    corners: Floats
+    line: Floats
 
 
 def _arrows_of(
@@ -405,6 +405,7 @@ def _content(
     labels: tuple[NDArray[np.bool_], NDArray[np.bool_]],
     missing: tuple[Integers, Dashes],
     regions: Mapping[str, Floats],
+    view: _View,
 ) -> SceneContent:
     is_present = rows >= 0
     is_drawn = is_present | (missing[0] >= 0)
@@ -423,9 +424,14 @@ def _content(
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
+    messages = np.flatnonzero(found.is_shown)
     deciding = _deciding_boxes(names, found, arrows, observations, (low, high), missing, regions)
-    spots = np.zeros((len(rows), 2, 2))
-    spots[found.is_shown] = place_names(*deciding, before.line)
+    spots, label = np.zeros((len(rows), 2, 2)), np.full((len(rows), 2), np.nan)
+    of_messages = _View(view.corners[messages], view.line[messages])
+    others = _boxes_of(observations[messages], low, high)
+    spots[messages], label[messages] = _places(
+        deciding, _label_letters(arrows, messages), others, of_messages
+    )
     return SceneContent(
         names,
         rows,
@@ -435,14 +441,18 @@ def _content(
         observations,
         footprints,
         rings,
-        _name_places(low, high, letters, before.line),
+        _name_places(low, high, letters, np.repeat(view.line, is_present.sum(axis=1))),
         found,
-        _label_places(found, observations, (low, high), spots, before),
+        label,
         witness,
         arrows.causes,
         arrows.numbers,
         spots,
     )
+
+
+_ARROW_BOX: Final = 2
+"""The place of the arrow's box among those that no name may cover."""
 
 
 class _DecidingBoxes(NamedTuple):
@@ -493,8 +503,8 @@ def _deciding_boxes(
             blocked[places, side] = boxes_of[places, side]
     ends = found.points[messages]
     # reductions over two ends are slow
-    blocked[:, 2, 0] = np.minimum(ends[:, 0], ends[:, 1])
-    blocked[:, 2, 1] = np.maximum(ends[:, 0], ends[:, 1])
+    blocked[:, _ARROW_BOX, 0] = np.minimum(ends[:, 0], ends[:, 1])
+    blocked[:, _ARROW_BOX, 1] = np.maximum(ends[:, 0], ends[:, 1])
     # an object that is gone has its name at the arrow
     boxes_of = np.where(np.isnan(boxes_of), ends[:, :, None], boxes_of)
     return _DecidingBoxes(boxes_of[:, :, 0], boxes_of[:, :, 1], letters, blocked)
@@ -505,7 +515,42 @@ def _box(points: Floats) -> Floats:
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> Floats:
+def _boxes_of(observations: Integers, low: Floats, high: Floats) -> Box:
+    """Return the boxes (2, K, N) of the objects of K messages; NaN where one is absent."""
+    if not len(low):
+        return np.full((2, *observations.shape), np.nan), np.full((2, *observations.shape), np.nan)
+    is_absent = observations < 0
+    corners = [np.where(is_absent, np.nan, corner[observations]) for corner in (*low.T, *high.T)]
+    return np.stack(corners[:2]), np.stack(corners[2:])
+
+
+def _label_letters(arrows: ArrowTexts, messages: Integers) -> Floats:
+    """Return the lengths (K,) of the labels of some messages."""
+    lengths = np.array([len(cause.text) + cause.length for cause in arrows.causes], np.float64)
+    return lengths[arrows.cause[messages]] if len(lengths) else np.empty(0)
+
+
+def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View) -> tuple[Floats, Floats]:
+    """Return the middles of names (K, 2, 2) and of the label (K, 2) of an arrow.
+
+    Args:
+        letters: (K,), lengths of labels.
+        others: boxes of all objects.
+        view: that of these messages.
+    """
+    blocked = columns_of(deciding.blocked)
+    spots = place_names(deciding.low, deciding.high, deciding.letters, blocked, view.line)
+    arrow = blocked[_ARROW_BOX]
+    for place in range(spots.shape[1]):
+        half, middle = half_sizes(deciding.letters[:, place], view.line), spots[:, place].T
+        blocked.append((middle - half, middle + half))
+    scene = view.corners[:, 0].T, view.corners[:, 1].T
+    margin = VIEW / 2.0 * (scene[1] - scene[0]).max(axis=0)
+    half = half_sizes(letters, view.line)
+    return spots, place_labels(half, arrow, blocked, others, scene, margin, view.line)
+
+
+def _name_places(low: Floats, high: Floats, letters: Integers, line: Floats) -> Floats:
     """Return (R, 2) where names are: in the middle of what is large enough for them, else below it."""
     # half the sum of the ends does not depend on the order in which points are added up
     places = (low + high) / 2.0
@@ -513,37 +558,6 @@ def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> F
     is_small = (sides[:, 1] < 1.5 * line) | (sides[:, 0] < 0.5 * line * letters)
     places[:, 1] = np.where(is_small, low[:, 1] - 0.75 * line, places[:, 1])
     return places
-
-
-def _label_places(
-    found: Violations,
-    observations: Integers,
-    boxes: tuple[Floats, Floats],
-    spots: Floats,
-    state: SceneState,
-) -> Floats:
-    """Return (S,) how high on the plane each arrow's label is: above the objects that it joins, or below.
-
-    Args:
-        spots: (S, 2, 2), the middles of the names beside it.
-    """
-    label = np.full(len(observations), np.nan)
-    messages = np.flatnonzero(found.is_shown)
-    ends = found.points[messages]
-    of_names = spots[messages, :, 1]
-    low = np.minimum(ends[:, :, 1].min(axis=1), of_names.min(axis=1) - 0.5 * state.line)
-    high = np.maximum(ends[:, :, 1].max(axis=1), of_names.max(axis=1) + 0.5 * state.line)
-    for rows in observations[messages].T:
-        # an absent object has the last box, and counts for nothing
-        lower, upper = (box[rows][:, None, :] for box in boxes) if len(boxes[0]) else (ends, ends)
-        near = state.line * 0.1
-        is_near = np.all((lower - near <= ends) & (ends <= upper + near), axis=2)
-        touches = is_near.any(axis=1) & (rows >= 0)
-        low = np.where(touches, np.minimum(low, lower[:, 0, 1]), low)
-        high = np.where(touches, np.maximum(high, upper[:, 0, 1]), high)
-    has_room = high + 0.5 * state.line < (state.top or 0.0)
-    label[messages] = np.where(has_room, high + 1.25 * state.line, low - 1.75 * state.line)
-    return label
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:

@@ -1,0 +1,157 @@
+"""The extent of a scene: where its footprints are so far, and the size that texts are placed by."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.annotate.scene.scene_template import boxes
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import FootprintBatch
+from spatial_replay.trace.trace import Trace
+
+VIEW: Final = 1.5
+"""The height of the picture by the longer side of the scene; a panel may be narrower than it is high."""
+
+_STEP: Final = 1.25
+"""Ratio of the sizes that texts are placed by: smaller steps would move all names of a growing scene."""
+
+
+class SceneBounds(NamedTuple):
+    """The box that a log's footprints lie in, in footprint units."""
+
+    xmin: float
+    ymin: float
+    xmax: float
+    ymax: float
+
+    @classmethod
+    def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
+        """Return the box of some samples and of those before; None without any footprint."""
+        low, high = _finite_boxes(trace.footprints.select(trace.rows[trace.rows >= 0]))
+        box = cls(*low.min(axis=0, initial=np.inf).tolist(), *high.max(axis=0, initial=-np.inf).tolist())
+        if not np.isfinite(box).all():
+            return before
+        return box if before is None else before.with_points(np.reshape(box, (2, 2)))
+
+    def with_points(self, points: Floats) -> SceneBounds:
+        """Return the box around this one and some points (P, 2)."""
+        corners = np.vstack([points, [self[:2], self[2:]]])
+        return SceneBounds(*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
+
+    def contains(self, footprints: FootprintBatch) -> bool:
+        """Return whether footprints surely lie inside: those with corners at NaN do not."""
+        radius = footprints.radius.max(initial=0.0)
+        columns = zip(footprints.vertices.T, self[:2], self[2:], strict=True)
+        return all(
+            low <= column.min(initial=np.inf) - radius and column.max(initial=-np.inf) + radius <= high
+            for column, low, high in columns
+        )
+
+
+class SceneExtent(NamedTuple):
+    """The extent of the samples so far.
+
+    Attributes:
+        bounds: the box of their footprints; None before any.
+        size: the longer side of that box and the regions, rounded up to steps from its first length on.
+    """
+
+    bounds: SceneBounds | None = None
+    size: float = 0.0
+
+    def with_area(self, area: SceneBounds | None) -> SceneExtent:
+        """Return the extent with the area of a planner's map, if there is one."""
+        if area is None:
+            return self
+        bounds = area if self.bounds is None else self.bounds.with_points(np.reshape(area, (2, 2)))
+        side = max(bounds.xmax - bounds.xmin, bounds.ymax - bounds.ymin)
+        return SceneExtent(bounds, float(_in_steps(np.array([side]), self.size)[0]) if self.size else 0.0)
+
+    def after(self, trace: Trace, regions: Floats | None = None) -> SceneExtent:
+        """Return the extent after the next samples, see `grow`."""
+        if not self.size:
+            first = self.grow(trace.slice(0, 1), regions)[0]
+            return first.after(trace, regions) if first.size else self.grow(trace, regions)[0]
+        bounds = SceneBounds.of(trace, self.bounds)
+        if bounds is None or bounds == self.bounds:
+            return self
+        xmin, ymin, xmax, ymax = _with_regions(np.array(bounds), regions).tolist()
+        side = np.array([max(xmax - xmin, ymax - ymin)])
+        return SceneExtent(bounds, float(_in_steps(side, self.size)[0]))
+
+    def grow(self, trace: Trace, regions: Floats | None = None) -> tuple[SceneExtent, Floats, Floats]:
+        """Return the extent after T samples, and for each sample the extent up to it.
+
+        Args:
+            regions: their corners (P, 2).
+
+        Returns:
+            The extent; (T, 2, 2), low and high corners with the regions, infinite before any footprint;
+            (T,), the sizes.
+        """
+        if self.size and self.bounds is not None and self.bounds.contains(trace.footprints):
+            corners = np.reshape(_with_regions(np.array(self.bounds), regions), (1, 2, 2))
+            return self, np.repeat(corners, len(trace), axis=0), np.full(len(trace), self.size)
+        low, high = _finite_boxes(trace.footprints)
+        before = np.array(self.bounds or (np.inf, np.inf, -np.inf, -np.inf))
+        # an absent object has the last box
+        lows = np.append(low, [[np.inf, np.inf]], axis=0)[trace.rows].min(axis=1, initial=np.inf)
+        highs = np.append(high, [[-np.inf, -np.inf]], axis=0)[trace.rows].max(axis=1, initial=-np.inf)
+        lows = np.minimum(np.minimum.accumulate(lows), before[:2])
+        highs = np.maximum(np.maximum.accumulate(highs), before[2:])
+        if not len(trace) or not np.isfinite(lows[-1]).all():
+            corners = np.repeat(np.reshape(before, (1, 2, 2)), len(trace), axis=0)
+            return self, corners, np.full(len(trace), self.size)
+        bounds = SceneBounds(*lows[-1].tolist(), *highs[-1].tolist())
+        corners = _with_regions(np.concatenate([lows, highs], axis=1), regions).reshape(-1, 2, 2)
+        is_empty = ~np.isfinite(lows).all(axis=1)
+        sides = np.where(is_empty, 0.0, (corners[:, 1] - corners[:, 0]).max(axis=1))
+        sizes = _in_steps(sides, self.size)
+        return SceneExtent(bounds, float(sizes[-1])), corners, sizes
+
+
+def map_area(plan: Mapping[str, str]) -> SceneBounds | None:
+    """Return the area of a planner's map by the metadata of its plan; None if there is none."""
+    try:
+        xmin, ymin, cell, columns, rows = map(float, json.loads(plan["settings"])["grid"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    return SceneBounds(xmin, ymin, xmin + columns * cell, ymin + rows * cell)
+
+
+def _with_regions(corners: Floats, regions: Floats | None) -> Floats:
+    """Return boxes (..., 4) around others and around the corners of regions."""
+    if regions is None or not len(regions):
+        return corners
+    low = np.minimum(corners[..., :2], regions.min(axis=0))
+    high = np.maximum(corners[..., 2:], regions.max(axis=0))
+    return np.concatenate([low, high], axis=-1)
+
+
+def _finite_boxes(footprints: FootprintBatch) -> tuple[Floats, Floats]:
+    """Return the corners of the boxes of footprints, (R, 2) each, infinite for footprints at NaN."""
+    start = footprints.vertex_start[footprints.part_start]
+    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    low = boxes(footprints.vertices - radius, start)[0]
+    high = boxes(footprints.vertices + radius, start)[1]
+    is_finite = np.isfinite(low).all(axis=1, keepdims=True) & np.isfinite(high).all(axis=1, keepdims=True)
+    return np.where(is_finite, low, np.inf), np.where(is_finite, high, -np.inf)
+
+
+def _in_steps(sides: Floats, size: float) -> Floats:
+    """Return lengths (T,), which never shrink, rounded up to steps from the first one above 0 on."""
+    sizes, place = np.empty(len(sides)), 0
+    while place < len(sides):
+        end = max(int(np.searchsorted(sides, size, side="right")), place)
+        sizes[place:end] = size
+        if end < len(sides):
+            # repeated products are the same for any division into blocks
+            size = size or float(sides[end])
+            while size < sides[end]:
+                size *= _STEP
+        place = end
+    return sizes
