@@ -1,6 +1,6 @@
-"""LeRobot data sets (v2, v3): rows of Parquet files, found by their episodes.
+"""LeRobot data sets (v2, v3): rows of Parquet files, found by `episode_index`.
 
-Only files below the folder of a data set are read: templates of paths in its metadata are not followed.
+Only files in the folder of a data set are read; path templates in its metadata are ignored.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from spatial_replay.text import listing, plural
 
 _SUCCESS: Final = "next.success"
 _TIME_ERROR_S: Final = 1e-3
-"""A time in float32 may differ so much from the exact one."""
+"""Largest error of a time in float32, seconds."""
 _EPISODE_COLUMNS: Final = ("episode_index", "tasks", "length", "data/chunk_index", "data/file_index")
 
 
 class _Rows(NamedTuple):
-    """The rows of an episode in a file; whole if no other episode is between them."""
+    """Rows of an episode in a file; whole if no other episode is between them."""
 
     file: Path
     begin: int
@@ -100,7 +100,7 @@ class _LeRobot(DataSet):
                 " of numbers; use the original"
             )
         self.remarks = tuple(remarks)
-        # a file, the columns that were looked for in it, and those that it has
+        # the last file with its time, the requested columns, and the columns among them that it has
         self._loaded: tuple[object, AbstractSet[str], Mapping[str, Floats]] = (None, frozenset(), {})
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[list[_Rows]]:
@@ -121,7 +121,7 @@ class _LeRobot(DataSet):
         return len(run.arrays["episode_index"])
 
     def poses(self, run: Run, count: int) -> EpisodeColumns:
-        """See `DataSet.poses`; the times are those of `frame_index`."""
+        """Return the times of `frame_index`, which are exact, unlike `timestamp`; see `DataSet.poses`."""
         episode, arrays = run.episode, run.arrays
         fps, all_frames = self.required_fps(run.reading), np.arange(count, dtype=np.float64)
         frames = arrays.get("frame_index", all_frames)
@@ -148,15 +148,15 @@ class _LeRobot(DataSet):
         return [rows.file for rows in self._places(number)]
 
     def _places(self, number: int) -> list[_Rows]:
-        """Return the rows of an episode: in a file of its own, or in all files that have some.
+        """Return the rows of an episode, from its own file or from all files.
 
         Raises:
-            LogError: no file has them.
+            LogError: no file has its rows, or other episodes are between them.
         """
         likely = self._file_of[number]
         named = self._file_by_end.get(likely)
         is_alone = named is not None and named.name == likely and number in self._rows_of(named)
-        # whatever the metadata says: files that were copied or merged have wrong numbers there
+        # metadata of copied or merged data sets names wrong files, so all files are searched
         files = [named] if named is not None and is_alone else self._files
         places = [rows for file in files if (rows := self._rows_of(file).get(number)) is not None]
         if not places:
@@ -187,7 +187,7 @@ class _LeRobot(DataSet):
         return self._rows[file]
 
     def _table(self, file: Path, names: AbstractSet[str]) -> Mapping[str, Floats]:
-        """Return columns of a file; those of the last file stay in memory."""
+        """Return columns of a file; the columns of the last file are cached."""
         key = (file, file.stat().st_mtime_ns)
         read, table = self._loaded[1:] if self._loaded[0] == key else (frozenset[str](), {})
         if unread := names - read:
@@ -196,7 +196,7 @@ class _LeRobot(DataSet):
 
 
 def _lacks_files(path: Path) -> bool:
-    """Return whether the tables of episodes do not say in which files of data the episodes are."""
+    """Return whether the tables of episodes lack the column with the numbers of data files."""
     tables = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
     return bool(tables) and "data/file_index" not in arrow().parquet.read_schema(tables[0]).names
 
@@ -221,7 +221,7 @@ def _places_of(names: object, width: int) -> tuple[str, ...]:
 
 
 def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str]]:
-    """Return the end of the path of each episode's file, the episodes, and remarks."""
+    """Return path endings of files by episode number, the episodes, and remarks."""
     rows, remarks = list(_episode_rows(path)), []
     if not rows:
         remarks.append("meta has no episodes; their numbers are those in data/")
@@ -254,7 +254,7 @@ def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str
 
 
 def _episode_rows(path: Path) -> Iterator[Mapping[str, Any]]:
-    # tools for repairs add tables of other names
+    # repair tools add tables with other names
     files = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
     if files:
         library = arrow()
@@ -277,10 +277,10 @@ def _episode_rows(path: Path) -> Iterator[Mapping[str, Any]]:
 
 
 def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
-    """Read columns of a Parquet file as float64; those that it does not have are left out.
+    """Read columns of a Parquet file as float64; missing columns, and columns of texts, are left out.
 
     Raises:
-        LogError: the file cannot be read.
+        LogError: the file cannot be read, or is too large.
     """
     library = arrow()
     try:
@@ -301,7 +301,7 @@ def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
 def _remarks(
     columns: Mapping[str, Floats], frames: Floats, fps: float, expected: int | None
 ) -> Iterator[str]:
-    """Yield remarks on the rows of an episode whose values are odd, although all are read."""
+    """Yield remarks on unusual values in the rows of an episode; all rows are read nevertheless."""
     if expected is not None and expected != len(frames):
         yield f"meta says {plural(expected, 'frame')}, and data has {len(frames)}"
     steps = np.diff(frames)

@@ -81,11 +81,11 @@ class _Minari(DataSet):
             yield f"it combines {names}: episodes that were filtered out of these are in it again"
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
-        """Yield its episodes by number."""
+        """Yield the episodes in the order of their numbers."""
         raise NotImplementedError
 
     def widths(self, episode: Episode) -> dict[str, int]:
-        """Return the numbers a frame of each array of an episode."""
+        """Return how many numbers each array of an episode has per frame."""
         raise NotImplementedError
 
     def count_states(self, run: Run) -> int:
@@ -112,9 +112,9 @@ def _count_steps(run: Run) -> int:
 
 
 def _second_run(arrays: Mapping[str, Floats], steps: int, count: int) -> str:
-    """Return why an episode cannot be judged: it holds two runs; "" if it holds one.
+    """Return the reason why an episode with two runs gets no verdict; "" for an episode with one run.
 
-    Minari appends a run to an existing episode of the same number when a data set is updated.
+    When a data set is updated, Minari appends a run to an existing episode of the same number.
     """
     for name in _ENDS:
         ends = np.flatnonzero(arrays.get(name, np.empty(0))[:-1] > 0)
@@ -142,7 +142,7 @@ class _Hdf5(_Minari, InGroups):
                 yield Episode(number, key, None if steps is None else steps + 1, task, group.integer("seed"))
 
     def widths(self, episode: Episode) -> dict[str, int]:
-        """See `_Minari.widths`; parts of tuples are numbers, as in Arrow."""
+        """See `_Minari.widths`; elements of a tuple are named by their index, as in Arrow."""
         with self.open_episode(episode) as group:
             return {
                 "/".join(part.removeprefix("_index_") for part in name.split("/")): width_of(array)
@@ -185,7 +185,7 @@ class _Tables(_Minari):
         return arrays
 
     def _columns(self, episode: Episode) -> dict[str, Any]:
-        """Return the columns of an episode; the fields of structures apart."""
+        """Return the columns of an episode; each field of a struct is a separate column."""
         library, folder = arrow(), self.home / episode.key
         files = sorted([*folder.glob("*.arrow"), *folder.glob("*.parquet")])
         if not files:

@@ -1,7 +1,7 @@
 """MuJoCo models: poses, footprints and heights of free bodies, from recorded states.
 
-A recorded model names meshes on the disk of its recorder. Everything that kinematics do without is removed
-before a model is compiled, and MuJoCo itself never reads a file.
+A recorded model names meshes on the disk of its recorder. Elements without influence on the kinematics are
+removed before a model is compiled. MuJoCo itself never reads a file.
 """
 
 from __future__ import annotations
@@ -24,18 +24,21 @@ from spatial_replay.geometry.outline import normalise_polygons
 from spatial_replay.logs.formats.episodes import Body
 
 LARGEST_MODEL: Final = 2**24
-"""Characters of XML."""
+"""Longest model, characters of XML."""
 LARGEST_ASSET: Final = 2**27
-"""Bytes of one mesh."""
+"""Largest mesh, bytes."""
 DEEPEST: Final = 200
-"""Elements inside each other."""
+"""Deepest nesting of elements."""
 MOST_COPIES: Final = 10_000
-"""Elements that one model may generate by a `count`."""
+"""Most copies of elements that a model may generate by `count`."""
 RIM_CORNERS: Final = 32
-"""Corners of each rim of a tilted cylinder."""
+"""Number of corners of each rim of a tilted cylinder."""
 ELLIPSE_CORNERS: Final = 64
 UPRIGHT_COSINE: Final = math.cos(math.radians(5.6))
-"""A cylinder tilted less is a segment with a radius, at most 0.5 % of the radius too long."""
+"""Cosine of the tilt below which a cylinder is drawn as a rounded segment.
+
+The segment is too long by at most 0.5 % of the radius.
+"""
 
 _UNUSED: Final = frozenset(
     [
@@ -61,10 +64,10 @@ _UNUSED: Final = frozenset(
         "visual",
     ]
 )
-"""Elements without influence on the poses of bodies, or that load code or files."""
+"""Elements that do not influence the poses of bodies, or that load code or files."""
 _FOLDERS: Final = ("meshdir", "texturedir", "assetdir")
 _LOST: Final = "spatial-replay lost mesh "
-"""Beginning of the names of geoms whose mesh is missing."""
+"""Name prefix of geoms whose mesh is missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +85,9 @@ class SceneModel:
     """A compiled model.
 
     Attributes:
-        names: the names of its free bodies.
-        nq, nv: the lengths of qpos and qvel.
-        remarks: facts that a reader of its states should know.
+        names: names of its free bodies.
+        nq, nv: lengths of qpos and qvel.
+        remarks: remarks on meshes that are left out, and on mocap bodies.
     """
 
     def __init__(self, model: Any, place: str, remarks: Sequence[str]) -> None:
@@ -109,10 +112,11 @@ class SceneModel:
             )
 
     def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...]:
-        """Return the geoms that count for a body's footprint; none if one of them has lost its mesh."""
+        """Return the geoms of a body's footprint; () if one of their meshes is missing."""
         model, kinds = self._model, self._mujoco.mjtGeom
         indices = np.flatnonzero(model.body_weldid[model.geom_bodyid] == body)
         indices = indices[~np.isin(model.geom_type[indices], (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD))]
+        # geoms for display count only if no geom collides
         collides = (model.geom_contype[indices] != 0) | (model.geom_conaffinity[indices] != 0)
         counting = (indices[collides] if collides.any() else indices).tolist()
         if any(model.geom(index).name.startswith(_LOST) for index in counting):
@@ -130,7 +134,7 @@ class SceneModel:
         )
 
     def _vertices_of(self, geom: int) -> Floats:
-        """Return the vertices (v, 3) of a geom's mesh, those of its hull where MuJoCo computed it."""
+        """Return the vertices (v, 3) of a geom's mesh, or of its convex hull if MuJoCo computed one."""
         model = self._model
         mesh = int(model.geom_dataid[geom])
         if model.geom_type[geom] != self._mujoco.mjtGeom.mjGEOM_MESH or mesh < 0:
@@ -140,11 +144,12 @@ class SceneModel:
         graph = int(model.mesh_graphadr[mesh])
         if graph < 0:
             return vertices
+        # a graph holds numvert, numface, vert_edgeadr[numvert], vert_globalid[numvert], edges and faces
         corners = int(model.mesh_graph[graph])
         return np.asarray(vertices[model.mesh_graph[graph + 2 + corners : graph + 2 + 2 * corners]])
 
     def states(self, states: Floats, place: str) -> tuple[Floats, list[Body]]:
-        """Return times (n,) in seconds and the free bodies of states (n, 1 + nq + nv): time, qpos, qvel.
+        """Return times (n,), in seconds, and free bodies of states (n, 1 + nq + nv): time, qpos, qvel.
 
         Raises:
             LogError: states of another length.
@@ -203,7 +208,8 @@ def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats
     """Return the projections of a body's geoms onto the plane; None without geoms.
 
     Args:
-        positions: (n, 3) of the body, quaternions: (n, 4), w x y z.
+        positions: (n, 3), positions of the body.
+        quaternions: (n, 4), orientations of the body, w x y z.
     """
     if not geoms:
         return None
@@ -213,7 +219,7 @@ def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats
     parts = FootprintBatch.concatenate(
         [_projection(geom, places + turns @ geom.position, turns @ geom.rotation) for geom in geoms]
     )
-    # rows of one geom after the other become rows of one state after the other
+    # the rows are sorted by geom and state; they become sorted by state and geom
     by_state = np.arange(len(geoms) * count).reshape(len(geoms), count).T.reshape(-1)
     joined = parts.select(by_state)
     merged = replace(
@@ -240,7 +246,7 @@ def _rotations(quaternions: Floats) -> Floats:
 
 
 def _projection(geom: _Geom, centres: Floats, turns: Floats) -> FootprintBatch:
-    """Return the projections of one geom, at centres (n, 3) with rotations (n, 3, 3): n rows of one part."""
+    """Return n footprints of one part: projections of a geom at centres (n, 3), rotated by (n, 3, 3)."""
     from mujoco import mjtGeom
 
     size, height = geom.size, centres[:, 2]
@@ -264,7 +270,7 @@ def _projection(geom: _Geom, centres: Floats, turns: Floats) -> FootprintBatch:
 
 
 def _ends(centres: Floats, halves: Floats) -> Floats:
-    """Return the projected ends (n, 2, 2) of segments, given their middles and halves (n, 3)."""
+    """Return the projected ends (n, 2, 2) of segments with centres (n, 3) and half vectors (n, 3)."""
     return np.stack([centres - halves, centres + halves], axis=1)[..., :2]
 
 
@@ -288,7 +294,8 @@ def _cylinders(size: Floats, centres: Floats, turns: Floats) -> FootprintBatch:
 
 
 def _ellipses(axes: Floats) -> Floats:
-    """Return outlines (n, k, 2) of the ellipses that (n, 2, 3) matrices make of the unit ball."""
+    """Return outlines (n, k, 2) of ellipses, the projections of the unit ball by matrices (n, 2, 3)."""
+    # the Cholesky factor of A A^T maps the unit circle to the outline of the projection by A
     squared = axes @ axes.transpose(0, 2, 1)
     first = np.sqrt(squared[:, 0, 0])
     across = squared[:, 0, 1] / first
@@ -299,7 +306,7 @@ def _ellipses(axes: Floats) -> Floats:
 
 
 def _hulls(points: Floats, radius: float, bottom: Floats, top: Floats) -> FootprintBatch:
-    """Return n rows, each the hull of its points (n, k, 2), rounded by a radius."""
+    """Return n footprints, hulls of k points each (n, k, 2), rounded by a radius."""
     import shapely
 
     count, corners, _ = points.shape
@@ -323,7 +330,7 @@ def _hulls(points: Floats, radius: float, bottom: Floats, top: Floats) -> Footpr
 
 
 def model_from_file(path: Path, assets: Path | None = None) -> SceneModel:
-    """Return the model in a file, with the meshes of a folder: by default its own.
+    """Return the model in a file, with meshes from a folder; by default, from the folder of the file.
 
     Raises:
         LogError: a model that cannot be read or compiled.
@@ -341,30 +348,30 @@ def _text_of(path: Path) -> str:
 
 
 def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneModel:
-    """Compile a model from its XML, without what kinematics do without; the last few are compiled once.
+    """Compile a model from its XML, reduced to the kinematics. The last four models are cached.
 
     Args:
-        place: what names the model in messages.
-        assets: a folder in which meshes and included files are searched by the ends of their paths; no file
-            outside it is read.
+        place: name of the model in messages.
+        assets: folder in which meshes and included files are searched by the ends of their paths; files
+            outside it are not read.
 
     Raises:
-        LogError: XML that is broken or too large, or no model of MuJoCo.
+        LogError: the XML is broken, too large, or no model of MuJoCo.
     """
     return _compile(_source_without_files(text, place) if assets is None else _source(text, place, assets))
 
 
 def identity_of_model(model: Path | None, assets: Path | None) -> str:
-    """Return a hash that changes with the files that a mapping's model, or models in a data set, are made of.
+    """Return a hash of the files of a mapping's model, or of the assets for models in a data set.
 
     Raises:
-        LogError: they cannot be read.
+        LogError: the files cannot be read.
     """
     if model is not None:
         source = _source(_text_of(model), model.name, assets or model.absolute().parent)
         parts = [source.xml.encode(), *(content for _, content in source.files)]
     else:
-        # the models name their meshes: any file of the folder
+        # the models in a data set may name any file of the folder as a mesh
         files = sorted(file for file in assets.rglob("*") if file.is_file()) if assets is not None else []
         states = [(str(file), state.st_size, state.st_mtime_ns) for file in files for state in [file.stat()]]
         parts = [repr(states).encode("utf-8", "surrogatepass")]
@@ -375,7 +382,7 @@ def identity_of_model(model: Path | None, assets: Path | None) -> str:
 
 
 class _ModelSource(NamedTuple):
-    """The source of a model: XML, the content of files by their names, and remarks on lost ones."""
+    """The source of a model: XML, contents of files by name, and remarks on meshes that are left out."""
 
     place: str
     xml: str
@@ -412,14 +419,14 @@ def _compile(source: _ModelSource) -> SceneModel:
 
 
 class _Folder:
-    """The files of a folder, found by the ends of paths that were written elsewhere."""
+    """Files of a folder, found by the ends of paths on another machine."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = None if folder is None else folder.resolve()
         self._too_large: list[str] = []
 
     def read(self, name: str, directory: str = "") -> bytes | None:
-        """Return a file's bytes; None if the folder does not have it."""
+        """Return the content of a file; None if it is missing in the folder or too large."""
         if self._folder is None:
             return None
         path = PurePosixPath(directory.replace("\\", "/")) / name.replace("\\", "/")
@@ -493,7 +500,7 @@ def _number(text: str) -> float:
 
 
 def _strip(root: ElementTree.Element, folder: _Folder, directory: str) -> dict[str, bytes]:
-    """Remove what kinematics do without; return the meshes that the folder has, by new names."""
+    """Remove elements without influence on kinematics; return the meshes in the folder, by new names."""
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tag in _UNUSED or "hfield" in child.attrib:
@@ -517,7 +524,7 @@ def _strip(root: ElementTree.Element, folder: _Folder, directory: str) -> dict[s
 
 
 def _has_content(mesh: ElementTree.Element, folder: _Folder, directory: str, files: dict[str, bytes]) -> bool:
-    """Return whether a mesh has its vertices in the XML, or a file that the folder has."""
+    """Return whether a mesh has its vertices in the XML or in the folder; add its file to `files`."""
     name = mesh.attrib.pop("file", None)
     if name is None:
         return "vertex" in mesh.attrib or "builtin" in mesh.attrib
@@ -532,7 +539,7 @@ def _has_content(mesh: ElementTree.Element, folder: _Folder, directory: str, fil
 
 
 def _lose_mesh(geom: ElementTree.Element, number: int) -> None:
-    """Make a geom without its mesh a small sphere with a name that says so."""
+    """Replace a geom whose mesh is missing by a small sphere with the name prefix `_LOST`."""
     for key in ("mesh", "fromto", "fitscale"):
         geom.attrib.pop(key, None)
     geom.attrib |= {"type": "sphere", "size": "0.001", "name": f"{_LOST}{number}"}
@@ -543,7 +550,7 @@ _COMPILER: Final[Mapping[str, str]] = {
     "boundmass": "1e-6",
     "boundinertia": "1e-9",
     "balanceinertia": "true",
-    # names and geoms stay
+    # all bodies and geoms stay in the model
     "fusestatic": "false",
     "discardvisual": "false",
 }

@@ -1,4 +1,4 @@
-"""Data sets that are arrays of all steps, of which some end episodes: OGBench in npz files, D4RL in HDF5."""
+"""Data sets of arrays over all steps, which mark the ends of episodes: OGBench in npz files, D4RL in HDF5."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class _Steps(DataSet):
     """A data set of arrays of all steps.
 
     Attributes:
-        qpos: the name of the array of joint positions, for a model.
+        qpos: name of the array of joint positions, which a model needs.
     """
 
     qpos = "qpos"
 
     def divide(self, is_end: Booleans, missing: str) -> None:
-        """Divide the steps into episodes; `missing` says what the last one lacks."""
+        """Divide the steps into episodes; `missing` is the remark on a last episode without an end."""
         ends = np.flatnonzero(is_end)
         if len(is_end) and (len(ends) == 0 or ends[-1] != len(is_end) - 1):
             last = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)
@@ -91,7 +91,7 @@ class D4rl(_Steps):
 
     @staticmethod
     def is_layout(file: Group) -> bool:
-        """Return whether a file has the arrays of one."""
+        """Return whether a file has the arrays of D4RL."""
         return file.array("terminals") is not None and file.array("observations") is not None
 
     @contextmanager
@@ -106,7 +106,7 @@ class D4rl(_Steps):
 
 
 def open_npz(path: Path) -> DataSet | None:
-    """Open a data set of OGBench; None if the file is no archive of arrays with `terminals`."""
+    """Open a data set of OGBench; None if the file is not an npz file with the array `terminals`."""
     if path.suffix != ".npz" or not path.is_file():
         return None
     with _raising_log_errors(path), zipfile.ZipFile(path) as archive:
@@ -166,7 +166,7 @@ class _Npz(_Steps):
 
 @contextmanager
 def _raising_log_errors(path: Path) -> Iterator[None]:
-    """Raise LogError for what the readers of a damaged archive raise."""
+    """Convert the errors of reading a damaged archive to LogError."""
     try:
         yield
     except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
@@ -174,10 +174,10 @@ def _raising_log_errors(path: Path) -> Iterator[None]:
 
 
 def _npy_header(stream: BinaryIO, what: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return the shape and the type of an array, without its numbers.
+    """Read the shape and the type of an array, without its numbers.
 
     Raises:
-        LogError: it is none.
+        LogError: the stream is not an array of NumPy.
     """
     headers = np.lib.format
     try:

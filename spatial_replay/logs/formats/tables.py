@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _LARGEST_INFO: Final = 64 * 2**20
-"""Bytes of a metadata file."""
+"""Largest metadata file, bytes."""
 
 
 def read_head(file: Path) -> bytes:
-    """Read a metadata file; nothing of a file that is missing, and no more than its largest size."""
+    """Read a metadata file up to `_LARGEST_INFO`; return b"" for a missing file."""
     if not file.is_file():
         return b""
     with file.open("rb") as stream:
@@ -55,7 +55,7 @@ def arrow() -> Any:
 
 
 def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
-    """Return a column as (T,) or (T, W) float64; null is NaN; None for texts, and rows of several lengths."""
+    """Return a column as (T,) or (T, W) float64, null as NaN; None for texts, or lists of several lengths."""
     library = arrow()
     types = library.types
     array, widths = column.combine_chunks(), list[int]()

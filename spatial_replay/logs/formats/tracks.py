@@ -1,7 +1,7 @@
-"""Track JSONL, track CSV and the Stanford Drone Dataset, and their shared lines, objects and columns.
+"""Read track JSONL, track CSV and the Stanford Drone Dataset; shared parsing of lines and objects.
 
-A text file may be plain or gzip, and damaged anywhere. A line that cannot be read costs its own sample only,
-so each is checked by itself.
+A text file may be plain or gzip, and damaged anywhere. An unreadable line loses only its own sample, so each
+line is checked separately.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from spatial_replay.trace.trace import LATEST_NS, Trace, class_order, require_fe
 
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20
-"""Bytes; a line beyond this is a file of another kind, or damage."""
+"""Longest line, bytes; a longer line is damage, or in a file of another kind."""
 
 MOST_BLANK_LINES = 10_000_000
-"""Limit for a file; later lines are not read."""
+"""Most blank lines in a file; the lines after them are not read."""
 
 
 def open_text(path: Path) -> BinaryIO:
-    """Open a file for its bytes, decompressed if it begins as a gzip file does, whatever its name."""
+    """Open a file as bytes; a file with the gzip magic is decompressed, whatever its name."""
     with path.open("rb") as stream:
         magic = stream.read(len(GZIP_MAGIC))
     return cast(BinaryIO, gzip.open(path, "rb")) if magic == GZIP_MAGIC else path.open("rb")
 
 
 def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
-    """Yield each line that is not blank, numbered from 1; what cannot be read goes to `faults`."""
+    """Yield the lines that are not blank, with numbers from 1; unreadable lines go to `faults`."""
     number = blank = 0
     with open_text(path) as stream:
         while True:
@@ -80,7 +80,7 @@ def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
 
 @dataclass(slots=True)
 class ObjectReport:
-    """One object as a line of a log reports it, unchecked; the defaults stand for missing fields.
+    """The unchecked report of an object in a log; missing fields have the defaults.
 
     Attributes:
         vertices: x, y, x, y … of all parts.
@@ -101,7 +101,7 @@ class ObjectReport:
 
 
 class ReportedSample(NamedTuple):
-    """A sample as a file reports it; `place` says where it is there."""
+    """An unchecked sample of a file; `place` is its position there, for messages."""
 
     time_ns: int
     place: str
@@ -162,10 +162,10 @@ def iter_jsonl(path: Path, faults: FaultList, *, concave: Concave = "decompose")
 def iter_traces(
     samples: Iterable[ReportedSample], faults: FaultList, concave: Concave, *, most_reports: float = inf
 ) -> Iterator[Trace]:
-    """Yield reported samples in blocks; what has to be left out goes to `faults`.
+    """Yield reported samples in blocks; samples that are left out go to `faults`.
 
     Args:
-        most_reports: objects after which a block is closed, however few its samples are.
+        most_reports: number of object reports at which a block is closed.
     """
     block, count = list[ReportedSample](), 0
     for sample in samples:
@@ -286,7 +286,7 @@ def _signals(entry: Any) -> dict[str, float]:
 
 
 def _number(value: Any, what: str) -> float:
-    """Return the number; null, like NaN, stands for an unknown one."""
+    """Return the number; null and NaN stand for an unknown number."""
     if value is None:
         return nan
     if type(value) is not int and type(value) is not float:
@@ -311,7 +311,7 @@ def _check_keys(entry: dict[str, Any], keys: set[str], what: str) -> None:
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
-    """Return whether a text fits UTF-8, unlike the halves of surrogate pairs that JSON can spell."""
+    """Return whether a text can be encoded as UTF-8; lone surrogates, which JSON can spell, cannot."""
     return is_encodable(text) if text else empty
 
 
@@ -335,7 +335,7 @@ CSV_COLUMNS = ("time_ns", "name", "class", "x", "y", "yaw", "length", "width")
 def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
     """Yield the samples of a track CSV in blocks.
 
-    A sample with a line that cannot be read is left out as a whole and goes to `faults`.
+    A sample with an unreadable line is left out, and the line goes to `faults`.
 
     Raises:
         LogError: the first line does not name the columns.
@@ -412,7 +412,7 @@ def _row_report(row: dict[str, str]) -> ObjectReport:
     yaw = _cell(row, "yaw") if row["yaw"].strip() else nan
     if length < 0 or width < 0:
         raise _NoSampleError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
-    # the cosine and sine of an orientation that is not finite make the box unknown
+    # for an orientation that is not finite, NaN as cosine and sine makes the box unknown
     c, s = (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
     vertices: list[float] = []
     for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)):
@@ -421,7 +421,7 @@ def _row_report(row: dict[str, str]) -> ObjectReport:
 
 
 def _cell(row: dict[str, str], column: str) -> float:
-    """Return the number in a cell; an empty one stands for an unknown number."""
+    """Return the number in a cell; an empty cell stands for an unknown number."""
     text = row[column].strip()
     try:
         return float(text) if text else nan
@@ -431,12 +431,12 @@ def _cell(row: dict[str, str], column: str) -> float:
 
 
 FRAMES_A_SECOND = 30.0
-"""The rate of the dataset's videos."""
+"""Frame rate of the dataset's videos, Hz."""
 
 DRONE_COLUMNS = ("id", "xmin", "ymin", "xmax", "ymax", "frame", "lost", "occluded", "generated", "label")
 
 _LARGEST = 10**18 - 1
-"""Any integer of so many digits fits 64 bits."""
+"""Largest integer of 18 digits; all integers of 18 digits fit 64 bits."""
 
 
 _PACKED = struct.Struct("<qqq?4d")
@@ -445,11 +445,11 @@ _BOX = np.dtype([("id", "<i8"), ("frame", "<i8"), ("label", "<i8"), ("lost", "?"
 _Boxes: TypeAlias = NDArray[np.void]
 
 _BLOCK_BOXES = 2**16
-"""A block is closed when it holds this many, however few its frames are."""
+"""Number of boxes at which a block is closed."""
 
 
 def is_annotations(head: bytes) -> bool:
-    """Return whether some whole line at the beginning of a file is a row of annotations."""
+    """Return whether a complete line in the first bytes of a file is a row of annotations."""
     lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")
     return any(map(_is_row, lines[:1] if len(lines) == 1 else lines[:-1]))
 
@@ -462,16 +462,16 @@ def iter_annotations(
     rate: float = FRAMES_A_SECOND,
     lost: Lost = "drop",
 ) -> Iterator[Trace]:
-    """Yield the frames of an `annotations.txt` in blocks; a frame that the file names is a sample.
+    """Yield the samples of an `annotations.txt` in blocks; each frame in the file is a sample.
 
-    Files are ordered by object, so the first frame is complete only after the last line. All boxes are read
-    first, as plain columns of 57 bytes a line; samples are built block by block.
+    Files are ordered by object, so the first frame is complete only after the last line. So all boxes are
+    read first, in 57 bytes a line, and samples are built block by block.
 
-    A frame with a line that cannot be read is left out as a whole and goes to `faults`.
+    A frame with an unreadable line is left out, and the line goes to `faults`.
 
     Args:
-        concave: has no effect, since boxes are convex.
-        rate: frames a second; frame 0 is at time 0.
+        concave: without effect, because boxes are convex.
+        rate: frames per second; frame 0 is at time 0.
         lost: whether rows marked as out of the picture are dropped or kept.
     """
     boxes, labels, broken = _read_boxes(path, faults, _last_frame(rate))
@@ -498,11 +498,10 @@ def iter_annotations(
 
 
 def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes, list[str], set[int]]:
-    """Read every line that can be read.
+    """Read all readable lines.
 
     Returns:
-        the boxes by frame, in the file's order within each; their labels; the frames of lines that cannot be
-        read.
+        the boxes sorted by frame, in file order within a frame; their labels; the frames of unreadable lines.
     """
     packed, labels, broken = bytearray(), dict[str, int](), set[int]()
     for number, line in iter_lines(path, faults):
@@ -549,7 +548,7 @@ def _integer(text: str, what: str, last: int) -> int:
 
 
 def _last_frame(rate: float) -> int:
-    """Return the last frame whose time fits a sample."""
+    """Return the last frame whose time a sample can have."""
     last = LATEST_NS // frame_times(rate) - 1
     return min(max(last, 0), _LARGEST)
 
@@ -557,7 +556,7 @@ def _last_frame(rate: float) -> int:
 def _observations(
     times_ns: Integers, sample: Integers, boxes: _Boxes, classes: tuple[str | None, ...]
 ) -> Observations:
-    """Return boxes, each in a sample, as observations."""
+    """Return boxes as observations; `sample` is the sample index of each box."""
     numbers, name = np.unique(boxes["id"], return_inverse=True)
     count, corners = len(boxes), boxes["corners"]
     return Observations(
@@ -569,7 +568,7 @@ def _observations(
         classes=classes,
         yaw=np.full(count, np.nan),
         uncertainty=np.zeros(count),
-        # counter-clockwise where y grows upwards
+        # counter-clockwise corners if y points up
         shapes=FootprintBatch(
             part_start=np.arange(count + 1, dtype=np.int64),
             vertex_start=np.arange(count + 1, dtype=np.int64) * 4,

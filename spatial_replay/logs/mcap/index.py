@@ -1,7 +1,7 @@
-"""The directory of an MCAP file: its chunks and attachments, by its summary or, failing that, by a scan.
+"""The directory of an MCAP file: its chunks and attachments, from its summary or from a scan.
 
-Summaries are optional, and an interrupted recorder writes none. Then the file is scanned from its beginning;
-a damaged part is skipped up to the next chunk that is consistent in itself.
+Summaries are optional, and an interrupted recorder writes none. A file without a summary is scanned from its
+beginning. A damaged part is skipped up to the next chunk with a consistent head.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from spatial_replay.logs.topics import LIBRARY, MAGIC
 from spatial_replay.text import Instant, Sentence
 
 RECORD_HEAD = struct.Struct("<BQ")
-"""Opcode and length of the body that follows."""
+"""Head of a record: opcode, and length of the body that follows."""
 CHUNK_HEAD = struct.Struct("<QQQII")
-"""Times of the first and the last message, size, checksum, and the length of the compression's name."""
+"""Head of a chunk: first and last time, size, checksum, and length of the compression's name."""
 LARGEST_CHUNK = 2**30
-"""Bytes, uncompressed; a chunk that claims more is damaged."""
+"""Largest chunk, uncompressed, bytes; a chunk that claims more is damaged."""
 
 _Record = TypeVar("_Record")
 
 
 class DamageError(Exception):
-    """Bytes that are not what they should be. The text says what is wrong; the catcher knows where."""
+    """Damaged bytes. The text describes the damage; the handler adds the place."""
 
 
 def encode_records(*several: records.McapRecord) -> bytes:
-    """Encode records one after the other, each with its head."""
+    """Encode and concatenate records, each with its head."""
     builder = RecordBuilder()
     for record in several:
         record.write(builder)
@@ -50,7 +50,7 @@ def encode_records(*several: records.McapRecord) -> bytes:
 
 
 def decode_record(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Record:
-    """Decode the record in a body.
+    """Decode the body of a record.
 
     Raises:
         DamageError: the body is too short, or holds impossible lengths or texts that are not UTF-8.
@@ -62,15 +62,15 @@ def decode_record(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Re
 
 
 class ChunkPlace(NamedTuple):
-    """Where some records are in the file.
+    """Place of a chunk in the file, or of consecutive messages outside chunks.
 
     Attributes:
-        offset, length: of the record with its head, in bytes.
+        offset, length: place of the record with its head, bytes.
         start_ns, end_ns: log times of its first and last message.
-        compressed: whether it is a chunk; else records outside chunks.
-        channels: those with messages in it, by the index; None where it does not say.
-        has_checksum: whether a chunk must have a checksum, as those of our own logs do.
-        size: bytes that a chunk decompresses to, by the index or by its head; 0 for records outside chunks.
+        compressed: whether it is a chunk; False for messages outside chunks.
+        channels: channels of its messages, from the index; None if the index lists none.
+        has_checksum: whether the chunk must have a checksum, as in our own logs.
+        size: decompressed size of a chunk, from the index or its head, bytes; 0 outside chunks.
     """
 
     offset: int
@@ -84,14 +84,14 @@ class ChunkPlace(NamedTuple):
 
 
 def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
-    """Return the place of a chunk by the beginning of its record, if that is consistent in itself.
+    """Return the place of a chunk from the beginning of its record.
 
     Args:
-        record: the first bytes of the record, at least 64 unless the file ends.
-        length: of the record with its head.
+        record: first bytes of the record, at least 64 unless the file ends.
+        length: length of the record with its head, bytes.
 
     Raises:
-        DamageError: it is not.
+        DamageError: the head of the chunk is inconsistent.
     """
     fixed = RECORD_HEAD.size + CHUNK_HEAD.size
     if len(record) < fixed:
@@ -107,7 +107,7 @@ def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
 
 
 def _uncompressed_content(offset: int, record: bytes, following: int) -> int | None:
-    """Return where the records in an uncompressed chunk begin; None if this is no such chunk."""
+    """Return the offset of the records in an uncompressed chunk; None for another record."""
     if record[0] != Opcode.CHUNK:
         return None
     with suppress(DamageError):
@@ -118,37 +118,38 @@ def _uncompressed_content(offset: int, record: bytes, following: int) -> int | N
 
 
 _UNCOMPRESSED_HEAD_BYTES = RECORD_HEAD.size + CHUNK_HEAD.size + 8
-"""Up to the records of a chunk whose compression has no name."""
+"""Offset of the records in an uncompressed chunk, bytes."""
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _SIZE_BYTES = 8
-"""At the end of the index of a chunk: what it decompresses to."""
+"""Length of the decompressed size, the last field of a chunk index, bytes."""
 _MESSAGE_INDEX = struct.Struct("<H8x")
-"""Only the channel matters here."""
+"""Channel and offset of a message index; the offset is not read."""
 _LOOSE_BYTES = 2**22
-"""Messages outside of chunks are read together up to here: one by one, each would be a seek."""
+"""Most bytes of messages outside chunks that are read together; single messages would take a seek each."""
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
-"""Bytes that a search for the next chunk reads at a time."""
+"""Read size of a search for the next chunk, bytes."""
 _MOST_GAPS = 1_000
-"""Damaged stretches after which the rest of a file is not searched."""
-# a chunk has no mark of its own: a search looks for the name of its compression, behind its length
+"""Number of damaged parts after which the rest of a file is not searched."""
+# a chunk has no magic bytes, so a search looks for the name of its compression with the length before it:
+# https://mcap.dev/spec#chunk-op0x06
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _BEFORE_COMPRESSION = RECORD_HEAD.size + 28
 
 
 @dataclass(slots=True)
 class Directory:
-    """Places in a file, and what its summary declares.
+    """Places of records in a file, and its declarations outside chunks.
 
     Attributes:
-        header: None where it cannot be read.
-        schemas, channels: declared outside chunks, by number.
-        chunks: in the order of the file.
+        header: header record; None if it cannot be read.
+        schemas, channels: declarations outside chunks, by number.
+        chunks: places of chunks, in file order.
         attachments, metadata: offset and length of each such record with its head.
-        statistics: None without a summary.
-        skipped: how many records of kinds that the format reserves for later a scan came across.
+        statistics: statistics of the summary; None without a summary.
+        skipped: number of records with reserved opcodes that a scan skipped.
     """
 
     header: records.Header | None = None
@@ -162,7 +163,7 @@ class Directory:
 
 
 def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
-    """Read the directory of an MCAP file; what is wrong with the file goes to `faults`."""
+    """Read the directory of an MCAP file; damage goes to `faults`."""
     size = stream.seek(0, os.SEEK_END)
     try:
         directory = _from_summary(stream, size)
@@ -179,32 +180,32 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
 
 
 def _is_own(header: records.Header | None) -> bool:
-    """Return whether we wrote a log: then all of it has checksums, and one that is missing is damage."""
+    """Return whether our writer wrote a log; its logs have all checksums, so a missing one is damage."""
     return header is not None and header.library == LIBRARY
 
 
 def has_summary(stream: BinaryIO) -> bool:
-    """Return whether a file ends with a footer that points to a summary; without one, it is scanned."""
+    """Return whether a file ends with a footer that points to a summary; other files are scanned."""
     tail = _tail(stream, stream.seek(0, os.SEEK_END))
     return any(tail[RECORD_HEAD.size : RECORD_HEAD.size + 8])
 
 
 def _tail(stream: BinaryIO, size: int) -> bytes:
-    """Return the footer of a file and what follows; nothing without one."""
+    """Return the footer and the closing magic of a file; b"" without a footer."""
     stream.seek(max(0, size - _FOOTER_BYTES - len(MAGIC)))
     tail = stream.read()
     return tail if tail.endswith(MAGIC) and tail.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) else b""
 
 
 class _NoSummaryError(Exception):
-    """A file without a summary, or with an incomplete one, as other writers may make it."""
+    """A file without a complete summary; other writers may leave out parts of it."""
 
 
 def _from_summary(stream: BinaryIO, size: int) -> Directory:
     """Read the directory from a file's own summary.
 
     Raises:
-        _NoSummaryError: there is no summary, or one that leaves something out.
+        _NoSummaryError: the summary is missing or incomplete.
         DamageError: the end of the file is missing or damaged.
     """
     directory = Directory(header=_header(stream))
@@ -288,7 +289,12 @@ def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
 
 
 def _check_complete(directory: Directory, end: int) -> None:
-    """Check that a summary is complete; other writers may leave out parts of theirs."""
+    """Check that a summary is complete; other writers may leave out parts of it.
+
+    Raises:
+        _NoSummaryError: the summary is incomplete.
+        DamageError: the summary points outside the file.
+    """
     statistics = directory.statistics
     kinds = ("schema", "channel", "chunk", "attachment", "metadata")
     counts = [getattr(statistics, f"{kind}_count", None) for kind in kinds]
@@ -303,15 +309,15 @@ def _check_complete(directory: Directory, end: int) -> None:
 
 
 class _Scan:
-    """One pass over the records of a file, skipping their contents.
+    """A scan of the records of a file, which skips their contents.
 
-    The records of an uncompressed chunk that breaks off are read as records outside chunks.
+    The records in an uncompressed chunk that breaks off are read as records outside chunks.
     """
 
     def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
         self._stream = stream
         self._size = size
-        # beyond the size inside a chunk that breaks off
+        # greater than the size while the scan is inside a chunk that breaks off
         self._end = size
         self._faults = faults
         self._name = name
@@ -355,7 +361,7 @@ class _Scan:
         self._faults.add(Sentence(what, *when, " cannot be read"))
 
     def _record(self, position: int) -> int:
-        """Take in the record at a position; return where the next one begins."""
+        """Read the record at a position; return the position of the next record."""
         self._stream.seek(position)
         beginning = self._stream.read(_CHUNK_HEAD_BYTES)
         if len(beginning) < RECORD_HEAD.size:
@@ -371,6 +377,7 @@ class _Scan:
             self._end_loose()
             self._end = following
             return content
+        # opcodes below 0x80 are reserved for later versions of the format: https://mcap.dev/spec#records
         if max(Opcode) < opcode < 0x80:
             self._skip(opcode, beginning, following)
         if opcode == Opcode.CHUNK:
@@ -396,12 +403,16 @@ class _Scan:
                 raise DamageError("the data end within a chunk")
             if self._next_chunk(following) is not None:
                 raise DamageError("the data end before the last chunk")
-            # what follows repeats what was read already
+            # the summary section repeats records that were read already
             self._ended = True
         return following
 
     def _skip(self, opcode: int, beginning: bytes, following: int) -> None:
-        """Count a record of a kind that is not known yet; raise DamageError if it is none."""
+        """Count a record with a reserved opcode.
+
+        Raises:
+            DamageError: no record follows it, or the bytes are a chunk with a damaged opcode.
+        """
         self._stream.seek(following)
         head = self._stream.read(RECORD_HEAD.size)
         is_followed = following == self._size - len(MAGIC)
@@ -409,7 +420,7 @@ class _Scan:
             after, length = RECORD_HEAD.unpack(head)
             is_followed = is_followed or (after != 0 and following + RECORD_HEAD.size + length <= self._size)
         with suppress(DamageError):
-            # a chunk whose opcode is damaged
+            # a consistent head of a chunk: only the opcode is damaged
             chunk_place(0, beginning, RECORD_HEAD.size + RECORD_HEAD.unpack_from(beginning)[1])
             is_followed = False
         if not is_followed:
@@ -417,7 +428,7 @@ class _Scan:
         self._directory.skipped += 1
 
     def _message(self, position: int, beginning: bytes, following: int) -> None:
-        """Put a message outside chunks into a place with its neighbours."""
+        """Add a message outside chunks to the place of the messages before it."""
         if len(beginning) < RECORD_HEAD.size + 22 or following - position < RECORD_HEAD.size + 22:
             raise DamageError("a message breaks off")
         time_ns = int.from_bytes(beginning[RECORD_HEAD.size + 6 : RECORD_HEAD.size + 14], "little")
@@ -436,7 +447,7 @@ class _Scan:
             self._loose = None
 
     def _next_chunk(self, position: int) -> ChunkPlace | None:
-        """Return the next chunk that is consistent in itself, from a position on."""
+        """Return the next chunk with a consistent head, from a position on; None if there is none."""
         overlap = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
         while position < self._size:
             self._stream.seek(position)
@@ -455,7 +466,7 @@ class _Scan:
 
 
 def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
-    """Yield where a chunk would begin, by the name of its compression, in order."""
+    """Yield the possible offsets of chunks, in order, from the name of their compression."""
     at = window.find(mark)
     while at >= 0:
         if at >= _BEFORE_COMPRESSION:
@@ -470,13 +481,13 @@ _ATTACHMENT_NUMBERS = 32
 def iter_attachments(
     stream: BinaryIO, directory: Directory, faults: FaultList, name: str
 ) -> Iterator[Attachment]:
-    """Yield the attachments of a file that can be read; the others go to `faults`."""
+    """Yield the readable attachments of a file; damaged attachments go to `faults`."""
     for offset, length in directory.attachments:
         stream.seek(offset + RECORD_HEAD.size)
         body = stream.read(length - RECORD_HEAD.size)
         try:
             record = decode_record(records.Attachment.read, body)
-            # behind the fields that are known there may be others
+            # later versions of the format may append fields: https://mcap.dev/spec#records
             texts = len(record.name.encode()) + len(record.media_type.encode())
             size = _ATTACHMENT_NUMBERS + texts + len(record.data)
             checksum = int.from_bytes(body[size : size + 4], "little")
@@ -491,7 +502,7 @@ def iter_attachments(
 def iter_metadata(
     stream: BinaryIO, directory: Directory, faults: FaultList, name: str
 ) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield the metadata records of a file that can be read, with their names; the others go to `faults`."""
+    """Yield the readable metadata records of a file with their names; damaged ones go to `faults`."""
     for offset, length in directory.metadata:
         stream.seek(offset + RECORD_HEAD.size)
         try:
@@ -503,7 +514,7 @@ def iter_metadata(
 
 
 def check_attachments(stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
-    """Report to `faults` the attachments and metadata that cannot be read: copies of the log lose them."""
+    """Report damaged attachments and metadata to `faults`, because copies of the log lose them."""
     for iter_records in (iter_attachments, iter_metadata):
         for _ in iter_records(stream, directory, faults, name):
             pass

@@ -3,8 +3,8 @@
 The reader is our own for two reasons. The MCAP library fails 112 of the 416 files of the format's conformance
 suite. It gives up on truncated and unindexed files, which crashed recorders leave behind.
 
-Chunks may overlap in time. So they are read in the order of their first message, and a message is handed
-out only when no later chunk can hold an earlier one.
+Chunks may overlap in time. So they are read in the order of their start times, and a message is yielded only
+when no later chunk can hold an earlier one.
 """
 
 from __future__ import annotations
@@ -69,29 +69,29 @@ from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
-"""Bytes, and times its own size, that a chunk or a message may decompress to: no recorder's needs more."""
+"""Limits of a decompressed chunk or message: bytes that are always allowed, and compression ratio."""
 _ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
-"""Bytes, and times the size of the log, of messages that wait until all chunks before them are read."""
+"""Limits of messages that wait for earlier chunks: bytes, and multiple of the log; the larger counts."""
 _AHEAD_BYTES: Final = 2**24
-"""Bytes of chunks, decompressed, that are read ahead; one chunk for each core at least."""
+"""Most decompressed bytes of chunks that are read ahead; at least one chunk per core is."""
 BLOCK_BYTES = 64 * 2**20
-"""A block of messages is closed when it holds this much, however few its samples are."""
+"""Size of messages at which a block is closed, bytes."""
 AFTER_ALL_NS = 2**64
-"""Later than every time of MCAP, whose times are unsigned integers of 64 bits."""
+"""A time after all times of MCAP, which are unsigned 64-bit integers."""
 _LEAST_BOUND: Final = 2**20
-"""Bytes that a chunk may hold whatever the index says: some writers leave the size out."""
+"""Size that a chunk may always have, bytes; some writers leave the size out of the index."""
 _LONGEST_HEAD: Final = 80
 _CHANNELS: Final = 2**16
-"""As many as a file can have."""
+"""Number of channels that a file can have."""
 
 
 def most_waiting(lengths: Iterable[int]) -> int:
-    """Return the bytes of messages that may wait for others, by the lengths of all chunks."""
+    """Return the most bytes of messages that may wait for earlier chunks, from the lengths of all chunks."""
     return max(_ALWAYS_WAITING, _MOST_TIMES_WAITING * sum(lengths))
 
 
 def too_many_waiting(name: str, most: int) -> LogError:
-    """Return the error that more messages wait than that."""
+    """Return the error for waiting messages of more than `most` bytes."""
     return LogError(
         f"{name}: chunks that overlap in time hold more than {most} bytes of messages, far more than the log;"
         " give a part of it by --start and --end, or fewer topics"
@@ -99,10 +99,10 @@ def too_many_waiting(name: str, most: int) -> LogError:
 
 
 def _content(place: ChunkPlace, record: bytes) -> bytes:
-    """Return the records in what was read of a place, decompressed.
+    """Return the decompressed records of a place.
 
     Raises:
-        DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
+        DamageError: the chunk breaks off, does not decompress, or fails its checksum.
     """
     if len(record) < place.length:
         raise DamageError("the chunk breaks off")
@@ -144,15 +144,16 @@ def _decompress(compression: bytes, data: memoryview, size: int) -> bytes:
 def iter_records(
     stream: BinaryIO, places: Sequence[ChunkPlace]
 ) -> Iterator[tuple[ChunkPlace, bytes | DamageError]]:
-    """Yield places with their records, decompressed, or with what is wrong with them, in this order.
+    """Yield places in their order, each with its decompressed records or its damage.
 
-    While the caller processes one, other threads read the next ones, so it must not use the stream.
+    Threads read ahead from the stream, so the caller must not use it.
     """
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
     reading, is_over = RLock(), False
 
     def read(place: ChunkPlace) -> bytes | DamageError:
         with reading:
+            # the caller may have closed the stream
             if is_over:
                 return b""
             stream.seek(place.offset)
@@ -162,7 +163,7 @@ def iter_records(
         except DamageError as damage:
             return damage
 
-    # a short log has one chunk, which no thread is needed for
+    # a short log has one chunk, which needs no thread
     records: Iterator[bytes | DamageError] = map(read, places)
     if len(places) > 1:
         records = each_ahead(read, places, cores(), _AHEAD_BYTES, lambda place: max(place.length, place.size))
@@ -184,13 +185,13 @@ _HEAD_BYTES: Final = _HEAD.itemsize
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """The records in some bytes that a reader needs, in their order.
+    """Messages and declarations in the bytes of a chunk, in their order.
 
     Attributes:
-        heads: (M,) of the messages.
-        payloads: of each, where it begins and ends.
+        heads: (M,) heads of the messages.
+        payloads: place of each message's payload in the bytes.
         declarations: opcodes and bodies of schemas and channels.
-        breaks_off: whether the last record is not whole.
+        breaks_off: whether the last record is incomplete.
     """
 
     heads: MessageHeads
@@ -200,7 +201,7 @@ class Records:
 
 
 def split_records(content: bytes, passed_over: Collection[int] = ()) -> Records:
-    """Return the messages and declarations in decompressed records, up to where one breaks off.
+    """Return the messages and declarations in decompressed records, up to an incomplete record.
 
     Args:
         passed_over: channels whose messages are left out.
@@ -225,7 +226,7 @@ def split_records(content: bytes, passed_over: Collection[int] = ()) -> Records:
 
 
 class ChunkWalk:
-    """The messages of a log by chunk, with the channels that have been declared so far."""
+    """The messages of a log by chunk, and the channels that are declared so far."""
 
     def __init__(
         self,
@@ -238,7 +239,7 @@ class ChunkWalk:
         """Begin with the channels that the directory declares.
 
         Args:
-            renamed: returns the channel on which to hand out the messages of one.
+            renamed: returns the channel that messages get in place of their channel in the log.
         """
         self._renamed = renamed
         self.stream = stream
@@ -257,7 +258,7 @@ class ChunkWalk:
     def iter_messages(
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
     ) -> Iterator[tuple[ChunkPlace, Messages]]:
-        """Yield the messages of some topics in each place; what is lost of them goes to the faults."""
+        """Yield the messages of wanted topics in each place; losses go to `faults`."""
         declared, passed_over = -1, set[int]()
         for place, content in iter_records(self.stream, places):
             if declared < len(self.channels):
@@ -269,7 +270,7 @@ class ChunkWalk:
                 continue
             messages = self._messages(place, split_records(content, passed_over), content)
             if declared < len(self.channels):
-                # those that were declared in this chunk
+                # this chunk declares channels, whose topics may not be wanted
                 topics = [self.channels[n].topic for n in messages.channel.tolist()]
                 messages = select(messages, np.flatnonzero(np.fromiter(map(is_wanted, topics), np.bool_)))
             yield place, messages
@@ -279,7 +280,7 @@ class ChunkWalk:
         return int(np.count_nonzero(self._is_objects[messages.channel]))
 
     def _messages(self, place: ChunkPlace, split: Records, content: bytes) -> Messages:
-        """Return the messages among the records of a place that can be used."""
+        """Return the valid messages of a place; report the number of invalid ones."""
         damage = self._take_in(split.declarations) or ("a record breaks off" if split.breaks_off else "")
         if damage:
             self._fault(place, f"{damage}; of the ", f", {len(split.heads)} could be read")
@@ -295,14 +296,17 @@ class ChunkWalk:
         return Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
 
     def _find_channels(self) -> None:
-        """Declare all channels of a log without a summary: chunks need not come in the order of time."""
+        """Declare all channels of a log without a summary.
+
+        Chunks are read in time order, but a channel may be declared only in a chunk that is later in time.
+        """
         for _, content in iter_records(self.stream, sorted(self.places, key=lambda place: place.offset)):
-            # the chunk is read again for its messages, and its damage reported then
+            # damage is reported when the chunk is read again for its messages
             if not isinstance(content, DamageError):
                 self._take_in(split_records(content).declarations)
 
     def _take_in(self, declarations: Iterable[tuple[int, bytes]]) -> str:
-        """Store declarations that are new; return what is wrong with one, or ""."""
+        """Store new declarations; return the damage of the first invalid one, or ""."""
         damage = ""
         for opcode, body in declarations:
             number = int.from_bytes(body[:2], "little")
@@ -327,7 +331,7 @@ class ChunkWalk:
         self.channels[channel.id] = self._renamed(declared)
 
     def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
-        """Report what happened to the messages in a place, in words before and after their times."""
+        """Report a fault of the messages in a place, in words before and after their times."""
         span = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
         where = f"{self.name}: at byte {place.offset}: "
         self.faults.add(Sentence(where, Sentence(before, *span, after)))
@@ -338,8 +342,8 @@ class McapSource(FileSource):
     """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source.
 
     Attributes:
-        keep: which of its other messages its blocks hold, as `is_kept` takes them. Chunks without these
-            topics are skipped, if chunks list their topics.
+        keep: patterns of the other topics in its blocks, see `is_kept`. Chunks without these topics are
+            skipped if the index lists the channels of chunks.
     """
 
     kind: str = "MCAP"
@@ -351,14 +355,14 @@ class McapSource(FileSource):
 
     @property
     def _given(self) -> Mapping[str, object]:
-        # a log of ours has the options that it was recorded with in its metadata
+        # our logs store the read options of their source in their metadata
         return {}
 
     @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """See `Source.iter_blocks`; derived topics, and those that `keep` does not name, are left out.
+        """See `Source.iter_blocks`; derived topics, and topics that `keep` does not match, are left out.
 
-        Only chunks that reach into the window are read, if the log has an index.
+        If the log has an index, only chunks that overlap the window are read.
         """
         renamed = set[Channel]()
         with self.open_walk(lambda channel: self._channel_of_copy(channel, renamed)) as walk:
@@ -367,7 +371,7 @@ class McapSource(FileSource):
             for messages in _blocks(walk, window, self.is_wanted):
                 yield decoder.block(messages)
             if not isinstance(self.path, RemoteFile) or window == (0, AFTER_ALL_NS):
-                # some seconds of a log elsewhere are not worth all its attachments
+                # a window of a remote log is read without the attachments, which would be downloaded whole
                 check_attachments(walk.stream, walk.directory, walk.faults, self.name)
             rest = walk.faults.take(last=True)
             fault = decoder.first_fault or next(iter(rest), None)
@@ -383,18 +387,18 @@ class McapSource(FileSource):
                 yield Block(trace, remarks=remarks, doubts=doubts)
 
     def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
-        """Yield the payloads of one topic in order, in lists of bounded size, each with what was lost."""
+        """Yield the payloads of one topic in order, in lists of bounded size, each with its faults."""
         with self.open_walk() as walk:
             for messages in _blocks(walk, (0, AFTER_ALL_NS), topic.__eq__):
                 yield list(messages.payloads), walk.faults.take()
             yield [], walk.faults.take(last=True)
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`; those that are damaged are left out."""
+        """See `Source.attachments`; damaged attachments are left out."""
         return self._beside[0]
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `Source.metadata`; records that are damaged are left out."""
+        """See `Source.metadata`; damaged records are left out."""
         return self._beside[1]
 
     @property
@@ -404,7 +408,7 @@ class McapSource(FileSource):
 
     @property
     def begin_ns(self) -> int | None:
-        """When the first chunk with samples begins, if the index says so."""
+        """Start of the first chunk with samples; None if the index lists no channels."""
         with self.open_walk() as walk:
             numbers = {number for number, channel in walk.channels.items() if channel.topic == OBJECTS}
             return next((p.start_ns for p in walk.places if p.channels and p.channels & numbers), None)
@@ -426,14 +430,14 @@ class McapSource(FileSource):
     def open_walk(
         self, renamed: Callable[[Channel], Channel] = lambda channel: channel
     ) -> Iterator[ChunkWalk]:
-        """Open the file for a walk over its chunks, whose faults begin with those of the index."""
+        """Open the file for a walk over its chunks; its faults begin with the faults of the index."""
         directory, faults = self._index
         with open_file(self.path) as stream:
             yield ChunkWalk(stream, directory, deepcopy(faults), self.name, renamed)
 
     @cached_property
     def _index(self) -> tuple[Directory, FaultList]:
-        """The directory and its faults, read once: without a summary, it takes a scan of the whole file."""
+        """The directory and its faults, cached because a log without a summary is scanned as a whole."""
         faults = FaultList()
         with open_file(self.path) as stream:
             return read_directory(stream, faults, self.name), faults
@@ -448,9 +452,9 @@ class McapSource(FileSource):
             return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
 
     def _channel_of_copy(self, channel: Channel, renamed: set[Channel]) -> Channel:
-        """Return the channel that a copy has; collect it if that is on another topic."""
+        """Return the channel in a copy; add `channel` to `renamed` if the copy has another topic."""
         copied = copied_channel(channel)
-        # in a log that we did not write, others may have used our topics with our types
+        # other programs may write our topics, even with our types
         is_ours = has_our_type(channel) and METADATA in dict(self.metadata())
         if is_ours or channel.topic == OBJECTS or copied == channel:
             return channel
@@ -473,14 +477,14 @@ class McapSource(FileSource):
 
 
 def is_samples(channel: Channel) -> bool:
-    """Return whether the messages of a channel are samples of ours."""
+    """Return whether the messages of a channel are our samples."""
     return channel.topic == OBJECTS and has_our_type(channel)
 
 
 def directory_remarks(
     name: str, directory: Directory, metadata: Sequence[tuple[str, Mapping[str, str]]]
 ) -> tuple[str, ...]:
-    """Return what to say about a log with skipped records, or one recovered from a damaged one."""
+    """Return remarks on skipped records, and on the recovery of the log from a damaged one."""
     skipped = (
         (f"{name}: {plural(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
         if directory.skipped
@@ -495,7 +499,7 @@ def directory_remarks(
 
 
 def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]) -> Iterator[Messages]:
-    """Yield the messages of the topics wanted, in order, in blocks of bounded size."""
+    """Yield the messages of wanted topics in time order, in blocks of bounded size."""
     start_ns, end_ns = window
     numbers = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
     places = [
@@ -516,6 +520,7 @@ def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str],
         samples += walk.sample_count(messages)
         if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
             ordered = _in_order(waiting)
+            # chunks are sorted by start, so no later chunk has a message before the start of the next one
             ready = int(np.searchsorted(ordered.log_time_ns, places[number].start_ns))
             waiting = [ordered]
             if ready:
@@ -530,7 +535,7 @@ def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str],
 
 
 def _in_order(several: Sequence[Messages]) -> Messages:
-    """Join messages by log time, channel and sequence; those that share all three keep their order."""
+    """Join and sort messages by log time, channel and sequence; equal ones stay in their order."""
     joined = concatenate_tables([Messages(), *several])
     times = joined.log_time_ns
     if (times[1:] > times[:-1]).all():
@@ -545,12 +550,12 @@ def decode_samples(
     report: Callable[[Sentence], None],
     concave: Concave = "decompose",
 ) -> tuple[Trace, Integers]:
-    """Decode samples of ours; return them, and the places of those that can be used.
+    """Decode our samples; return them, and the places of the valid samples among the messages.
 
     Args:
-        places: of the samples among the messages.
-        latest_ns: the time after which they have to come.
-        report: takes what is wrong with the others.
+        places: places of all samples among the messages.
+        latest_ns: time of the previous sample; valid samples are later.
+        report: receiver of the faults of invalid samples.
     """
     times = messages.log_time_ns[places]
     before = np.maximum.accumulate(np.append(latest_ns, times))[:-1]
@@ -564,12 +569,12 @@ def decode_samples(
 
 
 def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
-    """Return the places of messages but those in `own`, except those in `sound`."""
+    """Return the places of all messages, except places that are in `own` but not in `sound`."""
     return np.setdiff1d(np.arange(len(messages)), np.setdiff1d(own, sound))
 
 
 class _BlockDecoder:
-    """Decodes messages to blocks; remembers the latest sample, after which the next one has to come."""
+    """Decodes messages to blocks; stores the latest sample time, because later samples must be later."""
 
     def __init__(self, source: McapSource, walk: ChunkWalk) -> None:
         self._source = source
@@ -591,7 +596,7 @@ class _BlockDecoder:
         )
         self._latest_ns = int(columns.log_time_ns[sample_places].max(initial=self._latest_ns))
         if len(sound) < len(sample_places):
-            # a copy holds the samples that were read, and is sound
+            # a copy must be sound, so it gets the valid samples only
             columns = select(columns, without(columns, sample_places, sound))
         self.any_sample = self.any_sample or len(trace) > 0
         lost = self._walk.faults.take()
@@ -613,7 +618,7 @@ class _BlockDecoder:
 
 @dataclass(frozen=True, slots=True)
 class ChannelSummary:
-    """A channel and how many messages it has."""
+    """A channel and its number of messages."""
 
     channel: Channel
     messages: int
@@ -633,10 +638,10 @@ class LogSummary:
     """Content of an MCAP log.
 
     Attributes:
-        channels: by topic.
-        metadata: records in the order of the file; a name may occur more than once.
-        attachments: in the order of the file.
-        faults: what is damaged, each with its place.
+        channels: channels, sorted by topic.
+        metadata: records in file order; a name may occur more than once.
+        attachments: attachments in file order.
+        faults: damage, with its place.
     """
 
     channels: tuple[ChannelSummary, ...]
@@ -651,7 +656,7 @@ class LogSummary:
 
 
 def summarise_mcap(source: McapSource) -> LogSummary:
-    """Summarise an MCAP log; a log without a summary of its own is read as a whole for this."""
+    """Summarise an MCAP log; a log without a summary section is read as a whole."""
     with source.open_walk() as walk:
         counts, opened = _counts(walk), (walk.stream, walk.directory, walk.faults, source.name)
         channels = [ChannelSummary(channel, counts[number]) for number, channel in walk.channels.items()]

@@ -1,7 +1,7 @@
 """Write MCAP logs: messages in compressed chunks, each with its index, then the summary.
 
-The writer is our own because chunks have to be the same bytes for the same messages, however these were
-divided among calls.
+The writer is our own because equal messages must give equal bytes of chunks, however calls divide the
+messages.
 """
 
 from __future__ import annotations
@@ -34,23 +34,27 @@ from spatial_replay.logs.wire import Bytes, Payloads, stretches
 from spatial_replay.trace.trace import FOREVER
 
 CHUNK_BYTES = 512 * 2**10
-"""A chunk is closed when it holds this much, uncompressed."""
+"""Uncompressed size at which a chunk is closed, bytes."""
 CHUNK_NS = 10**9
-"""A chunk is closed before a message this much later than its first one."""
+"""Longest time between the messages of a chunk, nanoseconds."""
 WHOLE_CHUNK_NS = 10 * CHUNK_NS
-"""The same for a log that appears only when it is whole: fewer chunks are quicker and smaller."""
+"""`CHUNK_NS` for a log that appears only when it is complete: fewer chunks are faster and smaller."""
 REPEAT_NS = 5 * 10**9
-"""A channel is declared again in the second chunk with its messages, and in one this much after the last that
-declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
+"""Interval of the declarations of a channel, from the second chunk with its messages on, nanoseconds.
+
+Declarations in every chunk would add 15 % to an annotated log; these add up to 5 %.
+"""
 WAITING_BYTES = 64 * 2**20
-"""Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
+"""Most bytes of chunks that wait for compression; images and point clouds make large chunks."""
 _PART_BYTES: Final = 4 * 2**20
-"""Messages that are laid out as records at once."""
+"""Size of messages that are laid out as records at once, bytes."""
 COMPRESSION_LEVEL: Final = 1
-"""Coordinates hardly shrink further at higher levels, which take several times as long."""
+"""Zstandard level; higher levels take several times as long, and hardly shrink coordinates further."""
 _OWN_LEVEL, _OWN_HASH_LOG = -1, 12
-"""The same for our own messages, which resemble their predecessors. A small table finds the repetitions in
-three quarters of the time, for a twentieth more bytes."""
+"""Zstandard level and table size for our own messages, which resemble their predecessors.
+
+The small table takes a quarter less time, for 5 % more bytes.
+"""
 
 _HEAD: Final = np.dtype(
     [
@@ -66,17 +70,17 @@ _HEAD_BYTES: Final = _HEAD.itemsize
 # records MessageIndex and Chunk, field by field: https://mcap.dev/spec
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 _INDEX_ENTRY: Final = 16
-"""Bytes of an entry: log time and place in the chunk, of eight bytes each."""
+"""Size of an entry, bytes: log time and offset in the chunk, 8 bytes each."""
 _ZSTD: Final = "zstd"
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
 
 
 class _Records(NamedTuple):
-    """Records of some messages.
+    """Encoded records of M messages.
 
     Attributes:
-        content: their heads and payloads, one after the other.
-        channels, times_ns, sizes: of each message: number of its channel, log time, bytes of its record.
+        content: concatenated heads and payloads.
+        channels, times_ns, sizes: (M,) channel number, log time, and record size in bytes.
     """
 
     content: Bytes
@@ -87,14 +91,14 @@ class _Records(NamedTuple):
 
 @dataclass(slots=True)
 class _Lane:
-    """The open chunk of some topics.
+    """The open chunk of our topics, or of the other topics.
 
     Attributes:
-        is_own: whether the messages are ours, and so each much like the one before.
-        records: of its messages.
-        first_ns: the time of the first message.
-        size: of all records, in bytes.
-        began_s: when it began by the clock.
+        is_own: whether the topics are ours; our messages resemble their predecessors.
+        records: records of its messages.
+        first_ns: time of the first message.
+        size: size of all records, bytes.
+        began_s: clock time of its begin, seconds.
     """
 
     is_own: bool
@@ -105,7 +109,7 @@ class _Lane:
 
 
 def _run_ends(times_ns: Integers, lanes: Integers) -> list[int]:
-    """Return where each run of messages of one lane ends within which times do not fall."""
+    """Return the ends of runs of messages that share a lane and have times that do not decrease."""
     if len(lanes) == 1:
         return [1]
     breaks = np.flatnonzero((np.diff(times_ns) < 0) | (np.diff(lanes) != 0)) + 1
@@ -113,11 +117,11 @@ def _run_ends(times_ns: Integers, lanes: Integers) -> list[int]:
 
 
 class _PackedChunk(NamedTuple):
-    """A chunk with its index of messages, ready to be written.
+    """A chunk with its message indexes, ready to be written.
 
     Attributes:
-        summary: its entry in the summary; places count from the chunk on.
-        counts: how many messages there are, by channel.
+        summary: its index for the summary; offsets are relative to the chunk.
+        counts: number of messages by channel.
     """
 
     data: bytes
@@ -126,7 +130,7 @@ class _PackedChunk(NamedTuple):
 
 
 def _pack(lane: _Lane, declaring: bytes) -> _PackedChunk:
-    """Compress the chunk of a lane, which begins with some declarations, and make its index."""
+    """Compress the declarations and the messages of a lane to a chunk, and build its index."""
     contents, *columns = zip(*lane.records, strict=True)
     channels, times_ns, sizes = map(np.concatenate, columns)
     content = b"".join([declaring, *contents])
@@ -165,7 +169,8 @@ _local = local()
 
 
 def _compressor(is_own: bool) -> zstandard.ZstdCompressor:
-    """Return a compressor of this thread: one serves one thread at a time."""
+    """Return a compressor of this thread."""
+    # instances are not thread-safe: https://python-zstandard.readthedocs.io/en/latest/compressor.html
     if not hasattr(_local, "compressors"):
         parameters = zstandard.ZstdCompressionParameters.from_level(_OWN_LEVEL, hash_log=_OWN_HASH_LOG)
         _local.compressors = (
@@ -190,7 +195,7 @@ class _Summary:
     end_ns: int = 0
 
     def add(self, chunk: _PackedChunk, offset: int) -> None:
-        """Add a chunk that is written at a place in the file."""
+        """Add a chunk at its offset in the file."""
         index = chunk.summary
         places = {channel: offset + at for channel, at in index.message_index_offsets.items()}
         self.chunks.append(
@@ -201,7 +206,7 @@ class _Summary:
         self.end_ns = max(self.end_ns, index.message_end_time)
 
     def section(self, offset: int) -> bytes:
-        """Encode the section and the footer for a place in the file."""
+        """Encode the summary section and the footer for an offset in the file."""
         groups = (
             (Opcode.SCHEMA, encode_records(*self.schemas)),
             (Opcode.CHANNEL, encode_records(*self.channels)),
@@ -235,8 +240,12 @@ class _Summary:
 
 @dataclass(slots=True)
 class _Declaration:
-    """A channel and its schema as records, in how many chunks they were declared, and from when on the next
-    one does."""
+    """Records of a channel and its schema.
+
+    Attributes:
+        count: number of chunks that declare them.
+        due_ns: time from which the next chunk declares them.
+    """
 
     schema: bytes
     channel: bytes
@@ -247,11 +256,11 @@ class _Declaration:
 class LogWriter:
     """Writes one MCAP log to a stream, from its first byte to its last.
 
-    Equal calls give equal bytes. How messages are divided among calls makes no difference; a `clock`
-    makes one, because then a chunk is also closed when a second of its time has passed.
+    Equal messages give equal bytes, however calls divide them. With a `clock`, the bytes also depend on the
+    times of calls, because a chunk is closed after a second of the clock.
 
     Raises:
-        OutputError: from any method, when the stream cannot take what is written to it.
+        OutputError: from any method, if a write to the stream fails.
     """
 
     def __init__(
@@ -265,9 +274,9 @@ class LogWriter:
         """Begin a log.
 
         Args:
-            stream: takes bytes; need not seek. It is flushed after each chunk, and left open.
-            chunk_ns: a chunk is closed before a message this much later than its first one.
-            clock: seconds, for a log whose samples come in real time.
+            stream: binary stream, which need not seek. It is flushed after each chunk, and left open.
+            chunk_ns: longest time between the messages of a chunk.
+            clock: clock in seconds, for a log of samples in real time.
         """
         self._stream = stream
         self._path = Path(str(getattr(stream, "name", "the log")))
@@ -298,7 +307,7 @@ class LogWriter:
             self.close()
 
     def write(self, channel: Channel, log_time_ns: int, payload: bytes, *, sequence: int = 0) -> None:
-        """Add one message, published at its log time."""
+        """Add one message; its publish time is its log time."""
         self.write_messages(messages_of(channel, np.array([log_time_ns], np.int64), (payload,), sequence))
 
     def write_messages(self, messages: Messages) -> None:
@@ -313,7 +322,7 @@ class LogWriter:
         ends = np.cumsum(payloads.size)
         begin = 0
         while begin < len(messages):
-            # the memory of one part serves the next
+            # messages are written in parts, because the memory of one part is reused for the next
             filled = int(ends[begin]) - int(payloads.size[begin]) + _PART_BYTES
             end = max(begin + 1, int(np.searchsorted(ends, filled)))
             part = select(replace(messages, payloads=payloads), slice(begin, end))
@@ -321,7 +330,7 @@ class LogWriter:
             begin = end
 
     def _write_part(self, messages: Messages, numbers: Integers, lanes: Integers) -> None:
-        """Add messages that are not too many, given their channels' numbers and their lanes."""
+        """Add a part of messages; `numbers` (M,) are their channel numbers, `lanes` (M,) their lanes."""
         payloads = Payloads.of(messages.payloads)
         sizes = payloads.size + _HEAD_BYTES
         heads = np.zeros(len(messages), _HEAD)
@@ -331,7 +340,7 @@ class LogWriter:
         heads["sequence"] = messages.sequence
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
-        # the records of one lane are side by side
+        # records of one lane are adjacent, so that a run of messages is one slice
         order = np.argsort(lanes, kind="stable")
         starts = np.empty(len(messages), np.int64)
         starts[order] = np.cumsum(sizes[order]) - sizes[order]
@@ -345,7 +354,7 @@ class LogWriter:
             begin = end
 
     def _fill(self, number: int, part: _Records, starts: Integers, begin: int, end: int) -> None:
-        """Add messages of one lane whose times do not fall, as many at once as the open chunks take."""
+        """Add messages of one lane with times that do not decrease, as many at once as chunks hold."""
         times_ns = part.times_ns
         while begin < end:
             time_ns = int(times_ns[begin])
@@ -373,7 +382,7 @@ class LogWriter:
             begin = stop
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Add a metadata record, its keys in the order given, after closing the chunk."""
+        """Close the chunks, and add a metadata record with its keys in the given order."""
         self.flush()
         offset, length = self._write_record(records.Metadata(name, dict(data)))
         self._summary.metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
@@ -381,7 +390,7 @@ class LogWriter:
     def add_attachment(
         self, name: str, media_type: str, data: bytes, *, log_time_ns: int = 0, create_time_ns: int = 0
     ) -> None:
-        """Add an attachment, after closing the chunk; its times are left open unless given."""
+        """Close the chunks, and add an attachment; unknown times are 0."""
         self.flush()
         about: dict[str, Any] = {
             "create_time": create_time_ns,
@@ -414,7 +423,7 @@ class LogWriter:
             self._threads.shutdown(cancel_futures=True)
 
     def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
-        """Return (M,) channel numbers and (M,) lanes; channels that are new are numbered as they come."""
+        """Return (M,) channel numbers and (M,) lanes; new channels are numbered in order of appearance."""
         local_numbers, first = np.unique(messages.channel, return_index=True)
         number = np.zeros(int(local_numbers.max()) + 1, np.int64)
         lane = np.zeros(len(number), np.int64)
@@ -427,7 +436,7 @@ class LogWriter:
         return number[messages.channel], lane[messages.channel]
 
     def _declare(self, channel: Channel) -> None:
-        """Number a channel and its schema, and prepare the records that chunks declare them with."""
+        """Number a channel and its schema, and encode their declarations."""
         schema, described = channel.schema, b""
         if schema is not None:
             is_new = schema not in self._schemas
@@ -448,7 +457,7 @@ class LogWriter:
         self._declarations[declared.id] = _Declaration(described, encode_records(declared))
 
     def _end(self, number: int) -> None:
-        """Have the open chunk of a lane packed on another thread, and write those that are ready."""
+        """Close the open chunk of a lane: pack it on another thread, and write the chunks that are ready."""
         lane = self._lanes[number]
         self._lanes[number] = _Lane(lane.is_own)
         self._packing.append((lane.size, self._threads.submit(_pack, lane, self._declaring(lane))))
@@ -456,7 +465,7 @@ class LogWriter:
         self._write_ready_chunks(WAITING_BYTES)
 
     def _declaring(self, lane: _Lane) -> bytes:
-        """Return the declarations that a chunk begins with; each schema is in it once."""
+        """Return the declarations at the beginning of a chunk, each schema once."""
         start_ns = lane.first_ns
         counts = sum(np.bincount(part.channels, minlength=len(self._channels) + 1) for part in lane.records)
         declarations = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
@@ -472,7 +481,7 @@ class LogWriter:
         )
 
     def _write_ready_chunks(self, waiting_bytes: int) -> None:
-        """Write chunks in their order until no more bytes are waiting, and those that are ready."""
+        """Write packed chunks in order; wait for packing while more than `waiting_bytes` are pending."""
         while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
             size, packing = self._packing.popleft()
             chunk = packing.result()
@@ -482,7 +491,7 @@ class LogWriter:
             self._flush_stream()
 
     def _write_record(self, record: records.McapRecord) -> tuple[int, int]:
-        """Write a record; return its place and length."""
+        """Write a record; return its offset and length."""
         offset, content = self._offset, encode_records(record)
         self._write(content)
         return offset, len(content)
