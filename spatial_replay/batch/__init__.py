@@ -1,5 +1,6 @@
 """Many logs: a suite of cases in, rows of results out.
 
 `suite` reads the cases, and `rows` evaluates one log. `run` finds the logs and evaluates them with the
-processes of `workers`. `store` keeps rows; `run_table` and `outputs` compare and show them.
+processes of `workers`. `store` keeps rows, and `run_table` compares them. `overview`, `pages`, `junit` and
+`github` show them.
 """

@@ -1,4 +1,4 @@
-"""Curves of the logs that have a page, on one axis for each spec of the page over all logs."""
+"""Robustness curves for the page over all logs: one drawing per spec, one curve per log with a page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spatial_replay.report.panels import unpack_array, with_signs
 from spatial_replay.text import number_text, with_unit
 
 MOST_CURVES: Final = 60
-"""Curves of a spec, at most: the worst."""
+"""Curves per drawing; the worst are kept."""
 _MOST_POINTS: Final = 120
 _WIDTH: Final = 480.0
 _HEIGHT: Final = 120.0
@@ -31,13 +31,13 @@ _NUMBERS: Final = re.compile(
 
 
 class Curve(NamedTuple):
-    """The robustness of one result of a log, from its first sample to each one.
+    """The robustness of one result of a log, for the prefix up to each sample.
 
     Attributes:
-        title: of the log, with the object of a template.
-        address: of the page about the log.
+        title: name of the log, with the object of a template.
+        address: address of the page about the log.
         spec: name of the result.
-        times, values: (N,) each; NaN where it is not known.
+        times, values: (N,) each; NaN where the robustness is unknown.
     """
 
     title: str
@@ -49,10 +49,10 @@ class Curve(NamedTuple):
 
 
 def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
-    """Yield the curves of the results that a page about a log shows.
+    """Yield the curves in a page about a log.
 
     Args:
-        address: of the page, relative to the page over all logs.
+        address: address of the page, relative to the page over all logs.
     """
     content = page.read_bytes()
     facts, numbers = _FACTS.search(content), _NUMBERS.search(content)
@@ -65,7 +65,7 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
         places = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_POINTS)).astype(np.int64))
         if not samples:
             continue
-        # of the root, what it is up to each sample
+        # the series of the root holds the robustness of the prefix up to each sample
         values = unpack_array(result["series"], data)[:samples].astype(np.float64)
         title = f"{log}: {result['object']}" if result["object"] else log
         yield Curve(
@@ -79,7 +79,7 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
 
 
 def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
-    """Return the curves of a spec as a drawing, the worst on top, each a link to its page."""
+    """Return the curves of a spec as SVG. The worst is on top, and each curve links to its page."""
     finite = [curve for curve in curves if np.isfinite(curve.values).any()]
     worst_last = sorted(finite, key=lambda curve: -_final(curve))[-MOST_CURVES:]
     if not worst_last:
@@ -119,7 +119,7 @@ def _final(curve: Curve) -> float:
 
 
 def _lines(curve: Curve, end: float, high: float, size: float) -> Iterator[Html]:
-    """Yield the tip of a curve, a wide clear line to point at, and the line itself."""
+    """Yield the tooltip of a curve, a wide invisible line to point at, and the line itself."""
     yield element("title", f"{curve.title}, {curve.verdict}")
     pieces, is_open = list[str](), False
     for time, value in zip(curve.times, curve.values, strict=True):

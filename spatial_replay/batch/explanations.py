@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Row(NamedTuple):
-    """A row of the table of a run, and its place in it."""
+    """A row of the table of a run, with its place."""
 
     place: int
     case: str
@@ -39,8 +39,8 @@ class ExplanationTask(NamedTuple):
     """Results of one log to explain.
 
     Attributes:
-        keys: of the rows of each specification file; None for a file without such rows.
-        results: which results of the log.
+        keys: key of the rows of each specification file; None for a file without rows to explain.
+        results: results to explain.
     """
 
     task: Task
@@ -51,10 +51,9 @@ class ExplanationTask(NamedTuple):
 def explain_rows(
     table: pa.Table, places: Iterable[int], workers: Workers, progress: Progress = no_progress
 ) -> tuple[pa.Table, list[str]]:
-    """Return the table of a run in which the rows at some places are explained, and remarks on the others.
+    """Explain the rows of a run's table at some places. Return the table, and remarks on unexplained rows.
 
-    Rows that are explained already stay as they are. A log that is gone, or has changed, explains nothing:
-    a remark names it.
+    Explained rows are unchanged. A remark names each log that is missing or has changed.
     """
     import pyarrow as pa
 
@@ -66,7 +65,7 @@ def explain_rows(
     for row in (Row(place, **values) for place, values in zip(places, rows, strict=True)):
         if row.verdict is not None and row.explanation is None and row.case in record.cases:
             logs[row.case, row.log].append(row)
-    # two cases may ask for the same of a log
+    # two cases may request the same explanation
     requests: dict[ExplanationTask, list[Row]] = defaultdict(list)
     for rows_of_log in logs.values():
         requests[_task(record, rows_of_log)] += rows_of_log
@@ -93,7 +92,7 @@ def _task(record: RunRecord, rows: Sequence[Row]) -> ExplanationTask:
 
 
 def explanations_of(request: ExplanationTask) -> dict[ResultName, Explanation] | str:
-    """Return the explanations of results of a log, or why there are none."""
+    """Return the explanations of a log's results, or the reason why there are none."""
     task = request.task
     identity = identities_of((task.log,))[task.log]
     if identity is None:
@@ -121,7 +120,7 @@ def _explanation(row: ResultRow) -> Explanation:
 
 
 def failing_places(table: pa.Table, count: int | None = None) -> list[int]:
-    """Return the places of the rows that fail: of the worst `count`, or of all."""
+    """Return the places of the failing rows among the worst `count` rows, or among all."""
     places = range(len(table)) if count is None else worst_places(table, count)
     failures = table.column("failure").to_pylist()
     return [place for place in places if failures[place] is not None]
@@ -146,7 +145,7 @@ def explain_batch(
     """Return the result of a batch in which the rows at some places are explained.
 
     Args:
-        results: the folder of results, which keeps the explanations, too.
+        results: folder of results that also stores the explanations.
 
     Raises:
         OutputError: the folder cannot be written.

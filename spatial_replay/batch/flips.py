@@ -1,4 +1,4 @@
-"""Two runs of a batch over the same logs: which verdicts flipped, and which numbers got less."""
+"""Comparison of two batch runs over the same logs: flipped verdicts and lower robustness."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KINDS: Final[tuple[Kind, ...]] = ("flipped", "less", "more", "gone", "new")
 _LISTED: Final[Mapping[Kind, int]] = MappingProxyType(
     {"flipped": 20, "less": 10, "more": 5, "gone": 5, "new": 5}
 )
-"""Results of a kind that texts list; JSON has all."""
+"""Results that texts list, by kind of change. JSON has all results."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class ResultChange:
     """One result that differs between two runs.
 
     Attributes:
-        difference: with the verdicts of both; "untested" for a verdict that nothing tested.
-        unit: of both numbers, or "".
-        reason: what decided the worse one of the two verdicts, in a sentence.
+        difference: verdicts and numbers of both runs; "untested" for a verdict that nothing tested.
+        unit: unit of both numbers, or "".
+        reason: a sentence on the deciding atom of the worse verdict, or its error.
     """
 
     difference: Difference
@@ -40,7 +40,7 @@ class ResultChange:
 
     @property
     def kind(self) -> Kind:
-        """The change of the result between the two versions."""
+        """The kind of change between the two runs."""
         change = self.difference.change
         if change in ("verdict", "better"):
             return "flipped"
@@ -48,7 +48,7 @@ class ResultChange:
 
     @property
     def text(self) -> str:
-        """Both verdicts with their numbers, or that of the run which has the result."""
+        """Both verdicts with their numbers; only one if the other run lacks the result."""
         result = self.difference
         before, now = (
             "error" if verdict is None else f"{verdict} ({self._number(number)})"
@@ -79,9 +79,9 @@ class RunDiff:
     """Two runs side by side.
 
     Attributes:
-        logs, results: how many both have together.
+        logs, results: numbers of logs and results in the two runs together.
         changes: results that differ: flipped ones first, the worst first within each kind.
-        specs: how many results each spec has, by case, file and name.
+        specs: number of results of each spec, by case, file and name.
     """
 
     logs: int
@@ -95,7 +95,9 @@ class RunDiff:
         return tuple(change for change in self.changes if change.kind == "flipped")
 
     def lines(self, *kinds: Kind) -> Iterator[str]:
-        """Yield the results of some kinds, with reasons: of many, the first."""
+        """Yield lines on the results of some kinds, with reasons. A kind with many results lists the first
+        ones.
+        """
         for kind in kinds:
             changes = [change for change in self.changes if change.kind == kind]
             if changes:
@@ -109,7 +111,7 @@ class RunDiff:
                 yield f"  … and {len(changes) - _LISTED[kind]:,} more"
 
     def table(self) -> Iterator[str]:
-        """Yield how many results of each spec differ, in lines."""
+        """Yield the lines of a table that counts the changes of each spec."""
         yield f"{plural(self.logs, 'log')}, {plural(self.results, 'result')}"
         counts: dict[tuple[str, str, str], Counter[str]] = {spec: Counter() for spec in self.specs}
         edited = set()
@@ -152,16 +154,16 @@ def diff_runs(
 ) -> RunDiff:
     """Compare the tables of two runs, result by result.
 
-    Results are the same if case, log, specification file, spec and object are. A file that only the first
-    run has stands for one that only the second has.
+    Results are matched by case, log, specification file, spec and object. If each run has exactly one file
+    that the other run lacks, these two files are matched.
 
     Args:
-        tolerance: how much less is no change.
-        names: of the two, for errors.
-        explain: returns a table in which the rows at some places are explained.
+        tolerance: accepted loss of robustness.
+        names: names of the two runs, for errors.
+        explain: function that explains the rows of a table at some places.
 
     Raises:
-        UsageError: the runs have no result in common, or a tolerance without the unit of the results.
+        UsageError: the runs have no result in common, or the tolerance lacks the unit of the results.
     """
     unexplained = before, now
     before, now = _replace_untested_verdicts(_match_file_name(before, now)), _replace_untested_verdicts(now)
@@ -184,14 +186,14 @@ def diff_runs(
         changes.append(
             ResultChange(difference, row["unit"] or "", f"before: {reason}" if is_fixed else reason)
         )
-    # stable: the worst stay first within each kind
+    # the sort is stable, so the worst stay first within each kind
     changes.sort(key=lambda change: KINDS.index(change.kind))
     specs = Counter((case, file, spec) for case, _, file, spec, _ in rows)
     return RunDiff(len({log for _, log, *_ in rows}), len(rows), tuple(changes), specs)
 
 
 def _with_reasons(table: pa.Table, explained: pa.Table) -> pa.Table:
-    """Return a table with the reasons of another one, which has the same rows under other names."""
+    """Return a table with the reasons of another table that has the same rows."""
     index = table.schema.get_field_index("reason")
     return table.set_column(index, table.schema.field(index), explained.column("reason"))
 
@@ -206,7 +208,7 @@ def _example(table: pa.Table) -> str:
 
 
 def _match_file_name(table: pa.Table, other: pa.Table) -> pa.Table:
-    """Return a table in which the only file that another one lacks has the name of its counterpart there."""
+    """Rename the only file that another table lacks to the only file that this table lacks."""
     import pyarrow as pa
 
     files, others = (set(rows.column("file").to_pylist()) for rows in (table, other))
@@ -219,7 +221,7 @@ def _match_file_name(table: pa.Table, other: pa.Table) -> pa.Table:
 
 
 def _replace_untested_verdicts(table: pa.Table) -> pa.Table:
-    """Return a table with "untested" for verdicts that nothing tested."""
+    """Return a table with the verdict "untested" where nothing tested the spec."""
     import pyarrow.compute as pc
 
     is_untested = pc.fill_null(pc.equal(table.column("tested"), "nothing"), False)

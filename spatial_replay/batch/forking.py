@@ -1,4 +1,4 @@
-"""Processes that are copies of one that has imported everything already."""
+"""Fork server that imports all modules once, before it forks workers."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from multiprocessing.context import ForkServerContext
 
 
 def forking_context(modules: Sequence[str]) -> ForkServerContext:
-    """Start the process that others are copies of, with Ctrl-C blocked, which all of them inherit.
+    """Start the fork server with SIGINT blocked, and return its context.
 
-    Ctrl-C goes to all processes of a terminal; the first one decides.
+    Workers inherit the blocked signal. Ctrl-C reaches all processes of a terminal, and only the parent
+    handles it.
 
     Args:
-        modules: imported by that process, if it is not there yet.
+        modules: modules that the server imports, unless it runs already.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([*modules])
-    # it unblocks Ctrl-C itself when it starts
+    # before the signal is blocked, because `resource_tracker.ensure_running` unblocks SIGINT
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

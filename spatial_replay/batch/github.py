@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 
 _ANNOTATIONS: Final = 10
-"""GitHub shows no more of one kind for a step."""
+"""Annotations of one severity that GitHub shows per step."""
 _MOST_COMPARED: Final = 10_000
-"""Number of worst rows that are searched for failures of different kinds."""
+"""Worst rows that are searched for failures of different kinds."""
 
 
 def is_github() -> bool:
@@ -58,10 +58,10 @@ def annotation(
 
 
 def repository_path(file: str | Path) -> str:
-    """Return the path of a file as the tools of its repository know it: relative to the repository.
+    """Return the path of a file relative to its repository.
 
-    The repository is the folder of the job on GitHub, else the nearest folder above with a `.git`, else the
-    current one. A file elsewhere keeps its whole path, and an address stays.
+    The repository is the folder of the GitHub job, else the nearest parent of the current folder with a
+    `.git`, else the current folder. Files elsewhere keep their absolute path, and addresses are unchanged.
     """
     if is_address(file):
         return str(file)
@@ -78,10 +78,10 @@ def repository_path(file: str | Path) -> str:
 def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
     """Yield an annotation for each of the worst rows that fail, at the line of its spec.
 
-    Rows of one spec and verdict repeat only where there are not enough others.
+    Further rows of the same spec and verdict follow after all others.
 
     Args:
-        folder: what the paths of specifications are relative to.
+        folder: base of the paths of specifications.
     """
     rows = [row for row in worst_rows(table, _MOST_COMPARED) if row["failure"] is not None]
     kinds = Counter[tuple[str, str, str]]()
@@ -149,11 +149,11 @@ def _line(cells: list[str]) -> str:
 
 
 def _markdown_cell(sentence: str) -> str:
-    """Return a sentence, its formulas as code, that neither ends its cell nor becomes markup."""
+    """Return a sentence for a cell of a Markdown table: formulas as code, everything else escaped."""
     pieces = []
     for number, piece in enumerate(sentence_parts(sentence)):
         if number % 2:
-            # within code, a backslash escapes nothing but the end of a cell
+            # in code, a backslash escapes only a pipe: https://github.github.com/gfm/#tables-extension-
             fence = "`" * (max(map(len, _BACKQUOTES.findall(piece)), default=0) + 1)
             pad = " " if "`" in piece else ""
             pieces.append(f"{fence}{pad}{piece.replace('|', _PIPE)}{pad}{fence}")
@@ -168,7 +168,8 @@ _PIPE: Final = "\\|"
 
 
 def _data(text: str) -> str:
-    """Escape the message of a workflow command: a line break would begin another one."""
+    """Escape the message of a workflow command, in which a line break would begin another command."""
+    # the escapes of https://github.com/actions/toolkit, packages/core/src/command.ts
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
 
 

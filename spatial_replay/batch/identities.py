@@ -1,4 +1,4 @@
-"""Hashes of logs: equal logs share their results, and unchanged ones keep theirs."""
+"""Hashes of logs. Equal logs share their results, and unchanged logs are not hashed again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, each_ahead, is_
 from spatial_replay.sources.open_log import bag_files_at
 
 _TOGETHER: Final = 16
-"""Logs that are hashed as one task."""
+"""Logs per hashing task."""
 
 
 def identify(
@@ -26,18 +26,18 @@ def identify(
 ) -> tuple[dict[str, str | None], dict[str, str | None]]:
     """Return the identity of each log, and the states of their files.
 
-    An identity is a hash of bytes, or what a server says of a version; None if the log cannot be read. The
-    path, size, times and inode of a file, its state, only decide whether it is hashed again.
+    An identity is a hash of the log's bytes, or the version of a remote log; None if the log cannot be read.
+    A log is hashed again only if the state of a file changes: its path, device, inode, size or times.
 
     Args:
-        known: identities by states.
-        workers: they read the logs that are not known.
+        known: identities by state.
+        workers: executor that reads the logs with unknown states.
         progress: shows how many have been read.
     """
     states = states_of(paths)
     unknown = [path for path, state in states.items() if state is None or state not in known]
     groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
-    # few are read sooner than a process begins
+    # one group is read sooner than a process starts
     at_work = ThisProcess() if len(groups) == 1 else workers
     identity_by_path: dict[str, str | None] = {}
     with progress("logs read", len(unknown)) as advance:
@@ -53,7 +53,7 @@ def identify(
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
     """Return the identity of each log; None if it cannot be read."""
     if not any(map(is_address, paths)):
-        # in this thread, which a signal interrupts
+        # local files are read in this thread, so that a signal interrupts the reading
         files = _LogFiles()
         return {path: _identity(path, files) for path in paths}
     return dict(zip(paths, each_ahead(_identity, paths, _TOGETHER), strict=True))
@@ -67,29 +67,29 @@ def _identity(path: str, files: _LogFiles | None = None) -> str | None:
 
 
 class _LogFiles:
-    """The files of logs as they are now: a data set, and each file, is looked at once."""
+    """Files of logs. Each data set is opened once, and each file is looked up once."""
 
     def __init__(self) -> None:
         self._data_sets: dict[str, tuple[DataSet | None, list[str]]] = {}
         self._states: dict[str, tuple[str, os.stat_result]] = {}
 
     def of(self, path: str) -> tuple[list[str], int | None]:
-        """Return the files that a log consists of, and the number of an episode, None for any other log.
+        """Return the files of a log and its episode number; None if the log is no episode.
 
-        For an episode, they are the files with its numbers and its metadata.
+        The files of an episode hold its numbers and its metadata.
         """
         address = data_set_address(path)
         if address is not None:
             data_set, shared = self._data_set(address[0])
             if data_set is not None:
                 return [*shared, *map(str, data_set.files_of(address[1]))], address[1]
-        # not as paths, which take longer than asking the disk
+        # on texts: building `Path` objects takes longer than the system call
         if not os.path.isdir(path):  # noqa: PTH112
             return [path], None
         return sorted(str(file) for file in Path(path).iterdir() if file.is_file()), None
 
     def state(self, file: str) -> tuple[str, os.stat_result]:
-        """Return the real path of a file, and what the file system says of it."""
+        """Return the real path of a file and its result of `os.stat`."""
         if file not in self._states:
             self._states[file] = os.path.realpath(file), os.stat(file)  # noqa: PTH116
         return self._states[file]
@@ -103,9 +103,9 @@ class _LogFiles:
 
 
 def states_of(paths: Sequence[str]) -> dict[str, str | None]:
-    """Return hashes of what the file system says of the files of logs: equal while they are unchanged.
+    """Return a hash of the file states of each log: path, device, inode, size and times.
 
-    None for an address, and for files that cannot be read.
+    The hash is equal while the files are unchanged. It is None for an address and for unreadable files.
     """
     files = _LogFiles()
     return {path: None if is_address(path) else _state(path, files) for path in paths}
@@ -146,7 +146,7 @@ def _hash_of_log(path: str, files: _LogFiles) -> str:
 
 @lru_cache(maxsize=64)
 def _cached_hash(file: str, state_ns: int) -> str:
-    """Return the hash of a file with many episodes, read once."""
+    """Return the hash of a file that many episodes share. The modification time is part of the cache key."""
     return _hash_of(Path(file))
 
 

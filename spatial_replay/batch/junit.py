@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 LARGEST: Final = 30_000_000
-"""Bytes: GitLab refuses larger reports."""
+"""Size limit of a report, bytes. GitLab refuses larger reports."""
 _SHORT: Final = 300
-"""Characters of a failure where the full texts would be too long."""
+"""Length of a failure in a shortened report, characters."""
 
 
 def write_junit(
@@ -41,14 +41,14 @@ def write_junit(
 ) -> None:
     """Write the table of a run as a JUnit report.
 
-    A report that would be too large has shorter texts and, if that is not enough, lacks test cases that pass;
-    each test suite says how many.
+    A report above the limit gets shorter texts. If it is still too large, passing test cases are left out,
+    and each test suite counts them.
 
     Args:
-        name: of the whole: that of the suite.
-        reports: for cases and logs by name, the path of a page about them.
+        name: name of the suite.
+        reports: paths of pages about logs, by case and log.
         inputs: files that the output must not be.
-        largest: bytes of the report, at most.
+        largest: size limit of the report, bytes.
 
     Raises:
         UsageError, OutputError: the file cannot be written.
@@ -104,7 +104,7 @@ def _lines(
         for key, value in pairs:
             yield f"<property name={_quote(key)} value={_quote(value)}/>\n"
         yield "</properties>\n"
-        # two files may have a spec of one name
+        # with the stem of the file, because two files may have a spec of the same name
         class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
         for row in listed_rows:
             yield from _case(row, class_name, reports, limit)
@@ -122,7 +122,7 @@ def _case(
     yield f'<testcase classname={_quote(class_name)} name={_quote(name)} time="{row["seconds"]:.3f}">\n'
     tested = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
     if row["failure"] is not None:
-        # errors are about the test, failures about what it tests
+        # in JUnit, an error concerns the test, and a failure its subject
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or _unmet(row)
         texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
@@ -139,7 +139,7 @@ def _case(
 
 
 def _unmet(row: Values) -> str:
-    """Return the expectation that a result did not meet, in words that results of one kind share."""
+    """Return the kind of a failure, in words that all results of the kind share."""
     failure = row["failure"]
     kinds = {UNTESTED: "untested"}
     kinds |= {kind: kind for kind in (DOUBTFUL, WORSE_THAN, EDITED_SINCE, VACUOUS)}
@@ -151,13 +151,13 @@ def _unmet(row: Values) -> str:
 
 
 def _counts(rows: Any) -> tuple[int, int]:
-    """Return how many rows fail, and how many have errors."""
+    """Return the numbers of failures and of errors."""
     kinds = [row["error"] is None for row in rows if row["failure"] is not None]
     return sum(kinds), len(kinds) - sum(kinds)
 
 
 def _time(rows: Any) -> str:
-    """Return the seconds that rows took; those of one log took them together."""
+    """Return the total time of rows, seconds. Rows of one log share one time."""
     return f"{sum({(row['case'], row['log']): row['seconds'] for row in rows}.values()):.3f}"
 
 

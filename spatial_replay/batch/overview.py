@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 LABEL: Final = "label"
 AGREEMENT: Final = "agreement"
-"""Columns of judged episodes: "success" or "failure", and how that compares with the verdict."""
+"""Columns of judged episodes: the label, "success" or "failure", and its agreement with the verdict."""
 _MOST_LOGS: Final = 2_000
 """Rows of the matrix; a page with more is slow to open."""
 _MOST_SPECS: Final = 60
-"""Columns of the matrix, and distributions."""
+"""Largest number of columns of the matrix, and of distributions."""
 _BINS: Final = 24
 _WIDTH: Final = 480.0
 _HEIGHT: Final = 60.0
@@ -63,10 +63,10 @@ def overview_page(
     """Return the page, in UTF-8; equal tables give equal bytes.
 
     Args:
-        table: of a run.
-        name: of the suite.
-        reports: for cases and logs by name, the address of the page about them, relative to this one.
-        curves: by case, those of the logs with a page.
+        table: table of a run.
+        name: name of the suite.
+        reports: addresses of pages about logs, by case and log, relative to this page.
+        curves: curves of the logs with a page, by case.
     """
     body = [_header(table, name), element("main", *_panels(table, reports, curves))]
     scripts = [asset("batch:overview.js")]
@@ -104,7 +104,7 @@ def _panels(
 
 
 def _panel(title: str, *content: Html) -> Html:
-    # what may be wider than the page can be scrolled with keys
+    # focusable, so that keys can scroll a panel that is wider than the page (WCAG 2.1.1)
     attributes = {"class": "panel", "aria-label": title, "tabindex": "0"}
     return element("section", element("h2", title), *content, **attributes)
 
@@ -143,14 +143,14 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
 
 
 def _result_cell(row: Values) -> Iterator[Html]:
-    """Yield the name of a result, and below it the requirement that it is about."""
+    """Yield the name of a result, and below it the requirement."""
     yield text(result_name(row["spec"] or row["file"], row["object"]))
     if about := requirement_of(row):
         yield element("div", text(about), **{"class": "requirement"})
 
 
 def _with_code(sentence: str) -> Iterator[Html]:
-    """Yield a sentence, its formulas as code."""
+    """Yield a sentence with its formulas as code."""
     for number, piece in enumerate(sentence_parts(sentence)):
         yield element("code", text(piece)) if number % 2 else text(piece)
 
@@ -180,7 +180,7 @@ def _plots(
 
 
 def _histogram(numbers: Floats, unit: str) -> Html:
-    """Return a distribution as a drawing; a bin lies on one side of 0, where the verdict changes."""
+    """Return a histogram as SVG. An edge of its bins is 0, where the verdict changes."""
     low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
     if low == high:
         high = low + 1.0
@@ -194,7 +194,7 @@ def _histogram(numbers: Floats, unit: str) -> Html:
         height = _HEIGHT * count / tallest
         side = "bad" if number < below else "good"
         place = {"x": number * step + 0.5, "y": _HEIGHT - height, "width": step - 1.0, "height": height}
-        # what is read is the text beside the drawing, so the tip of a bar says its count
+        # only the tooltip of a bar gives its count: bars have no text
         tip = element("title", with_signs(f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}"))
         attributes = {name: f"{value:.2f}" for name, value in place.items()}
         bars.append(element("rect", tip, **attributes, **{"class": side}))
@@ -232,7 +232,7 @@ def _matrix(
             if len(cells) >= _MOST_LOGS:
                 continue
             log = cells[row["log"]] = {}
-        # of a template, the worst object
+        # rows are sorted, so the first one of a template is the worst object
         log.setdefault(column, row)
     logs = len(set(table.column("log").to_pylist()))
     if logs > len(cells):
@@ -260,7 +260,7 @@ def _matrix(
 
 
 def _filter() -> Html:
-    """Return what the rows of the matrix can be filtered by, and buttons that go through those that fail."""
+    """Return the filters of the matrix, and buttons that step through failing rows."""
     words = element("input", type="search", placeholder="name", **{"aria-label": "Name of a log"})
     box = element("label", element("input", type="checkbox", id="only-failing"), " only failing")
     steps = [
@@ -316,7 +316,7 @@ def _sortable(title: str, kind: str, about: str = "") -> Html:
 
 
 def _tip(about: str) -> dict[str, str]:
-    """Return the attribute with which a name shows the requirement that it is about."""
+    """Return the attribute of a tooltip with the requirement; nothing for an empty text."""
     return {"title": about} if about else {}
 
 
@@ -325,7 +325,7 @@ def _number(tag: str, words: str) -> Html:
 
 
 def _log_link(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:
-    """Return the name of a log, given with its case, linked to the page about it."""
+    """Return the name of a log, given as (case, log), linked to its page if there is one."""
     return element("a", text(log[1]), href=quote(reports[log])) if log in reports else text(log[1])
 
 

@@ -25,7 +25,7 @@ _FOLDER: Final = "reports"
 _LONGEST: Final = 80
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
 _HEAD: Final = re.compile(rb'(?:<nav class="neighbours".*?</nav>)?' + re.escape(HEADER.encode()), re.DOTALL)
-"""Where the header of a report begins, with the links that an earlier batch has written before it."""
+"""The begin of a report's header, and the links of an earlier batch before it."""
 
 
 def write_pages(
@@ -33,13 +33,13 @@ def write_pages(
 ) -> dict[tuple[str, str], Path]:
     """Write the page over all logs, and one about each log with a verdict that fails.
 
-    A page that an earlier run has written of the same log and specifications stays. Only its links to other
-    pages are written again. The worst log comes first.
+    Pages of an earlier run about the same log and specifications are kept, with new links to other pages. The
+    worst log comes first.
 
     Args:
-        folder: made if need be; the page over all is its `index.html`.
-        name: of the suite.
-        progress: shows how many pages have been written.
+        folder: folder of the pages, created if needed; the page over all logs is its `index.html`.
+        name: name of the suite.
+        progress: shows the number of written pages.
 
     Returns:
         The pages, by case and log.
@@ -75,7 +75,7 @@ def write_pages(
 
 
 def _link_pages(pages: Mapping[tuple[str, str], Path]) -> None:
-    """Write into each page about a log the links to the page over all, and to those before and after it."""
+    """Write links to the page over all logs and to the neighbouring pages into each page about a log."""
     neighbours = [(log, path.name) for (_, log), path in pages.items()]
     for place, path in enumerate(pages.values()):
         links = [element("a", "All logs", href=f"../{INDEX}")]
@@ -87,7 +87,7 @@ def _link_pages(pages: Mapping[tuple[str, str], Path]) -> None:
                 links.append(element("a", f"{words}: ", text(log), href=quote(address), rel=relation))
         nav = element("nav", *links, **{"class": "neighbours", "aria-label": "Logs that fail"})
         content, begin = path.read_bytes(), (nav + HEADER).encode()
-        # a backslash in the name of a log is no escape
+        # in a replacement of `re`, backslashes are escapes, and names of logs may contain them
         linked = _HEAD.sub(begin.replace(b"\\", rb"\\"), content, count=1)
         if linked != content:
             with replacing(path) as stream:
@@ -114,13 +114,13 @@ def _task(requests: list[RowRequest]) -> Task:
 
 
 def _file_name(log: str, requests: list[RowRequest]) -> str:
-    """Return a name that says which log it is, and changes with what the page shows."""
+    """Return a file name with the log's name and a hash of the page's inputs."""
     digest = hashlib.sha256("".join(request.key or "" for request in requests).encode()).hexdigest()[:12]
     return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
 
 
 def _write_page(page: tuple[Task, Path]) -> None:
-    """Write one page about a log; one that cannot be read any more has none."""
+    """Write one page about a log; none if the log cannot be read any more."""
     task, path = page
     try:
         files = parsed_specifications(task.specs, task.conditions)

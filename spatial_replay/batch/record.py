@@ -1,4 +1,4 @@
-"""How the logs of a run were evaluated, kept with its table, so that results can be explained later."""
+"""Conditions of a run, stored with its table so that results can be explained later."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 
 _RECORD: Final = b"spatial_replay"
-"""The metadata of a table that holds the record."""
+"""Key of the record in the metadata of a table."""
 Explanation: TypeAlias = tuple[Any, ...]
 """The values of the columns `EXPLANATION` in a row."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunRecord:
-    """How the logs of a run were evaluated.
+    """Conditions and specifications of a run.
 
     Attributes:
-        folder: what names of logs are relative to.
-        cases: by name, the conditions of each case and the texts of its specification files.
+        folder: base of the names of logs.
+        cases: conditions and texts of the specification files of each case, by name.
     """
 
     folder: str
@@ -38,7 +38,7 @@ class RunRecord:
 
     @classmethod
     def of(cls, table: pa.Table) -> RunRecord:
-        """Return the record of a table; one without cases if the table has none."""
+        """Return the record of a table; a record without cases if the table has none."""
         data = (table.schema.metadata or {}).get(_RECORD, b'{"folder": "", "cases": {}}')
         return cls(**json.loads(data))
 
@@ -56,7 +56,7 @@ class RunRecord:
         return self.files(case).index(file), spec, object_name
 
     def task(self, case: str, log: str) -> Task:
-        """Return the task that evaluates a log, named as in the table, as the run did."""
+        """Return the task with which the run evaluated a log, given the log's name in the table."""
         path = log if is_address(log) else str(Path(self.folder) / log)
         texts = tuple(SpecificationText(*text) for text in self.cases[case]["files"].values())
         values = self.cases[case]["conditions"]

@@ -1,7 +1,7 @@
-"""One log evaluated with all its specifications: a task in, rows out.
+"""Evaluates one log with all its specifications: a task in, rows out.
 
-A task is sent to the process that evaluates it, so it holds the texts of its specifications, and nothing that
-is open. Its rows are values, too. Nothing here knows where rows are stored or shown.
+A task is sent to another process, so it holds the texts of its specifications and no open file. Its rows are
+plain values, too.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from spatial_replay.text import counted_from, encodable, first_lines, printable
 from spatial_replay.trace.trace import time_point_from_text
 
 ErrorKind: TypeAlias = Literal["usage", "log", "unfit", "machine"]
-"""Whose an error is: of the options or files given, of the log, or of the machine and this program.
+"""Source of an error: the user's options and files, the log, or the machine and this program.
 
-A log that is "unfit" can be read, and lacks what the suite requires.
+An "unfit" log can be read, but lacks a requirement of the suite.
 """
 
 ResultName: TypeAlias = tuple[int, str, str | None]
@@ -55,7 +55,7 @@ ResultName: TypeAlias = tuple[int, str, str | None]
 _LONGEST: Final = 2_000
 """Characters of a text in a row."""
 _MOST: Final = 20
-"""Faults, remarks and the like in a row; the last of them says how many more there are."""
+"""Entries of each list in a row. The last entry counts the entries left out."""
 _KINDS: Final[tuple[tuple[tuple[type[Exception], ...], ErrorKind], ...]] = (
     ((UsageError, SpecificationError), "usage"),
     ((LogError, TraceError, GeometryError), "log"),
@@ -70,8 +70,8 @@ class Task:
     Attributes:
         log: its path or address.
         specs: the texts of the specification files.
-        conditions: how to read the log and evaluate them; objects for parameters that no specification has
-            are ignored, since a batch may have evaluated those already.
+        conditions: options of reading and evaluation. Objects of a parameter without a spec are ignored,
+            because the rows of that spec may be stored already.
     """
 
     log: str
@@ -92,25 +92,26 @@ class ResultRow:
         unit: the declared unit of the robustness, or "".
         robustness, lower, upper: NaN where not determined.
         first_satisfied_ns, violated_at_ns, satisfied_at_ns: as in `SpecResult`.
-        atom, atom_time_ns, atom_objects: what decides the verdict: the first cause of a violation.
-        reason: what decided and, if that is not what the number is of, what gave it; "" under the paper's
-            semantics.
-        explanation: what `explain` says, in sentences, but for since when a satisfied spec has held. Here, in
-            `reason` and in `atom…`, None stands for a result that is not explained.
-        tested: what the verdict was tested by, see `SpecResult.tested`; None if there is an error.
-        untested: sentences on the parts for which that is not "full".
+        atom, atom_time_ns, atom_objects: the deciding atom with its time and objects; the first cause of a
+            violation.
+        reason: a sentence on the deciding atom and, if another atom gives the robustness, on that one; ""
+            under the paper's semantics.
+        explanation: the sentences of `explain`, without the time since which a satisfied spec has held.
+            `explanation`, `reason` and `atom…` are None if the result is not explained.
+        tested: see `SpecResult.tested`; None if there is an error.
+        untested: sentences on the parts whose `tested` is not "full".
         vacuous: sentences on the parts that decided nothing.
-        left: sentences on the members of groups that left the log within reach of a threshold and came back.
-        doubts: assumptions that the verdict rests on, and that the log contradicts, by name.
+        left: sentences on group members that left the log within reach of a threshold and came back.
+        doubts: names of the verdict's assumptions that the log contradicts.
         doubtful: a sentence on each of them.
-        dropped: what the recorder of the log dropped, in words; None for nothing.
-        samples: how many were evaluated.
-        zero_ns: the time that sentences about the log count from.
+        dropped: a sentence on messages that the recorder dropped; None for none.
+        samples: number of evaluated samples.
+        zero_ns: zero of the times in sentences about the log.
         start_ns: time of the first sample evaluated.
-        duration_ns: from the first to the last.
-        faults, remarks, missing: what was lost while reading, what was remarkable, names that the log lacks.
-        seconds: how long reading and evaluating the log took, for all its specifications.
-        error: why there is no verdict, or None.
+        duration_ns: time from the first to the last evaluated sample.
+        faults, remarks, missing: losses while reading, remarks on the log, and names that it lacks.
+        seconds: time of reading and evaluating the log with all its specifications.
+        error: the reason why there is no verdict, or None.
         error_kind: see `ErrorKind`; None without an error.
         source: the name of the file that was read; faults, remarks and errors name it.
     """
@@ -154,18 +155,18 @@ class ResultRow:
 
 
 TaskRows: TypeAlias = tuple[tuple[ResultRow, ...], ...]
-"""For each specification file of a task the rows of its results."""
+"""Rows of a task, grouped by specification file."""
 
 
 def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) -> TaskRows:
     """Open a log once, evaluate all its specifications over it, and return their rows.
 
     Args:
-        explained: the results that get an explanation, which takes longer than all the rest; None for all.
+        explained: results to explain; None for all. Explanations take longer than the evaluation.
 
     Returns:
-        For each of `task.specs` one row for each of its results, in the order of the text, and for each
-        object of a template. An error of the log is a row for each of them; only an interruption is raised.
+        For each of `task.specs` one row per result and per object of a template, in the order of the text. If
+        the log has an error, each row holds it. Only an interruption is raised.
     """
     begin = time.perf_counter()
     try:
@@ -181,7 +182,7 @@ def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) ->
 
 
 def rows_from_tasks(tasks: tuple[Task, ...]) -> list[TaskRows]:
-    """Return the rows of each of several logs; short ones are measured together."""
+    """Return the rows of several logs. Short logs are evaluated together."""
     rows: list[TaskRows] = []
     for _, like_tasks in groupby(tasks, lambda task: (task.specs, task.conditions)):
         rows += _rows_of_like_tasks(list(like_tasks))
@@ -232,12 +233,12 @@ def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
 def _rows_of_short_logs(
     joint: JointReplay, files: Sequence[Specification], logs: Mapping[Task, ShortLog], begin_s: float
 ) -> dict[Task, TaskRows]:
-    """Return the rows of logs that are measured together; each took its share of the time since `begin_s`."""
+    """Return the rows of logs that are evaluated together, with equal shares of the time since `begin_s`."""
     rows_by_task: dict[Task, TaskRows] = {}
     try:
         for task, replayed in zip(logs, joint.replay([*logs.values()]), strict=True):
             rows_by_task[task] = _rows_of_log(task, files, joint.trees, replayed, ())
-    except Exception:  # alone, the log that it is of gets the error
+    except Exception:  # the rest is evaluated log by log, so that the error stays in the rows of its log
         rest = [task for task in logs if task not in rows_by_task]
     else:
         rest = []
@@ -275,7 +276,7 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
     parameters = {spec.parameter for file in files for spec in file.results}
     choices = {name: objects for name, objects in conditions.each if name in parameters}
     window = _window(source, conditions)
-    # no other messages are read than those that samples are made of
+    # samples need the mapped messages only, so no others are read
     return source, ReplayOptions(window, choices, conditions.semantics, conditions.strict_names, (MAPPED,))
 
 
@@ -290,17 +291,17 @@ def _window(source: Source, conditions: Conditions) -> Window:
 def parsed_specifications(
     specs: tuple[SpecificationText, ...], conditions: Conditions
 ) -> tuple[Specification, ...]:
-    """Parse specifications with a case's values for their constants; the same are parsed once.
+    """Parse specifications with the constants of a case. Results are cached.
 
     Raises:
-        SpecificationError: one has errors.
-        UsageError: a value of a constant that none has.
+        SpecificationError: a specification has errors.
+        UsageError: no specification has a given constant.
     """
     return tuple(load_specifications(specs, constants=dict(conditions.constants)))
 
 
 def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
-    """Return what an error says, and whose it is."""
+    """Return the message and the kind of an error."""
     kind: ErrorKind = "machine"
     for kinds, whose in _KINDS:
         if isinstance(error, kinds):
@@ -315,7 +316,7 @@ def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
 
 
 def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
-    """Return the rows of a task without results: one for each spec, with the error.
+    """Return one row with the error for each spec of a task.
 
     A specification that cannot be parsed has one row, with an empty name.
     """
@@ -346,7 +347,6 @@ def _rows_of_log(
     replayed: Replayed,
     explained: Collection[ResultName] | None,
 ) -> TaskRows:
-    """Return the rows of a log for each of its specification files."""
     log = ResultRow(
         samples=replayed.samples,
         zero_ns=replayed.first_ns,
@@ -374,7 +374,7 @@ def _rows_of_file(
 ) -> tuple[ResultRow, ...]:
     lines = spec_lines(file)
     pairs = zip(trees, replayed.results, strict=True)
-    # a name that another file has, too, is that of the file's own text here
+    # a replay renames specs whose name another file has, too; a row has the name in its own file
     results = [
         result if result.name == result.spec.name else replace(result, name=result.spec.name)
         for tree, result in pairs
@@ -395,7 +395,7 @@ def _rows_of_file(
 
 
 def _missing(name: Diagnostic) -> str:
-    """Return that a log lacks a name, with the nearest one; the names of each log are others."""
+    """Return a sentence on a missing name, with the nearest name but not all names of the log."""
     nearest, mark, _ = name.hint.partition("'?")
     return f"{name.message}; {nearest}{mark}" if mark else name.message
 
@@ -430,7 +430,7 @@ def _with_explanation(row: ResultRow, result: SpecResult, first_ns: int) -> Resu
 
 
 def _idle_row(about: ResultRow, part: UntestedPart) -> ResultRow:
-    """Return the row of a template that no object of the log fits: nothing violates it."""
+    """Return the row of a template without matching objects: satisfied, and tested by nothing."""
     message = _cut(part.message)
     endless = float("inf")
     return replace(
@@ -453,7 +453,7 @@ def spec_lines(file: Specification) -> dict[str, int]:
 
 
 def _some(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return texts of bounded length and number, with a note on what is left out."""
+    """Return texts of bounded length and number. The last one counts the texts left out."""
     return tuple(map(_cut, first_lines(texts, _MOST)))
 
 

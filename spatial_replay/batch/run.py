@@ -1,4 +1,4 @@
-"""A batch: what has to be evaluated, by which workers, and its result."""
+"""A batch: its logs, its evaluation by workers, and the table of results."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ class SpecFile:
     """A specification file of a case, parsed with the case's constants.
 
     Attributes:
-        name: as it is written: relative to the suite's folder.
-        hash: of its meaning, with ids and titles: layout and comments do not count.
-        meanings: a hash of the meaning of each spec, without ids and titles.
-        lines: the line of each spec.
-        warnings: what `check` warns of.
-        has_plugins: whether its results depend on code, which may import and read any other file.
+        name: path relative to the suite's folder.
+        hash: hash of its meaning with ids and titles, independent of layout and comments.
+        meanings: hash of the meaning of each spec, without ids and titles.
+        lines: line of each spec.
+        warnings: warnings of `check`.
+        has_plugins: whether its results depend on plug-in code, which may read any other file.
     """
 
     name: str
@@ -92,7 +92,7 @@ class SpecFile:
 
 
 def read_specification_text(path: Path | str) -> SpecificationText:
-    """Read the text of a specification at a path or an address, with its errors.
+    """Read and check the text of a specification at a path or an address.
 
     Raises:
         MissingFileError, UsageError, SpecificationError: see `load_specification`.
@@ -105,7 +105,7 @@ def read_specification_text(path: Path | str) -> SpecificationText:
 
 
 def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, folder: Path) -> SpecFile:
-    """Return a specification file that was read and parsed; paths are shown relative to a folder."""
+    """Return the `SpecFile` of a parsed specification, with a name relative to a folder."""
     lines = tuple(spec_lines(parsed).items())
     meanings = tuple((spec.name, _hash_of_text(_meaning(parsed, spec))) for spec in parsed.results)
     name, digest = _relative_name(path, folder), meaning_hash(parsed)
@@ -113,12 +113,12 @@ def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, 
 
 
 def meaning_hash(file: Specification) -> str:
-    """Return a hash of what a specification means: layout and comments do not count."""
+    """Return a hash of the meaning of a specification, independent of layout and comments."""
     return _hash_of_text(f"{file.profile}\n{format_specification(file)}")
 
 
 def _meaning(file: Specification, spec: NamedSpec) -> str:
-    """Return the text of a spec without names of other specs, and of all that it uses."""
+    """Return the text of a spec with its regions and groups, and without names of other specs."""
     names = other_names(spec.formula)
     regions = {name: region for name, region in file.regions.items() if name in names}
     groups = {name: group for name, group in file.groups.items() if name in names}
@@ -138,7 +138,7 @@ def _relative_name(file: Path | str, folder: Path) -> str:
 
 
 def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
-    """Yield what is wrong with the objects that a case chooses for the parameters of its templates."""
+    """Yield faults in the objects that a case chooses for the parameters of its templates."""
     templates = [spec for file in files for spec in file.results if spec.parameter is not None]
     parameters = {spec.parameter for spec in templates}
     choices = dict(case.conditions.each)
@@ -159,7 +159,7 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
 
 
 _DATA_SET_FOLDERS: Final = frozenset({"meta", "data"})
-"""Folders of which each data set that is a folder has one."""
+"""Folder names, of which each data set in a folder has at least one."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 
@@ -168,8 +168,8 @@ class FoundLog(NamedTuple):
     """A log of a batch.
 
     Attributes:
-        name: as people know it: its path relative to the suite's folder, or its address.
-        path: what opens it.
+        name: path relative to the suite's folder, or address.
+        path: path or address that opens it.
     """
 
     name: str
@@ -177,16 +177,15 @@ class FoundLog(NamedTuple):
 
 
 def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
-    """Return the logs that patterns stand for, in their order, sorted within each; each log once.
+    """Return the logs of patterns, each log once: in the order of the patterns, and sorted within each.
 
-    A folder stands for all logs in it and below, a ROS 2 bag for itself, a data set for its episodes.
-    `s3://bucket/folder/` and patterns of addresses stand for what the bucket lists.
+    A folder gives all logs in it and below, a ROS 2 bag itself, and a data set its episodes.
+    `s3://bucket/folder/` and patterns of addresses give the logs that the bucket lists.
 
     Args:
-        folder: what relative paths are relative to.
+        folder: base of relative paths.
 
-    Raises:
-        UsageError: patterns without a log; all are listed, with their places.
+        Raises: UsageError: patterns without a log; all are listed, with their places.
         RemoteError: a bucket cannot be listed.
     """
     logs_by_path: dict[str, FoundLog] = {}
@@ -217,7 +216,7 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
         if path.is_dir():
             yield from _logs_in(path, folder)
         elif path.exists():
-            # opening what is no regular file is the error of its row
+            # the row of a path that is no regular file reports the error
             yield from _episodes_in(path, folder) or [_log_at(path, folder)]
         elif (address := data_set_address(path)) is not None:
             data_set = open_data_set(address[0])
@@ -231,12 +230,12 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
                 if episodes or (log.exists() and not log.is_dir()) or (log / BAG_METADATA).is_file():
                     yield from episodes or [_log_at(log, folder)]
     except (OSError, ValueError):
-        # a name that cannot be one, such as one with a null character
+        # an impossible name, such as one with a null character
         return
 
 
 def _logs_at(address: str) -> Iterator[FoundLog]:
-    """Yield the log at an address, or those of a bucket that a pattern or a folder stands for."""
+    """Yield the log at an address, or the logs of a pattern or folder in a bucket."""
     is_folder = address.endswith("/")
     # in the address of a web server, "?" begins a query
     if address.startswith(("http://", "https://")) or not (is_folder or has_magic(address)):
@@ -249,7 +248,7 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
     for address in addresses:
         folder = address[: address.rfind("/") + 1]
         if folder in bags:
-            # a ROS 2 bag is one log, where its metadata is in the order
+            # a ROS 2 bag is one log, at the place of its metadata file in the listing
             if address == folder + BAG_METADATA:
                 yield FoundLog(folder, folder)
         elif not is_folder or address.lower().endswith(LOG_ENDINGS):
@@ -257,9 +256,9 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
 
 
 def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
-    """Return the episodes of a data set, a damaged one as a whole; none for anything else.
+    """Return the episodes of a data set; none if the path is no data set.
 
-    To open a damaged one is the error of its row: a batch does not pass over logs in silence.
+    A damaged data set is one log, and its row reports the error. So a batch skips no log silently.
     """
     whole = _log_at(path, folder)
     try:
@@ -275,9 +274,7 @@ def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
-    """Yield the logs in a folder: bags, episodes of data sets, files with the ending of a log, and folders
-    that cannot be read.
-    """
+    """Yield the logs in a folder: bags, episodes, files with the ending of a log, unreadable folders."""
     closed: list[OSError] = []
     for parent, folders, names in os.walk(path, onerror=closed.append):
         if BAG_METADATA in names:
@@ -288,17 +285,17 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
             yield from episodes
             folders.clear()
             continue
-        # in the order of their names, and without hidden folders
+        # `os.walk` visits the remaining folders in this order
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         parent_log = _log_at(Path(parent), folder)
         for name in sorted(names):
             if name.lower().endswith(LOG_ENDINGS) and not name.startswith("."):
-                # as texts: paths would take most of the time
+                # joined as text, because building `Path` objects would take most of the time
                 path_name = name if parent_log.name == "." else f"{parent_log.name}/{name}"
                 yield FoundLog(encodable(path_name), f"{parent_log.path}/{name}")
             elif name.lower().endswith(DATA_SET_ENDINGS) and not name.startswith("."):
                 yield from _episodes_in(Path(parent) / name, folder)
-    # to open one is the error of its row: a batch does not pass over logs in silence
+    # the row of an unreadable folder reports the error, so that a batch skips no log silently
     yield from (_log_at(Path(error.filename), folder) for error in closed)
 
 
@@ -312,7 +309,7 @@ def _nothing(text: str, folder: Path) -> str:
         return f"{text}: no log there; check the pattern"
     if has_magic(text):
         return f"{text}: no log matches this pattern; check it, and the folder it starts from"
-    # unlike a path's own, this test takes names that no file can have
+    # unlike `Path.is_dir`, it accepts names that no file can have
     if os.path.isdir(folder / text):  # noqa: PTH112
         try:
             open_data_set(folder / text)
@@ -324,7 +321,7 @@ def _nothing(text: str, folder: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PreparedCase:
-    """A case with the logs that its patterns stand for, and its specification files, checked."""
+    """A case with its logs and its checked specification files."""
 
     case: Case
     logs: tuple[FoundLog, ...]
@@ -335,9 +332,9 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
     """Find the logs of each case of a suite, and read and check its specifications and mappings.
 
     Raises:
-        SpecificationError: nothing is wrong but specifications; all of their errors are in it.
-        UsageError: patterns without a log, files that cannot be used, templates without objects, what else
-            is wrong in the suite; all of it is listed, with lines.
+        SpecificationError: only specifications have faults; it holds all of their errors.
+        UsageError: the suite has patterns without a log, unusable files, templates without objects, or other
+            faults; all are listed with lines.
         RemoteError: a bucket cannot be listed.
     """
     faults = _Faults(suite)
@@ -364,7 +361,7 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
 
 @dataclass(slots=True)
 class _Faults:
-    """Known faults of a suite, each once."""
+    """Faults of a suite, each once."""
 
     suite: Suite
     lines: dict[str, None] = field(default_factory=dict)
@@ -374,7 +371,7 @@ class _Faults:
         self.lines[text] = None
 
     def check(self) -> None:
-        """Raise all."""
+        """Raise all faults, if there are any."""
         name = "" if self.suite.path is None else self.suite.path.name
         lines = [*(f"{name}:{line}: {fault}" for line, fault in self.suite.faults), *self.lines]
         if self.diagnoses and not lines:
@@ -384,7 +381,7 @@ class _Faults:
             raise UsageError("\n".join(first_lines(lines, MOST_FAULTS)))
 
     def _line(self, fault: str) -> float:
-        """Return the line of the suite that a fault is in; others come last."""
+        """Return the line of a fault in the suite; infinity for faults of other files, which come last."""
         name, _, rest = fault.partition(":")
         number = rest.partition(":")[0]
         is_own = self.suite.path is not None and name == self.suite.path.name and number.isdecimal()
@@ -392,7 +389,7 @@ class _Faults:
 
 
 def _in_one_line(diagnosis: Diagnosis) -> str:
-    """Return an error of a specification without the line it is in, whose mark would be out of place."""
+    """Return an error of a specification in one line, without the quoted source and its caret."""
     head, hint = str(diagnosis).split("\n")[0], getattr(diagnosis, "hint", "")
     return f"{head}; {hint}" if hint else head
 
@@ -400,7 +397,7 @@ def _in_one_line(diagnosis: Diagnosis) -> str:
 def _files(
     case: Case, folder: Path, texts: dict[Path | str, SpecificationText | None], faults: _Faults
 ) -> tuple[SpecFile, ...]:
-    """Return the specification files of a case, or those of them that can be read."""
+    """Return the specification files of a case; none if one of them has faults."""
     for path in case.specs:
         if path in texts:
             continue
@@ -434,10 +431,10 @@ def _files(
 
 @dataclass(frozen=True, slots=True)
 class RowRequest:
-    """The rows that a case wants of one log and one specification file.
+    """Request for the rows of one log and one specification file.
 
     Attributes:
-        key: a hash of all that the rows depend on; None if the log cannot be read.
+        key: hash of all inputs of the rows, see `row_key`; None if the log cannot be read.
     """
 
     case: Case
@@ -452,10 +449,10 @@ class BatchResult:
 
     Attributes:
         table: one row for each case, log, spec and object of a template; see `store`.
-        logs: how many logs.
-        evaluated: on how many of them something was evaluated in this run; the rest was known.
+        logs: number of logs.
+        evaluated: number of logs that this run evaluated; rows of the others were stored.
         requests: rows that the suite asks for.
-        remarks: which stored files were damaged and replaced.
+        remarks: sentences on stored files that were damaged and replaced.
     """
 
     table: pa.Table
@@ -475,12 +472,12 @@ class BatchResult:
 def workers_of(
     jobs: int, dask: str | None = None, report: Callable[[str], None] = lambda text: None
 ) -> Workers:
-    """Return what evaluates logs.
+    """Return the executor of a batch.
 
     Args:
-        jobs: how many processes; with 1, this one.
-        dask: address of a scheduler, whose workers see the same files.
-        report: takes what a user who waits should know.
+        jobs: number of processes; 1 is this process.
+        dask: address of a scheduler; its workers have to see the same files.
+        report: receives messages for a waiting user.
     """
     if dask is not None:
         return DaskCluster(dask, report)
@@ -495,15 +492,15 @@ def run_batch(
     fail_on: frozenset[str] = frozenset(),
     progress: Progress = no_progress,
 ) -> BatchResult:
-    """Evaluate what is new, and return and store the results of all logs of a suite.
+    """Evaluate the logs without stored rows. Return and store the results of all logs.
 
     Args:
-        results: the folder of results or its address, made if need be.
-        fail_on: what fails although the case allows it, see `FAILING_KINDS`.
-        progress: shows how many logs have been hashed, and evaluated.
+        results: folder of results or its address, created if needed.
+        fail_on: kinds of results that fail even if the case allows them, see `FAILING_KINDS`.
+        progress: shows the numbers of hashed and evaluated logs.
 
     Raises:
-        UsageError: a folder that is not one of results.
+        UsageError: the folder holds something else.
         OutputError: rows cannot be written; those written so far stay.
         ClusterError: the scheduler of a cluster is lost; rows written so far stay.
     """
@@ -527,10 +524,10 @@ def run_batch(
             for group, rows_of_group in _evaluated_groups(workers, list(tasks)) if tasks else ():
                 now = states_of([task.log for task in group])
                 for task, rows_of_log in zip(group, rows_of_group, strict=True):
-                    # a log that changed during the run has another key; at an address, readers see to that
+                    # rows of a log that changed meanwhile are not stored; remote readers check versions
                     is_same = now[task.log] == states[task.log]
                     for key, rows in zip(tasks[task], rows_of_log, strict=True):
-                        # errors may pass
+                        # an error may be temporary, so its rows are not stored
                         if is_same and key in lasting and all(row.error is None for row in rows):
                             new_rows.add(key, rows)
                         else:
@@ -542,7 +539,7 @@ def run_batch(
         places = {place: explanations[name] for place, name in enumerate(names) if name in explanations}
         table = _record_of(requests).store_in(with_explanations(table, places))
         folder.write_run(table)
-    # a log that cannot be read was tried, and is not known
+    # an unreadable log has no key, and was tried
     evaluated = {task.log for task in tasks} | {
         request.log.path for request in requests if request.key is None
     }
@@ -550,17 +547,17 @@ def run_batch(
 
 
 _GROUP_S: Final = 0.5
-"""How long evaluating the logs that a worker is given at once takes, about."""
+"""Target time for a group of logs, seconds."""
 _GROWTH: Final = 8
-"""How many times more logs the next group has, at most: the first one prepares and loads code, too."""
+"""Largest growth of the next group, as a factor: the first group also spends time on loading code."""
 _MOST_IN_GROUP: Final = 64
-"""Logs that a worker is given at once: handing out one takes longer than evaluating a short one."""
+"""Largest group of logs. A scheduler takes 4 to 6 ms per task, as long as a short log."""
 
 
 def _evaluated_groups(
     workers: Workers, tasks: Sequence[Task]
 ) -> Iterator[tuple[Sequence[Task], Sequence[TaskRows]]]:
-    """Yield tasks with the rows of each. The logs of a worker that died are evaluated again, one by one."""
+    """Yield groups of tasks with their rows. Logs of a worker that died are evaluated again, one by one."""
     groups = _Groups(tasks)
     again: list[tuple[Task, ...]] = []
     for several in (groups, again):
@@ -575,7 +572,7 @@ def _evaluated_groups(
 
 
 class _Groups:
-    """Tasks in groups, larger ones where the logs before were short."""
+    """Tasks in groups, sized by the evaluation time of earlier logs."""
 
     def __init__(self, tasks: Sequence[Task]) -> None:
         self._tasks, self._size = tasks, 1
@@ -588,7 +585,7 @@ class _Groups:
             begin = end
 
     def note(self, rows: Iterable[TaskRows]) -> None:
-        """Take in how long the logs of a group took."""
+        """Adapt the size of the next group to the time per log of a finished group."""
         seconds = [
             rows_of_log[0][0].seconds
             for rows_of_log in rows
@@ -613,7 +610,7 @@ def _requests(cases: Sequence[PreparedCase], identities: Mapping[str, str | None
 
 
 def row_key(identity: str, conditions: Conditions, meaning: str) -> str:
-    """Return a hash of all that rows depend on: the log, the conditions and the hash of a specification."""
+    """Return the key of rows: a hash of the log, the conditions and the meaning of a specification."""
     return _key(identity, _key_of(conditions), meaning)
 
 
@@ -623,7 +620,7 @@ def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
 
 
 def _key_of(conditions: Conditions) -> list[Any]:
-    """Return what rows depend on besides the log and the specification, whose constants have their values."""
+    """Return the conditions that rows depend on. Constants are missing: the meaning has their values."""
     mapping = conditions.mapping
     return [
         None if mapping is None else load_mapping(mapping).identity,
@@ -639,7 +636,7 @@ def _key_of(conditions: Conditions) -> list[Any]:
 
 
 def _tasks(requests: Sequence[RowRequest], stored: set[str]) -> dict[Task, tuple[str, ...]]:
-    """Return a task for each log and conditions that lack rows, with the keys of these."""
+    """Return one task per log and conditions with missing rows, and the keys of these rows."""
     groups: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
     keys = set(stored)
     for request in requests:
@@ -658,7 +655,7 @@ def _table(
     unstored: Mapping[str, Sequence[ResultRow]],
     fail_on: frozenset[str],
 ) -> pa.Table:
-    """Return the table of a run: the rows of each log and specification file that the suite asks for."""
+    """Return the table of a run: the rows of all requests."""
     import pyarrow as pa
 
     unreadable = {
@@ -690,7 +687,7 @@ def _record_of(requests: Sequence[RowRequest]) -> RunRecord:
 
 
 def _folder_of(requests: Sequence[RowRequest]) -> str:
-    """Return what the names of logs are relative to."""
+    """Return the base folder of the names of logs."""
     for request in requests:
         log = request.log
         if not is_address(log.path) and log.path.endswith(log.name) and not Path(log.name).is_absolute():
@@ -699,7 +696,7 @@ def _folder_of(requests: Sequence[RowRequest]) -> str:
 
 
 def _restore_file_names(rows: pa.Table, requests: Sequence[RowRequest]) -> pa.Table:
-    """Return rows whose texts name the file that was asked for, not another one that holds the same."""
+    """Return rows whose texts name the requested file, not another file of the same content."""
     import pyarrow as pa
 
     sources = rows.column(SOURCE).to_pylist()
@@ -719,25 +716,25 @@ def _restore_file_names(rows: pa.Table, requests: Sequence[RowRequest]) -> pa.Ta
 
 
 def _rename_file(text: str | list[str] | None, old: str, new: str) -> str | list[str] | None:
-    """Return texts with another name of a file, where it is a word: "a.csv" is part of "b-a.csv.gz"."""
+    """Replace a file name in texts, only as a whole word: "a.csv" is also a part of "b-a.csv.gz"."""
     if isinstance(text, str):
         return re.sub(rf"(?<![\w./-]){re.escape(old)}(?![\w-]|\.\w)", lambda _: new, text)
     return text and [str(_rename_file(line, old, new)) for line in text]
 
 
 def _unreadable(request: RowRequest) -> tuple[ResultRow, ...]:
-    """Return the rows of a log that cannot even be hashed."""
+    """Return the rows of a log that could not be hashed."""
     task = Task(request.log.path, (request.file.text,), request.case.conditions)
     (rows,) = rows_from_task(task)
     if all(row.error is None for row in rows):
-        # it came back while it was looked at
+        # the log became readable after the hashing
         message = f"{request.log.name} could not be read at first; run the batch again"
         (rows,) = error_rows(task, message, "machine")
     return rows
 
 
 def _judge_rows(rows: pa.Table, requests: Sequence[RowRequest], fail_on: frozenset[str]) -> pa.Table:
-    """Return the table of a run: rows with what was asked for, and with why they fail."""
+    """Return the table of a run: rows with their requests and failures."""
     import pyarrow as pa
 
     names = rows.column("spec").to_pylist()
@@ -777,12 +774,12 @@ _JUDGED += ["faults", "error"]
 
 
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:
-    """Return why a row does not pass, in a few words; None if it does."""
+    """Return why a row does not pass, in a few words; None if it passes."""
     if row["verdict"] is None:
         return cast("str | None", row["error"])
     return expectation.failure(cast(Outcome, SimpleNamespace(**{**row, "lower": _lower(row)})), fail_on)
 
 
 def _lower(row: Mapping[str, Any]) -> float:
-    """Return the least robustness of a row that is possible; NaN if that is not known."""
+    """Return the least possible robustness of a row; NaN if unknown."""
     return nan if row["lower"] is None else cast(float, row["lower"])

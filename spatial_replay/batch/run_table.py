@@ -1,4 +1,4 @@
-"""The table of a run in short, and compared with that of an earlier run."""
+"""Totals of the table of a run, and its comparison with the table of an earlier run."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ Values: TypeAlias = dict[str, Any]
 """A row of a table: values by column."""
 
 VERDICTS: Final = ("satisfied", "violated", "unknown", "doubtful", "untested")
-"""Verdicts, and the words in their place for what fails as doubtful, or as tested by nothing."""
+"""Verdicts, and the words for results that fail as doubtful or as tested by nothing."""
 _WORDS: Final = MappingProxyType({"doubtful": DOUBTFUL, "untested": UNTESTED})
-"""Beginnings of the failures that stand for a verdict, by the words in its place."""
+"""Beginnings of failures, by the words that replace the verdict."""
 WORSE: Final = "worse_than_baseline"
-"""A column of a table that was compared with a baseline: whether a result is worse than there, or gone."""
+"""Column of a table with a baseline: whether a result is worse than in the baseline, or gone."""
 EDITED: Final = "edited_since_baseline"
-"""Another such column: whether the spec means something else than in the baseline."""
+"""Column of a table with a baseline: whether the meaning of the spec has changed since."""
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
     {"spec": ("case", "file", "spec"), "log": ("case", "log")}
 )
 RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
     {"violated": 0, None: 1, "unknown": 2, "untested": 2, "satisfied": 3}
 )
-"""Verdicts, the worst first; None is an error, or gone."""
+"""Ranks of verdicts, the worst first. None is an error or a result that is gone."""
 _LONGEST_CONDITION: Final = 1_000
 
 
@@ -48,15 +48,16 @@ class Total:
     """The results of one spec over its logs, or of one log under its specs.
 
     Attributes:
-        group: what they have in common, by column.
-        satisfied, violated, unknown, doubtful, untested: how many results; see `VERDICTS`.
-        errors: how many have an error in place of a verdict.
-        failures: how many do not pass.
-        least: the least robustness among them; None if none is determined.
-        worse: how many of unchanged specs are worse than a baseline, or gone; None without one.
-        worse_edited: how many of specs that were edited since; None without a baseline.
+        group: common values of the results, by column.
+        satisfied, violated, unknown, doubtful, untested: numbers of results, see `VERDICTS`.
+        errors: number of results with an error instead of a verdict.
+        failures: number of results that do not pass.
+        least: least robustness; None if none is determined.
+        worse: number of results of unchanged specs that are worse than in a baseline, or gone; None without a
+            baseline.
+        worse_edited: the same number for specs that were edited since the baseline; None without a baseline.
         is_edited: whether the spec was edited since the baseline.
-        requirement, title, unit: of the spec; None for a log, and where it has none.
+        requirement, title, unit: values of the spec; None for a log, and for a spec without them.
     """
 
     group: Values
@@ -82,12 +83,12 @@ class Total:
 
 
 def result_name(spec: str, object_name: str | None) -> str:
-    """Return what a result is called: its spec, with the object of a template."""
+    """Return the name of a result: its spec, with the object of a template."""
     return spec if object_name is None else f"{spec}({object_name})"
 
 
 def requirement_of(row: Values) -> str:
-    """Return the requirement that a row is about, see `requirement_text`."""
+    """Return the requirement of a row, see `requirement_text`."""
     return requirement_text(row["requirement"], row["title"])
 
 
@@ -101,7 +102,7 @@ def robustness_of(row: Values) -> str:
 
 
 def verdict_word(row: Values) -> str:
-    """Return the verdict of a row, see `VERDICTS`; "error" or "gone" in place of one."""
+    """Return the verdict of a row, see `VERDICTS`; "error" or "gone" if it has none."""
     for word, beginning in _WORDS.items():
         if (row["failure"] or "").startswith(beginning):
             return word
@@ -109,12 +110,12 @@ def verdict_word(row: Values) -> str:
 
 
 def damage_word(row: Values) -> str:
-    """Return what to add to the verdict of a row, if parts of its log are lost."""
+    """Return a suffix for verdicts of damaged logs; "" for other logs."""
     return " (damaged log)" if row["faults"] and row["verdict"] else ""
 
 
 def summary_text(table: pa.Table) -> str:
-    """Return how many results a table has, how many of each verdict, and which of those were expected."""
+    """Return a line that counts the results of a table by verdict, and the expected ones among them."""
     passed, total, damaged = Counter[str](), Counter[str](), 0
     names = ("verdict", "error", "failure", "faults")
     for values in zip(*(table.column(name).to_pylist() for name in names), strict=True):
@@ -138,14 +139,14 @@ def summary_text(table: pa.Table) -> str:
 
 
 def _count_text(text: str, total: int, passed: int) -> str:
-    """Say how many results with a verdict that fails unless it is expected were."""
+    """Return a count of results with the number of expected ones."""
     if not passed:
         return text
     return f"{text} as expected" if passed == total else f"{text} ({passed:,} as expected)"
 
 
 def totals(table: pa.Table, by: By = "spec") -> list[Total]:
-    """Return the totals of a table, in the order in which it names specs or logs."""
+    """Return the totals of specs or logs, in the order of the table."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -169,10 +170,10 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     sums = [(f"n_{name}", "sum") for name in counted]
     about = ("requirement", "title", "unit") if by == "spec" else ()
     columns |= {name: table.column(name) for name in about}
-    # the first one: what is gone comes last, with that of its time
+    # the first value is the current one: rows of gone results come last, with values of the baseline
     sums += [(name, "first") for name in about]
     sums += [("edited", "max")] if "edited" in columns else []
-    # one thread: groups come in the order of their first rows
+    # with several threads, pyarrow's TableGroupBy does not keep the order of the rows
     grouped = pa.table(columns).group_by(list(_GROUPS[by]), use_threads=False)
     return [
         Total(
@@ -210,11 +211,11 @@ class FlakyResult:
 
 
 RUN: Final = re.compile(r"#\d+(?=[./])")
-"""The number of a run in the name of its log: "cross#2.mcap". At the end, it is that of an episode."""
+"""The number of a run in the name of a log: "cross#2.mcap". A number at the end of a name is an episode."""
 
 
 def flaky_results(table: pa.Table) -> list[FlakyResult]:
-    """Return the flaky results among repeated runs: logs whose names differ in a number after "#" only."""
+    """Return the flaky results of repeated runs. Names of such logs differ only in a number after "#"."""
     failures: dict[Key, list[bool]] = defaultdict(list)
     for key, failure in zip(keys_of(table), table.column("failure").to_pylist(), strict=True):
         case, log, file, spec, object_name = key
@@ -229,7 +230,7 @@ def flaky_results(table: pa.Table) -> list[FlakyResult]:
 
 
 def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
-    """Return the columns of counts of a table of totals; some only where any counts."""
+    """Return the columns of counts by heading. Columns of rare words are left out if all counts are 0."""
     names = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
     if any(row.worse is not None for row in rows):
         names |= {"worse": "worse", "edited": "worse_edited"}
@@ -240,9 +241,10 @@ def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
 
 
 def worst_rows(table: pa.Table, count: int) -> list[Values]:
-    """Return the worst rows: what fails first, then violations, errors and unknown ones, by robustness.
+    """Return the worst rows: failures first, then by verdict and robustness.
 
-    Numbers of different units are not compared: the worst of each unit come first, then the second of each.
+    Numbers in different units are not compared: the worst row of each unit comes first, then the second of
+    each.
     """
     import pyarrow.compute as pc
 
@@ -276,11 +278,11 @@ def _worst_of_unit(table: pa.Table, count: int) -> list[Values]:
 def rows_where(table: pa.Table, condition: str) -> pa.Table:
     """Return the rows that fit a condition such as `verdict == "violated" and robustness < -0.1`.
 
-    It compares columns with texts and numbers (`==`, `!=`, `<`, `<=`, `>`, `>=`), looks for a text
-    (`"door" in log`), and joins such parts by `and`, `or`, `not` and parentheses. `none` is an absent value.
+    A condition compares columns with texts and numbers (`==`, `!=`, `<`, `<=`, `>`, `>=`) or searches for a
+    text (`"door" in log`). `and`, `or`, `not` and parentheses join conditions. `none` is an absent value.
 
     Raises:
-        UsageError: anything else, or a column that the table lacks.
+        UsageError: the text is no such condition, or names a column that the table lacks.
     """
     import pyarrow as pa
     import pyarrow.dataset as ds
@@ -307,10 +309,10 @@ _MOST_VALUES: Final = 5
 
 
 def absent_values(table: pa.Table, condition: str) -> Iterator[str]:
-    """Yield a sentence for each text that a condition compares a column with, and no row has.
+    """Yield a sentence for each text in a condition that no row of its column has.
 
     Args:
-        condition: one that `rows_where` takes.
+        condition: as for `rows_where`.
     """
     import pyarrow.compute as pc
 
@@ -357,7 +359,7 @@ class _Condition:
     field: Callable[[str], Any]
 
     def of(self, node: ast.expr) -> Any:
-        """Return the expression of a truth value."""
+        """Return the Arrow expression of a condition."""
         match node:
             case ast.BoolOp(op=op, values=[first, *rest]):
                 joined = self.of(first)
@@ -402,7 +404,7 @@ class _Condition:
             case ast.Name(id="none"):
                 return None
             case ast.Name(id=word) if word not in self.names:
-                # `verdict == violated`, as people type it where a shell takes the quotes
+                # a shell removes the quotes of `verdict == "violated"`
                 return word
         raise UsageError(_no_condition(self.text))
 
@@ -420,7 +422,7 @@ Change: TypeAlias = Literal["worse", "verdict", "gone", "better", "more", "new"]
 
 WORSE_THAN: Final = "worse than the baseline"
 EDITED_SINCE: Final = "edited since the baseline"
-"""Beginnings of failures of results that a baseline has better."""
+"""Beginnings of failures of results that are worse than in a baseline."""
 BASELINE_VERDICT: Final = "baseline_verdict"
 BASELINE_ROBUSTNESS: Final = "baseline_robustness"
 _NUMBER: Final = r"((?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?)"
@@ -433,12 +435,12 @@ _ORDER: Final = {"satisfied": 0, "untested": 1, "unknown": 1, "violated": 2, Non
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """How much less robustness passes: the greater one of a share and an amount.
+    """Accepted loss of robustness: the greater one of a share and an amount.
 
     Attributes:
-        share: of the baseline's number.
+        share: share of the baseline's robustness.
         amount: in units of robustness.
-        unit: of the amount; "" for results without one.
+        unit: unit of the amount; "" for results without a unit.
     """
 
     share: float = 0.0
@@ -450,7 +452,7 @@ class Tolerance:
         """Read an amount such as `0.02m`, a share such as `5%`, or both: `5%, at least 0.002m`.
 
         Raises:
-            UsageError: anything else.
+            UsageError: the text is no tolerance.
         """
         match = _TOLERANCE.fullmatch(text.strip())
         if match is None:
@@ -462,10 +464,10 @@ class Tolerance:
         return cls(float(percent or 0.0) / 100.0, float(amount or floor or 0.0), unit or floor_unit or "")
 
     def check(self, units: Iterable[str | None]) -> None:
-        """Check that an absolute amount says which unit of the results it is in.
+        """Check that an absolute amount has a unit of the results.
 
         Raises:
-            UsageError: it has none, and results have one; or no result has its unit.
+            UsageError: the amount lacks a unit that results have, or has a unit that no result has.
         """
         units_of_results = sorted({unit for unit in units if unit and unit != "1"})
         if not self.amount or self.unit in units_of_results or not (units_of_results or self.unit):
@@ -480,10 +482,10 @@ class Tolerance:
         raise UsageError(f"--tolerance {self.amount:g}{self.unit}: robustness {place}; {remedy}")
 
     def allows(self, before: float | None, now: float | None, unit: str = "") -> bool:
-        """Return whether a number is not worse than before by more than this.
+        """Return whether a loss of robustness is within the tolerance.
 
         Args:
-            unit: of both; an amount in another unit allows nothing.
+            unit: unit of both numbers; an amount in another unit allows nothing.
         """
         if before is None or now is None:
             return before is None
@@ -498,10 +500,10 @@ class Difference:
     """One result that differs from the baseline.
 
     Attributes:
-        change: "worse" by more than the tolerance, another "verdict" that is worse, "gone", "better" (another
-            verdict), "more" robustness by more than the tolerance, or "new".
-        case, log, file, spec, object: which result.
-        before, now: its verdicts; None for an error, and for what is gone now.
+        change: "worse" or "more" if the robustness changes by more than the tolerance; "verdict" or "better"
+            if the verdict gets worse or better; "gone" or "new" if only one table has the result.
+        case, log, file, spec, object: key of the result.
+        before, now: verdicts; None for an error or a missing result.
         before_robustness, robustness: None where not determined.
         is_edited: whether the spec was edited since the baseline.
     """
@@ -524,7 +526,7 @@ class Difference:
 
     @property
     def key(self) -> Key:
-        """Which result it is."""
+        """The key of the result."""
         return self.case, self.log, self.file, self.spec, self.object
 
     @property
@@ -544,13 +546,13 @@ def compare(
 ) -> list[Difference]:
     """Return the differences of a run from a baseline, the worst first.
 
-    Results are the same if case, log, specification file, spec and object are.
+    Results are matched by case, log, specification file, spec and object.
 
     Args:
-        with_all: also results that are new, or have more robustness.
+        with_all: whether new results and results with more robustness are included.
 
     Raises:
-        UsageError: a tolerance without the unit that results have.
+        UsageError: the tolerance lacks the unit of the results.
     """
     units = dict(zip(keys_of(table), table.column("unit").to_pylist(), strict=True))
     tolerance.check(units.values())
@@ -566,7 +568,7 @@ def compare(
 
 
 def edited_specs(table: pa.Table, baseline: pa.Table) -> list[tuple[str, str, str]]:
-    """Return case, file and name of the specs that mean something else than in the baseline."""
+    """Return case, file and name of each spec whose meaning differs from the baseline."""
 
     def meanings(rows: pa.Table) -> dict[tuple[str, str, str], str | None]:
         names, hashes = ("case", "file", "spec"), rows.column("meaning").to_pylist()
@@ -578,11 +580,10 @@ def edited_specs(table: pa.Table, baseline: pa.Table) -> list[tuple[str, str, st
 
 
 def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
-    """Return the table of a run in which what is worse than the baseline fails, and what is gone has a row.
+    """Return the table of a run in which worse results fail, and gone results have a row.
 
-    The columns `baseline_verdict` and `baseline_robustness` say what each result was,
-    `worse_than_baseline` whether it is worse now, or gone, and `edited_since_baseline` whether its spec
-    means something else.
+    The columns `baseline_verdict` and `baseline_robustness` hold the earlier results. `worse_than_baseline`
+    marks worse and gone results. `edited_since_baseline` marks specs whose meaning has changed.
 
     Args:
         differences: see `compare`.
@@ -597,7 +598,7 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
         if difference.change == "gone":
             gone.append(difference)
         elif difference.fails:
-            # an error in place of all objects of a template
+            # one row with an error stands for all objects of a template
             key = difference.key if difference.key in present else (*difference.key[:-1], None)
             beginning = EDITED_SINCE if difference.is_edited else WORSE_THAN
             worse[key].append(f"{beginning}: {difference.failure}")
@@ -632,11 +633,11 @@ _LISTS: Final = (
     "remarks",
     "missing",
 )
-"""Columns of several texts."""
+"""Columns that hold lists of texts."""
 
 
 def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
-    """Return the row of a result that only the baseline has, given its row there."""
+    """Return the row of a gone result, given its row in the baseline."""
     copied_columns = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
     nothing: dict[str, Any] = {name: [] for name in _LISTS}
     return {
@@ -653,7 +654,7 @@ def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
 
 
 def keys_of(table: pa.Table) -> list[Key]:
-    """Return which result each row is."""
+    """Return the key of each row."""
     return list(zip(*(table.column(name).to_pylist() for name in _KEY), strict=True))
 
 
@@ -670,10 +671,10 @@ def _differences(
 ) -> Iterator[Difference]:
     present = {key[:-1] for key in now}
     for key, (old, old_number) in before.items():
-        # an error in place of all objects of a template stands for each
+        # one row with an error stands for all objects of a template
         result_now = now.get(key) or now.get((*key[:-1], None))
         if result_now is None and old is None and key[:-1] in present:
-            # an error in place of all objects of a template, which has results now
+            # the baseline had one row with an error for all objects, which have results now
             continue
         if result_now is None:
             yield Difference(
@@ -693,7 +694,7 @@ def _differences(
                 change, *key, before=old, now=new, before_robustness=old_number, robustness=number
             )
     for key, (new, number) in now.items():
-        # an error in place of all objects of a template is none of them
+        # one row with an error for all objects of a template is no new result
         if key not in before and not (new is None and key[-1] is None):
             yield Difference("new", *key, before=None, now=new, before_robustness=None, robustness=number)
 
@@ -710,11 +711,11 @@ def _describe_verdict(verdict: str | None, number: float | None) -> str:
 
 MOST_WORST: Final = 10
 MOST_FLAKY: Final = 20
-"""Worst rows, and flaky results, that a report lists."""
+"""Numbers of worst rows and of flaky results that a report lists."""
 
 
 def total_cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
-    """Return a table of totals: the headings of its numbers, and rows of three names and then these."""
+    """Return the headings of the number columns, and one row per total: three names, then the numbers."""
     columns = counts_of(rows)
     cells = []
     for place, total in enumerate(rows):

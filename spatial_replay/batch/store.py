@@ -28,15 +28,15 @@ _PARTIAL: Final = ".partial"
 
 
 class LocalFolder:
-    """A folder on this machine. A file is written under another name first, so it is whole or not there."""
+    """A folder on this machine. Files are written under temporary names first, so no file is partial."""
 
     is_on_this_machine: Final = True
 
     def __init__(self, path: Path) -> None:
-        """Take a path; nothing is read yet.
+        """Check a path without reading the folder.
 
         Raises:
-            UsageError: it is a file.
+            UsageError: the path is a file.
         """
         refuse_addresses(path, "give it as a text: a path joins its slashes")
         if path.exists() and not path.is_dir():
@@ -48,18 +48,18 @@ class LocalFolder:
         return str(self.path)
 
     def exists(self) -> bool:
-        """Return whether there is a file in it."""
+        """Return whether the folder contains a file."""
         return next(self._files(self.path), None) is not None
 
     def names(self, below: str = "") -> list[str]:
-        """Return the names of all files in it, or in a folder below, in order."""
+        """Return the sorted names of all files in the folder, or in a folder below."""
         return sorted(file.removeprefix(f"{self.path}/") for file in self._files(self.path / below))
 
     def read(self, names: Sequence[str]) -> Iterator[bytes]:
         """Read files, and yield the content of each in their order.
 
         Raises:
-            MissingFileError, LogError: one is not there, or cannot be read.
+            MissingFileError, LogError: a file is missing, or cannot be read.
         """
         for name in names:
             try:
@@ -71,10 +71,10 @@ class LocalFolder:
             yield data
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and the folders that it lies in.
+        """Write a file, and create its folders.
 
         Raises:
-            OutputError: the machine cannot write it.
+            OutputError: the file cannot be written.
         """
         file = self.path / name
         try:
@@ -88,7 +88,7 @@ class LocalFolder:
         """Remove files.
 
         Raises:
-            OutputError: one cannot be removed.
+            OutputError: a file cannot be removed.
         """
         for name in names:
             try:
@@ -104,7 +104,7 @@ class LocalFolder:
 
     @contextmanager
     def lock(self, name: str) -> Iterator[None]:
-        """Keep other commands from writing here, by a lock on a file, and remove what killed ones have left.
+        """Lock the folder against other commands, and remove partial files of killed commands.
 
         Raises:
             UsageError: another command is writing here.
@@ -122,13 +122,13 @@ class LocalFolder:
 
 
 class BucketFolder(RemoteFolder):
-    """A folder in a bucket. Many machines write to it, so it has no lock, and nothing about files of one."""
+    """A folder in a bucket. Many machines write to it, so it has no lock and no states of local files."""
 
     is_on_this_machine: Final = False
 
     @contextmanager
     def lock(self, name: str) -> Iterator[None]:
-        """Let others write, too: a batch that is killed could not take a lock back."""
+        """Lock nothing, because a killed batch could not release a lock in a bucket."""
         yield
 
 
@@ -139,27 +139,27 @@ def result_files(folder: str | PathLike[str]) -> ResultFiles:
     """Return the folder of a path or an address.
 
     Raises:
-        UsageError: neither a folder nor the address of one, or obstore is not installed.
+        UsageError: the argument is neither a folder nor an address of one, or obstore is not installed.
     """
     return BucketFolder(fspath(folder)) if is_address(folder) else LocalFolder(Path(folder))
 
 
 FORMAT: Final = 4
-"""The version of the layout; rows of another version are never read."""
+"""Version of the layout; rows of another version are never read."""
 LAST_RUN: Final = "last_run.parquet"
 SOURCE: Final = "source"
-"""The column of the file that was read: logs that hold the same share their rows."""
+"""Column with the name of the evaluated file. Logs of equal content share their rows."""
 EXPLANATION: Final = ("atom", "atom_time_ns", "atom_objects", "reason", "explanation")
-"""The columns of what decided a result: null until it is explained."""
+"""Columns of the explanation; null until a result is explained."""
 _FORMAT_FILE: Final = "format.json"
 _IDENTITIES: Final = "identities.parquet"
 _ROWS: Final = "rows"
 _MOST_TOGETHER: Final = 500
-"""Keys in one file, at most: so many wait in memory."""
+"""Keys per file of rows, whose rows wait in memory."""
 _LONGEST_WAIT_S: Final = 0.5
-"""Between two files of rows: a batch that is killed loses the results of this time."""
+"""Time between two files of rows, seconds. A killed batch loses the results of this time."""
 _MOST_SMALL: Final = 50
-"""Files of rows that are not full, before they are joined."""
+"""Number of small files of rows above which they are joined."""
 _DIGEST_BYTES: Final = 32
 
 
@@ -175,7 +175,7 @@ def columns() -> pa.Schema:
 
 
 def run_columns() -> pa.Schema:
-    """Return the columns of the table of a run: those of rows, and what the run asked for."""
+    """Return the columns of the table of a run: stored rows with their requests."""
     pa = _pyarrow()
     text = pa.string()
     run_columns = [(name, text) for name in ("case", "log", "file", "meaning", "expected", "failure")]
@@ -196,14 +196,14 @@ def _schema(columns: Sequence[Any]) -> pa.Schema:
 
 
 def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
-    """Return rows, by their keys, as a table; an unknown number is null."""
+    """Return rows by key as a table. Unknown numbers are null."""
     pa, schema = _pyarrow(), columns()
     key, *values = schema
     all_rows = [row for several in rows.values() for row in several]
     arrays = [pa.array([key for key, several in rows.items() for _ in several], key.type)]
     # column by column: three times as fast as row by row
     arrays += [
-        # DuckDB and polars hold a NaN for greater than every number
+        # null instead of NaN, which DuckDB and polars sort above every number
         pa.array([getattr(row, column.name) for row in all_rows], column.type, from_pandas=True)
         for column in values
     ]
@@ -211,14 +211,14 @@ def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
 
 
 def _encode_table(table: pa.Table) -> bytes:
-    """Return a table as a Parquet file that holds a digest of its other bytes right before its footer.
+    """Return a table as Parquet with a SHA-256 digest of its other bytes before the footer.
 
-    Readers of Parquet skip what no column refers to.
+    Parquet readers skip bytes that no column refers to.
     """
     from pyarrow import parquet
 
     stream = io.BytesIO()
-    # written in one piece, a table of many small ones takes a quarter of the time
+    # one combined chunk is written in a quarter of the time of many small ones
     parquet.write_table(table.combine_chunks(), stream, compression="zstd")
     data = stream.getvalue()
     footer = _footer(data)
@@ -229,7 +229,7 @@ def _decode_table(data: bytes) -> pa.Table:
     """Return the table of `_encode_table`.
 
     Raises:
-        ValueError: the digest does not fit.
+        ValueError: the digest does not match.
     """
     from pyarrow import parquet
 
@@ -244,32 +244,32 @@ def _decode_table(data: bytes) -> pa.Table:
 
 
 def _footer(data: bytes) -> int:
-    """Return where the footer of a Parquet file begins: its length and four letters end the file."""
+    """Return the offset of the footer. A Parquet file ends with its length and `PAR1`, 4 bytes each."""
     return max(0, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
 
 
 class NewRows:
-    """Stores the rows of a run, those of many keys as one file; see `ResultsFolder.new_rows`."""
+    """Writes the rows of many keys into one file, see `ResultsFolder.new_rows`."""
 
     def __init__(self, files: ResultFiles) -> None:
         self._files = files
         self.tables: list[pa.Table] = []
-        """The rows that were written."""
+        """Written rows."""
         self._waiting: dict[str, Sequence[ResultRow]] = {}
         self._written_s = 0.0
 
     def add(self, key: str, rows: Sequence[ResultRow]) -> None:
-        """Take the rows of a key.
+        """Store the rows of a key.
 
         Raises:
-            OutputError: they cannot be written.
+            OutputError: rows cannot be written.
         """
         self._waiting[key] = rows
         if len(self._waiting) >= _MOST_TOGETHER or time.monotonic() - self._written_s >= _LONGEST_WAIT_S:
             self.write()
 
     def write(self) -> None:
-        """Write the rows that wait; for what is raised, see `add`."""
+        """Write the waiting rows, with the errors of `add`."""
         if self._waiting:
             table = table_of(self._waiting)
             _write_rows(self._files, table)
@@ -295,12 +295,12 @@ class ResultsFolder:
 
     @classmethod
     def create(cls, path: str | PathLike[str]) -> ResultsFolder:
-        """Open a folder for a batch; one that does not exist is made.
+        """Open a folder of results for a batch, and create it if needed.
 
         Raises:
-            UsageError: it holds something else, or results of another version.
-            OutputError: it cannot be written.
-                MissingFileError, RemoteError: a bucket cannot be read.
+            UsageError: the folder holds something else, or results of another version.
+            OutputError: the folder cannot be written.
+            MissingFileError, RemoteError: a bucket cannot be read.
         """
         _pyarrow()
         files = result_files(path)
@@ -314,7 +314,7 @@ class ResultsFolder:
 
         Raises:
             MissingFileError: there is no such folder.
-            UsageError: it does not hold results, or those of another version.
+            UsageError: the folder does not hold results, or holds results of another version.
             RemoteError: a bucket cannot be read.
         """
         _pyarrow()
@@ -336,7 +336,7 @@ class ResultsFolder:
         return cls(files)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Keep other batches from writing here, unless it is in a bucket.
+        """Lock the folder against other batches. A bucket has no lock.
 
         Raises:
             UsageError: another batch is running.
@@ -344,12 +344,12 @@ class ResultsFolder:
         return self._files.lock(_FORMAT_FILE)
 
     def rows(self, lasting: set[str]) -> tuple[pa.Table, list[str]]:
-        """Return the stored rows of keys, those of each together, and a remark on each damaged file.
+        """Return the stored rows of `lasting` keys, grouped by key, and a remark on each damaged file.
 
-        Damaged files are removed, and small ones are joined; call it inside `lock`.
+        Damaged files are removed, and small files are joined. Call it inside `lock`.
 
         Raises:
-            OutputError: that cannot be done.
+            OutputError: a file cannot be removed or written.
         """
         tables, remarks, taken_keys, small = [columns().empty_table()], [], set[str](), {}
         names = self._files.names(_ROWS)
@@ -371,13 +371,13 @@ class ResultsFolder:
         return _pyarrow().concat_tables(tables), remarks
 
     def _join(self, tables: Mapping[str, pa.Table]) -> None:
-        """Write tables of rows as one, in place of those that have their names."""
+        """Replace several files of rows by one, given their tables by name."""
         name = _write_rows(self._files, _pyarrow().concat_tables(tables.values()))
         self._files.remove(sorted(set(tables) - {name}))
 
     @contextmanager
     def new_rows(self) -> Iterator[NewRows]:
-        """Store rows, the last of them when the block ends, even by an interruption.
+        """Return a writer of rows. The last rows are written when the block ends, even after an interruption.
 
         Raises:
             OutputError: they cannot be written.
@@ -389,9 +389,9 @@ class ResultsFolder:
             rows.write()
 
     def identities(self) -> tuple[dict[str, str], list[str]]:
-        """Return the digests of logs by their states, as they were written, and a remark if they are damaged.
+        """Return the stored identities of logs by state, and a remark if their file is damaged.
 
-        In a bucket, there are none: other machines have other files of one path.
+        A bucket stores none, because a path means different files on different machines.
         """
         if not self._files.is_on_this_machine:
             return {}, []
@@ -404,7 +404,7 @@ class ResultsFolder:
         return dict(zip(*(column.to_pylist() for column in table.columns), strict=True)), []
 
     def write_identities(self, identities: Mapping[str, str]) -> None:
-        """Write digests of logs by their states.
+        """Write identities of logs by state.
 
         Raises:
             OutputError: they cannot be written.
@@ -430,7 +430,7 @@ class ResultsFolder:
         """Return the table of the last run that ended.
 
         Raises:
-            UsageError: none has.
+            UsageError: no run has ended.
             LogError: its file is damaged.
         """
         try:
@@ -443,7 +443,7 @@ class ResultsFolder:
             raise LogError(f"{error}; run the batch again, which writes it again") from None
 
     def read_explanations(self) -> dict[tuple[str, str, str | None], tuple[Any, ...]]:
-        """Return the values of `EXPLANATION` that the last run knows, by key, spec and object."""
+        """Return the explanations in the last run by key, spec and object, see `EXPLANATION`."""
         import pyarrow.compute as pc
 
         try:

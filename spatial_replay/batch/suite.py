@@ -1,7 +1,7 @@
-"""Suites: which logs are evaluated with which specifications, and what is expected of them.
+"""Suites: logs with their specifications and the expected results.
 
-A suite is a YAML file, or what a command line says. It names logs as people write them: patterns, folders,
-addresses; `logs` finds them.
+A suite comes from a YAML file or a command line. It names logs by patterns, folders and addresses, and
+`run.find_logs` finds the logs.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from spatial_replay.monitor.verdict import Semantics, Verdict
 from spatial_replay.trace.trace import time_point_from_text
 
 LARGEST_SUITE: Final = 8 * 2**20
-"""Bytes of a suite file."""
+"""Size limit of a suite file, bytes."""
 _Value = TypeVar("_Value")
 Pairs: TypeAlias = tuple[tuple[str, _Value], ...]
-"""A table that can be hashed, and sent to another process."""
+"""A table as a tuple, which can be hashed and sent to another process."""
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """How logs are read, and how specifications are evaluated over them.
+    """Options of reading logs and of evaluating specifications.
 
     Attributes:
         mapping: the mapping file or its address, or None.
         reading: further keyword arguments of `open_source`.
-        start, end: the window, as people write times; None for the whole log.
+        start, end: the window, as times in text; None for the ends of the log.
         every: every `every`th sample is evaluated.
         each: for each parameter of a template its objects: "all", "class:NAME" or a name.
         semantics: "ltlf" or "paper".
-        strict_names: names that a log never has are errors.
-        constants: values in place of those that the specifications give their constants.
-        requires: what a log must have to be judged, as JSON; "" for nothing.
+        strict_names: whether names that a log never has are errors.
+        constants: values that replace those in the specifications.
+        requires: requirements on a log, as JSON; "" for none.
     """
 
     mapping: Path | str | None = None
@@ -128,10 +128,10 @@ class Expectation:
 
     Attributes:
         verdict: the verdict that passes.
-        at_least: the least robustness that passes, whatever the verdict, or None.
-        tolerance: how much less passes, as an allowance for rounding.
+        at_least: least robustness that passes, independent of the verdict; None without a limit.
+        tolerance: allowance below the limit, for rounding.
         allow_unknown: whether an unknown verdict passes, too.
-        allow: "vacuous", "dropped" and "doubtful": what passes although it shows nothing.
+        allow: kinds of inconclusive results that pass: "vacuous", "dropped" and "doubtful".
     """
 
     verdict: Verdict = Verdict.SATISFIED
@@ -149,17 +149,17 @@ class Expectation:
         return f"{self.verdict}{unknown}"
 
     def verdict_of(self, verdict: str | None, lower: float) -> str | None:
-        """Return the verdict of a result: one that misses its limit by the tolerance at most is satisfied."""
+        """Return the verdict of a result. A violation within the tolerance counts as satisfied."""
         is_wanted = self.verdict is Verdict.SATISFIED and self.at_least is None and self.tolerance > 0.0
         if is_wanted and verdict == Verdict.VIOLATED and lower >= -self.tolerance:
             return str(Verdict.SATISFIED)
         return verdict
 
     def failure(self, outcome: Outcome, fail_on: AbstractSet[str] = frozenset()) -> str | None:
-        """Return why a result with a verdict does not pass, in a few words; None if it does.
+        """Return why a result with a verdict does not pass, in a few words; None if it passes.
 
         Args:
-            fail_on: what fails although the case allows it, see `FAILING_KINDS`.
+            fail_on: kinds of results that fail even if the case allows them, see `FAILING_KINDS`.
         """
         failure = self._difference(outcome)
         is_unknown = outcome.verdict == Verdict.UNKNOWN
@@ -181,11 +181,11 @@ class Expectation:
         return "; ".join(filter(None, (failure, damage))) or None
 
     def _difference(self, outcome: Outcome) -> str | None:
-        """Return how a verdict or a robustness differs from what is expected."""
+        """Return the difference from the expected verdict or robustness; None without a difference."""
         if outcome.verdict == Verdict.UNKNOWN and self.allow_unknown:
             return None
         if self.verdict is Verdict.SATISFIED and (self.at_least is not None or self.tolerance):
-            # known to be at least that: the lower end is the robustness where nothing is unknown
+            # the lower end of the interval equals the robustness if nothing is unknown
             if outcome.lower >= (self.at_least or 0.0) - self.tolerance:
                 return None
             if self.at_least is not None:
@@ -200,10 +200,10 @@ DEFAULT_EXPECTATION: Final = Expectation()
 
 @dataclass(frozen=True, slots=True)
 class LogPattern:
-    """Logs as they are written: a file, a folder, a pattern, an address.
+    """Logs as a suite names them: a file, a folder, a pattern or an address.
 
     Attributes:
-        place: file and line where it is written, for errors; "" on a command line.
+        place: file and line of the text, for errors; "" on a command line.
     """
 
     text: str
@@ -216,13 +216,12 @@ class Case:
 
     Attributes:
         name: unique in its suite.
-        logs: relative paths are relative to the suite's folder.
+        logs: patterns of logs, relative to the suite's folder.
         specs: the specification files, or their addresses.
-        requirements: ids of requirements that the case is about; a spec can have one of its own.
-        at_least_logs: the least number of logs that its patterns have to find.
+        requirements: ids of the case's requirements; the id of a spec has priority.
+        at_least_logs: least number of logs that the patterns have to find.
         places: file and line of each key, for errors; none on a command line.
-        is_whole: whether its specs, and what is given for their constants and parameters, are all there:
-            what is wrong in the file is left out.
+        is_whole: whether specs, constants and objects of parameters are complete; faulty values are left out.
     """
 
     name: str
@@ -236,7 +235,7 @@ class Case:
     is_whole: bool = True
 
     def place(self, key: str) -> str:
-        """Return where a key is written, as the beginning of an error; "" on a command line."""
+        """Return the place of a key as the beginning of an error; "" on a command line."""
         places = dict(self.places)
         return f"{places.get(key, places[''])}: case {self.name[:60]!r}: " if places else ""
 
@@ -246,11 +245,11 @@ class Suite:
     """The cases of a batch.
 
     Attributes:
-        name: for reports: the stem of the suite's file.
-        folder: what relative paths of logs are relative to.
+        name: name in reports: the stem of the suite's file.
+        folder: base of relative log paths.
         cases: at least one; their names differ.
         path: the suite's file, or None.
-        faults: lines of the file and what is wrong there; `prepare` raises them with all that it finds.
+        faults: lines and messages of faults in the file; `prepare` raises them together with others.
     """
 
     name: str
@@ -260,7 +259,7 @@ class Suite:
     faults: tuple[tuple[int, str], ...] = ()
 
     def allowing(self, kinds: AbstractSet[str]) -> Suite:
-        """Return the suite with what passes in every case, too."""
+        """Return the suite with further kinds of inconclusive results that pass in every case."""
         cases = [
             replace(case, expectation=replace(case.expectation, allow=case.expectation.allow | kinds))
             for case in self.cases
@@ -282,8 +281,8 @@ class Suite:
 def load_suite(path: str | PathLike[str]) -> Suite:
     """Load a suite file (YAML; `schemas/suite.schema.json`).
 
-    Keys beside `cases` hold for every case that does not have its own. Paths are relative to the file.
-    `faults` of the suite says what is wrong in it; `prepare` raises that with all else that is wrong.
+    Keys next to `cases` are the defaults of all cases. Paths are relative to the file. Faults of the file are
+    in `Suite.faults`, and `prepare` raises them together with others.
 
     Raises:
         MissingFileError: there is no such file.
@@ -304,7 +303,7 @@ def load_suite(path: str | PathLike[str]) -> Suite:
 
 
 def _cases(document: Document, faults: Mapping[Place, str], path: Path) -> Iterator[Case]:
-    """Yield the cases of a suite, without the values that are wrong."""
+    """Yield the cases of a suite, without faulty values."""
     value = document.value if isinstance(document.value, dict) else {}
     entries = value.get("cases")
     wrong = {place[:end] for place in faults for end in range(1, len(place) + 1)}
@@ -326,8 +325,8 @@ def _case(
     """Return a case from an entry.
 
     Args:
-        places: of the case, for "", and of its keys.
-        wrong: places with a fault there or within.
+        places: places of the case (key "") and of its keys.
+        wrong: places of faults, and all places that contain them.
     """
     folder = path.parent
     lines = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
@@ -376,7 +375,7 @@ def _case(
 
 
 def _contradictions(value: Any, folder: Path) -> Iterator[tuple[Place, str]]:
-    """Yield what a schema cannot express; the value may be any."""
+    """Yield the faults that a schema cannot express, of a value of any type."""
     if not isinstance(value, dict):
         return
     yield from _wrong_values(value, (), folder)
@@ -398,7 +397,7 @@ def _contradictions(value: Any, folder: Path) -> Iterator[tuple[Place, str]]:
 
 
 def _wrong_values(entry: Mapping[str, Any], place: Place, folder: Path) -> Iterator[tuple[Place, str]]:
-    """Yield times that are none, and files that do not exist."""
+    """Yield invalid times and missing files."""
     for key in ("from", "to"):
         if isinstance(entry.get(key), str | int):
             try:
@@ -432,5 +431,5 @@ def _pairs(table: Mapping[str, _Value]) -> Pairs[_Value]:
 
 
 def _as_list(value: Any) -> Sequence[Any]:
-    """Return what a key with one value or several lists; nothing for anything else."""
+    """Return the values of a key that has one text or a list; nothing for other types."""
     return [value] if isinstance(value, str) else value if isinstance(value, list) else ()

@@ -1,8 +1,8 @@
 """Processes that work on many tasks: on this machine, or on a Dask cluster.
 
-Both take a function and tasks and yield results as they come. A worker that dies takes no other task with it:
-its task runs again once, and then its result says so. There is no scheduler here: processes are those of
-`concurrent.futures`, clusters are Dask's.
+Both take a function and tasks, and yield results as they arrive. If a worker on this machine dies, the tasks
+of its pool run once more, one by one. A task whose worker dies again has the result `WorkerLost`. Scheduling
+is left to `concurrent.futures` and Dask.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
 Progress: TypeAlias = Callable[[str, int | None], AbstractContextManager[Callable[[int], None]]]
-"""Shows work: takes a label and the number of steps, and yields what is called with the steps done."""
+"""Progress factory: (label, total) → context manager that yields `advance(steps)`."""
 
 _AHEAD: Final = 2
-"""Tasks for each process that are handed out at once, so that none has to wait for its next."""
+"""Tasks handed out per process, so that no process waits for its next task."""
 _PRELOADED: Final = "spatial_replay.batch.run"
-"""Imported once, by the process that all workers are copies of."""
+"""Module that the fork server imports once for all workers."""
 _PATIENCE_S: Final = 10
-"""How long no task of a cluster ends before its lack of workers is said."""
+"""Time without a finished task after which missing workers of a cluster are reported, seconds."""
 _ANSWER_S: Final = 15
-"""How long the scheduler of a cluster has to answer."""
+"""Timeout for the scheduler of a cluster, seconds."""
 
 
 def no_progress(label: str, total: int | None) -> AbstractContextManager[Callable[[int], None]]:
@@ -46,7 +46,7 @@ def no_progress(label: str, total: int | None) -> AbstractContextManager[Callabl
 
 
 class WorkerLost(Exception):  # noqa: N818 - a result, not raised by this module
-    """The result of a task whose worker died twice while it worked on it."""
+    """The result of a task whose workers died."""
 
 
 class Workers(Protocol):
@@ -55,7 +55,7 @@ class Workers(Protocol):
     def results(
         self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
     ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
-        """Yield each task with its result, in any order; what `work` raises is raised."""
+        """Yield each task with its result, in any order. Errors of `work` are passed on."""
 
 
 class ThisProcess:
@@ -70,7 +70,7 @@ class ThisProcess:
 
 
 class LocalProcesses:
-    """Works in several processes on this machine; they end with this one, however that ends."""
+    """Works in several processes on this machine. They end when this process ends, even if it is killed."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -86,7 +86,7 @@ class LocalProcesses:
                 yield from _results(pool, work, rest, self._count * _AHEAD, suspects)
             if not suspects:
                 return
-            # one of them ended its process, so each gets one for itself
+            # one of these tasks killed its process, but it is unknown which one: each runs alone
             for task in suspects:
                 again: list[_Task] = []
                 with _pool(1, again) as pool:
@@ -105,13 +105,15 @@ def _results(
     ahead: int,
     suspects: list[_Task],
 ) -> Iterator[tuple[_Task, _Result]]:
-    """Yield results until the tasks end, or the pool breaks: then `suspects` gets the tasks it had."""
+    """Yield results until the tasks end or the pool breaks. `suspects` gets the unfinished tasks of a broken
+    pool.
+    """
     waiting: dict[Future[_Result], _Task] = {}
     is_whole = True
     while True:
         for task in islice(tasks, ahead - len(waiting) if is_whole else 0):
             try:
-                # a process that is half started could not be ended
+                # an interrupted `submit` could leave a process that `_pool` does not find
                 with uninterrupted():
                     waiting[pool.submit(work, task)] = task
             except BrokenProcessPool:
@@ -133,7 +135,7 @@ def _results(
 
 @contextmanager
 def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
-    """Start processes; they are ended at once when the block ends early, or with suspects."""
+    """Start processes. They end at once if the block ends early or leaves suspects."""
     context = forking_context([_PRELOADED])
     others = set(multiprocessing.active_children())
     ours, theirs = multiprocessing.Pipe(duplex=False)
@@ -144,12 +146,12 @@ def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
             except BaseException:
                 theirs.close()
                 pool.shutdown(wait=False, cancel_futures=True)
-                # those that are still starting would miss what this process takes away as it ends
+                # a process that is still starting would fail when this one removes its resources
                 for process in set(multiprocessing.active_children()) - others:
                     process.kill()
                 raise
             if suspects:
-                # the executor would wait for a process that it was starting as another one died
+                # otherwise the executor waits for a process that was starting when another one died
                 theirs.close()
     finally:
         theirs.close()
@@ -157,8 +159,8 @@ def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
 
 
 def _begin_worker(connection: Connection) -> None:
-    """End this process when the other end of the connection is closed, or its process ends."""
-    # a server that was there before may not block it
+    """Make this process end when the other end of the connection is closed."""
+    # a fork server that was started elsewhere may not block Ctrl-C
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
 
@@ -173,16 +175,16 @@ def _end_with(connection: Connection) -> None:
 class DaskCluster:
     """Works on a Dask cluster, through the executor of its client.
 
-    The cluster's scheduler decides how often the task of a worker that died runs again. Each use has a
-    connection of its own: a client that was closed cannot be opened again.
+    The scheduler decides how often the task of a dead worker runs again. Each use has its own client, because
+    a closed client cannot be reopened.
     """
 
     def __init__(self, address: str, report: Callable[[str], None] = lambda text: None) -> None:
-        """Take a scheduler that answers.
+        """Check that the scheduler answers.
 
         Args:
             address: such as "tcp://scheduler:8786".
-            report: takes what a user who waits should know.
+            report: receives messages for a waiting user.
 
         Raises:
             UsageError: Dask is not installed, or no scheduler answers.
@@ -199,7 +201,7 @@ class DaskCluster:
 
         Raises:
             UsageError: no scheduler answers.
-            ClusterError: it answers no more.
+            ClusterError: the scheduler stopped answering.
         """
         rest = iter(tasks)
         waiting: dict[Future[_Result], _Task] = {}
@@ -219,7 +221,7 @@ class DaskCluster:
                         task = waiting.pop(future)
                         yield task, self._result(future)
             finally:
-                # without waiting for them, as the executor would: its scheduler may be gone
+                # the executor would wait for them, and the scheduler may be gone
                 for future in waiting:
                     future.cancel()
 
@@ -231,18 +233,18 @@ class DaskCluster:
         tasks: Iterator[_Task],
         waiting: dict[Future[_Result], _Task],
     ) -> bool:
-        """Submit as many tasks as keep all workers busy, and return whether any is under way."""
+        """Submit enough tasks to keep all workers busy. Return whether any task is pending."""
         try:
             ahead = _AHEAD * max(1, sum(client.nthreads().values())) - len(waiting)
             for task in islice(tasks, max(0, ahead)):
                 waiting[pool.submit(work, task)] = task
         except (OSError, RuntimeError, ValueError) as error:
-            # a connection that is closed has many names
+            # distributed raises errors of several types for a closed connection
             raise self._scheduler_loss() from error
         return bool(waiting)
 
     def _result(self, future: Future[Any]) -> Any:
-        """Return the result of a task, or that its workers were lost; what its work raised is raised."""
+        """Return the result of a task, or `WorkerLost`. Errors of its work are passed on."""
         from distributed import KilledWorker
 
         try:
@@ -260,11 +262,11 @@ class DaskCluster:
 
     @contextmanager
     def _connection(self) -> Iterator[Any]:
-        """Connect a client, which closes whatever has become of the cluster."""
+        """Connect a client. It is closed even if the cluster is gone."""
         with importing("clusters need Dask", extra="cluster"):
             import distributed
         client_type = cast(Any, distributed).Client
-        # made before it connects, so that one that cannot is closed here and not when Python ends
+        # built in two steps: a client that cannot connect is closed here, not when Python exits
         client = client_type.__new__(client_type)
         try:
             client.__init__(self._address, timeout=_ANSWER_S, set_as_default=False)
@@ -285,7 +287,7 @@ class DaskCluster:
 
 @contextmanager
 def _silent(*loggers: str) -> Iterator[None]:
-    """Keep loggers from writing tracebacks about what is raised as an error of ours."""
+    """Silence loggers that write tracebacks of errors which this module raises itself."""
     named_loggers = [logging.getLogger(name) for name in loggers]
     before = [logger.disabled for logger in named_loggers]
     try:
