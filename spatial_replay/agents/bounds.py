@@ -16,19 +16,19 @@ from spatial_replay.errors import UsageError
 from spatial_replay.text import escape_text, plural
 
 MOST_BYTES: Final = 20_000
-"""Size of an answer as JSON, bytes."""
+"""Size limit of an answer as JSON, bytes."""
 MOST_TEXT: Final = 100_000
-"""Length of a text that a tool takes, characters."""
+"""Length limit of a text argument, characters."""
 
 _LINES: Final = 4_000
-"""Bytes of the lines of an answer, which are sent twice: as text and as values."""
+"""Size limit of the lines of an answer, bytes. They are sent twice: as text and as values."""
 _WARNINGS: Final = 1_500
 _ROW: Final = 3_000
-"""Bytes of one row."""
+"""Size limit of a row, bytes."""
 _OTHERS: Final = 3_000
-"""Bytes of all values but the rows."""
+"""Size limit of all values except the rows, bytes."""
 _MOST_ENTRIES: Final = 20_000
-"""Entries of a folder that are checked for links."""
+"""Largest number of entries of a folder, which are all checked for links."""
 _ADDRESSES: Final = "://"
 
 
@@ -37,9 +37,9 @@ class Bounds:
     """Folders and addresses that a server reads, and the folder that it writes.
 
     Attributes:
-        folders: without links.
-        addresses: of folders on other machines; each ends in "/".
-        output: None if nothing is written.
+        folders: folders, with links resolved.
+        addresses: addresses of folders on other machines; each ends in "/".
+        output: output folder; None if nothing is written.
     """
 
     folders: tuple[Path, ...]
@@ -71,14 +71,14 @@ class Bounds:
         return ", ".join([*map(str, self.folders), *self.addresses])
 
     def place(self, text: str, argument: str) -> str:
-        """Return where an input is, with all links resolved.
+        """Return the path of an input with all links resolved, or its address.
 
         Args:
             text: a path, also relative to a root, or an address; `push_v3#17` is an episode of a data set.
             argument: the name of the argument, for errors.
 
         Raises:
-            UsageError: it is missing, outside the roots, or neither a file nor a folder.
+            UsageError: the input is missing, outside the roots, or neither a file nor a folder.
         """
         if not text:
             raise UsageError(f"{argument} is empty; give a path below {self.names}")
@@ -105,11 +105,11 @@ class Bounds:
         """Return an existing path without links; None if there is none.
 
         Raises:
-            UsageError: it is outside the roots.
+            UsageError: the path is outside the roots.
         """
         is_outside = False
         try:
-            # of an absolute one, every root gives the same
+            # an absolute path is the same below every root
             for root in self.folders:
                 path = (root / text).resolve()
                 if not any(map(path.is_relative_to, self.folders)):
@@ -117,7 +117,7 @@ class Bounds:
                 elif path.exists():
                     return path
         except (OSError, ValueError, RuntimeError):
-            # names that are too long or have a null character, links in a circle
+            # the name is too long or has a null character, or links form a circle
             raise UsageError(
                 f"{argument}: {_quote(text)} cannot be a path; give one that list_logs names"
             ) from None
@@ -137,16 +137,16 @@ class Bounds:
                     )
                 for path in map(Path(parent).joinpath, (*folders, *names)):
                     target = self._inside(path, argument)
-                    # a folder that a link leads to may have links, too
+                    # the target folder of a link may contain links, too
                     if target is not None and target not in visited and os.path.isdir(target):  # noqa: PTH112
                         visited.add(target)
                         pending.append(target)
 
     def _inside(self, path: Path, argument: str) -> str | None:
-        """Return where a link leads; None for a file or a folder.
+        """Return the target of a link; None for a file or a folder.
 
         Raises:
-            UsageError: it leads to the outside, or is neither of the three.
+            UsageError: the link leads to the outside, or the path is no link, file or folder.
         """
         target = None
         try:
@@ -155,7 +155,7 @@ class Bounds:
                 target = os.path.realpath(path)
                 mode = os.stat(target).st_mode  # noqa: PTH116
         except OSError:
-            # removed by now, or a link to nothing or to itself
+            # the file was removed meanwhile, or the link has no target
             mode = stat.S_IFREG
         if target is not None and not any(map(Path(target).is_relative_to, self.folders)):
             raise UsageError(
@@ -166,15 +166,15 @@ class Bounds:
         return target
 
     def relative(self, path: str) -> str:
-        """Return a path as tools take it: relative to the only root, or else absolute."""
+        """Return a path as an argument of tools: relative to the only root, else absolute."""
         root = str(self.folders[0]) if len(self.folders) == 1 and not self.addresses else ""
         return os.path.relpath(path, root) if root and path.startswith(root) else path
 
     def output_path(self, name: str, ending: str) -> Path:
-        """Return the file in the output folder that a result is written to.
+        """Return the path of a result in the output folder.
 
         Raises:
-            UsageError: no output folder; a name with a folder in it, or of something else than a file.
+            UsageError: there is no output folder, or the name is not the name of a file in it.
         """
         if self.output is None:
             raise UsageError("nothing can be written; start the server with --output FOLDER")
@@ -193,7 +193,7 @@ def _quote(text: str) -> str:
 
 
 class Files:
-    """A folder for the texts of one call, as files; removed after it."""
+    """A temporary folder with the texts of one call as files."""
 
     def __init__(self, parent: str, bounds: Bounds, texts: Mapping[str, str]) -> None:
         self._bounds, self._texts = bounds, texts
@@ -207,7 +207,7 @@ class Files:
         self._temporary.cleanup()
 
     def path(self, name: str) -> str:
-        """Return a file with a text, or the file that the text names.
+        """Return the path of a file with the text of an argument. A text may also be such a path itself.
 
         Raises:
             UsageError: the text is empty or too long, or names a file outside the roots.
@@ -226,11 +226,11 @@ class Files:
         return f"{name}{ending}"
 
     def option(self, option: str, name: str) -> list[str]:
-        """Return an option with that file; nothing for an empty text."""
+        """Return an option with the file of a text; nothing for an empty text."""
         return [option, self.path(name)] if self._texts.get(name) else []
 
     def json(self, command: Sequence[str]) -> Any:
-        """Return the values that a command wrote to a file; None without any."""
+        """Return the values that a command wrote with --json; None without a file."""
         for option, file in pairwise(command):
             path = Path(self.folder, file)
             if option == "--json" and path.is_file():
@@ -239,14 +239,14 @@ class Files:
 
 
 class Page(NamedTuple):
-    """A part of an answer that fits.
+    """The part of an answer that fits into the limits.
 
     Attributes:
-        lines: of the text.
-        warnings: of the first part.
-        document: with a part of its rows.
-        left_off: what was cut, as sentences.
-        next: the argument that gives the next part; "" for the last one.
+        lines: lines of the text.
+        warnings: warnings, only in the first part.
+        document: the document with a part of its rows.
+        left_off: notes on the values that were cut.
+        next: argument for the next part; "" for the last part.
     """
 
     lines: list[str]
@@ -262,11 +262,11 @@ def page_of(
     """Return the part of an answer that begins at a place.
 
     Args:
-        rows_key: the key of the list in the document that may be long.
-        start: the `next` of the part before; "" for the first.
+        rows_key: key of the long list in the document.
+        start: `next` of the previous part; "" for the first part.
 
     Raises:
-        UsageError: a place that no part names.
+        UsageError: the place is invalid.
     """
     first_line, first_row = _place(start)
     left_off: list[str] = []
@@ -302,7 +302,7 @@ def _place(start: str) -> tuple[int, int]:
 
 
 def _prefix(values: Iterable[Any], most: int) -> Iterator[Any]:
-    """Yield values that are at most so many bytes together; at least one."""
+    """Yield the first values that fit into a number of bytes; at least one."""
     total = 0
     for number, value in enumerate(values):
         total += _size(value) + 1
@@ -316,18 +316,18 @@ def _size(value: Any) -> int:
 
 
 _LIMITS: Final = ((1_000, 100), (300, 30), (200, 10), (120, 4), (80, 2), (40, 1))
-"""Characters of a text and entries of a list, less and less."""
+"""Limits for characters of a text and entries of a list, from loose to strict."""
 
 
 def _fit(value: Any, most: int, left_off: list[str]) -> Any:
-    """Return a value cut to at most so many bytes."""
+    """Return a value cut to a number of bytes."""
     part, notes = value, list[str]()
     for characters, entries in _LIMITS:
         notes = []
         part = _cut(value, "", characters, entries, notes)
         if _size(part) <= most:
             break
-    # without the largest values, if that is not enough
+    # if that is not enough, the largest values are dropped
     sizes = sorted(part, key=lambda key: _size(part[key])) if isinstance(part, dict) else []
     while sizes and _size(part) > most:
         key = sizes.pop()
@@ -338,7 +338,7 @@ def _fit(value: Any, most: int, left_off: list[str]) -> Any:
 
 
 def _cut(value: Any, name: str, characters: int, entries: int, notes: list[str]) -> Any:
-    """Return a value with shorter texts and lists, and without signs that do not print."""
+    """Return a value with shorter texts and lists, and with escapes for unprintable characters."""
     match value:
         case str():
             text = escape_text(value)

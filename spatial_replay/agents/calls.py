@@ -1,4 +1,4 @@
-"""Calls of tools: each runs commands in a process of its own, which ends with it."""
+"""Calls of tools. Each call runs its commands in its own process, which ends with the call."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Outcome(NamedTuple):
 
 
 class Outcomes(NamedTuple):
-    """The outcomes of the commands of a call, and why there are no more.
+    """The outcomes of a call's commands, and the reason if some are missing.
 
     Attributes:
-        outcomes: of the commands that ended.
-        reason: "" if all ended.
+        outcomes: outcomes of the commands that ended.
+        reason: the reason for missing outcomes; "" if all commands ended.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -67,32 +67,32 @@ _PRELOADED = (
     "spatial_replay.sanity.differences",
     *(f"spatial_replay.cli.{name}" for name in ("check", "diff", "distinguish", "info", "replay", "tune")),
 )
-"""Imported once, by the process that the processes of all calls are copies of."""
+"""Modules that the fork server imports once for all calls."""
 
 
 class Processes:
-    """Starts a process for each call; as many run at once as there are cores."""
+    """Starts a process for each call, and limits how many run at once."""
 
     def __init__(self, work: Work, limit_s: float, most: int) -> None:
         self._work, self._limit_s = work, limit_s
         self._limiter = anyio.CapacityLimiter(most)
 
     def start(self) -> None:
-        """Start the process that all others are copies of."""
+        """Start the fork server."""
         self._context()
 
     def _context(self) -> ForkServerContext:
         return forking_context([self._work.__module__, *_PRELOADED])
 
     async def run(self, call: Call, report: Report) -> Outcomes:
-        """Run a call to its end, or until the time limit; if it is cancelled, its process is killed."""
+        """Run a call to its end, or until the time limit. If the call is cancelled, its process is killed."""
         async with self._limiter:
             ours, theirs = multiprocessing.Pipe(duplex=False)
             process = self._context().Process(target=self._work, args=(theirs, call), daemon=True)
             outcomes: list[Outcome] = []
             progress = ""
             try:
-                # the first one waits for the process that is copied
+                # the first start waits for the imports of the fork server
                 await to_thread.run_sync(process.start)
                 theirs.close()
                 with anyio.move_on_after(self._limit_s):

@@ -43,7 +43,7 @@ _SECTIONS: Final[Mapping[str, Sequence[tuple[str, Sequence[str]]]]] = MappingPro
         "errors": (("agents", ("Mistakes, as they look",)), ("language", ("Errors and limits",))),
     }
 )
-"""Sections of pages of the documentation; without any, all of the page."""
+"""Sections of documentation pages, by page for agents. No sections mean the whole page."""
 
 _HEADING: Final = re.compile(r"^(#{2,}) (.+)$")
 
@@ -62,7 +62,7 @@ def relation_picture(name: str) -> str:
 
 
 def _document(path: str) -> str:
-    """Return a file of the documentation, which wheels have inside the package."""
+    """Return a file of the documentation. In wheels, it lies inside the package."""
     shipped = resources.files(__package__).joinpath("docs", path)
     source = Path(__file__).parents[2] / "docs" / path
     try:
@@ -72,7 +72,7 @@ def _document(path: str) -> str:
 
 
 def _sections(text: str, headings: Sequence[str]) -> str:
-    """Return sections of a page, each without those below it; all of it without headings."""
+    """Return sections of a page without their subsections; the whole page if no headings are given."""
     if not headings:
         return text
     lines: list[str] = []

@@ -1,4 +1,4 @@
-"""The server for agents: its tools, resources and prompt, as the SDK of the protocol takes them."""
+"""The server for agents: its tools, resources and prompt, registered in the SDK of the protocol."""
 
 from __future__ import annotations
 
@@ -78,17 +78,17 @@ _ROWS: Final = {
     "tune": "runs",
     "report": "",
 }
-"""Tools, and the list of each one's document that may be long."""
+"""Keys of the long list in each tool's document; "" without one."""
 
 _LEFT_OUT: Final = frozenset({"nodes", "path", "measured", "certificate"})
-"""Values of a document that only the command prints: they are long, and sentences say the same."""
+"""Keys of long values that are left out of a document, because sentences contain the same facts."""
 _MAPPING: Final = 6_000
-"""Bytes of a mapping that is also given as one text."""
+"""Size limit of a mapping that is also given as one text, bytes."""
 _CARET: Final = re.compile(r"^\S+:\d+:\d+: error: ", re.MULTILINE)
 _DESCRIBED: Final = 12
-"""Logs that one answer of list_logs describes."""
+"""Logs in one answer of `list_logs`."""
 _NAMED: Final = 15
-"""Objects of a log that it names."""
+"""Objects that `list_logs` names per log."""
 _OPTIONS: Final = {
     r"with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info \S+ --suggest-mapping": (
         "as mapping; suggest_mapping writes a first one"
@@ -99,7 +99,7 @@ _OPTIONS: Final = {
     "--const": "constants",
     **{f"--{name}": name for name in ("mapping", "labels", "result", "hz", "good", "bad")},
 }
-"""Words of the tools for those in errors of commands, by patterns."""
+"""Words of the tools that replace options in errors of commands, by pattern."""
 
 
 class Tools:
@@ -112,7 +112,7 @@ class Tools:
 
     @asynccontextmanager
     async def lifespan(self, server: MCPServer[None]) -> AsyncIterator[None]:
-        """Start the process that others are copies of, and keep a folder for texts, while it serves."""
+        """Start the fork server, and keep a folder for texts while the server runs."""
         with TemporaryDirectory(prefix="spatial-replay-", ignore_cleanup_errors=True) as folder:
             self._folder = os.path.realpath(folder)
             await to_thread.run_sync(self._processes.start)
@@ -166,7 +166,7 @@ class Tools:
                 return _failure(outcomes.reason or self._error(outcomes.outcomes[0].err, files))
             outcome = outcomes.outcomes[0]
             text = "\n".join(escape_text(line, "\t") for line in outcome.out.splitlines())
-            # the lines hold all of it; as one text it can be given to the other tools
+            # the lines hold the whole mapping; one text can be passed on to the other tools
             document = {"mapping": text if len(text.encode()) < _MAPPING else None}
             lines = text.split("\n")
             return _answer("suggest_mapping", 0, lines, _lines(outcome.err), {}, next, extra=document)
@@ -383,14 +383,14 @@ class Tools:
         start: str = "",
         document: Mapping[str, Any] = MappingProxyType({}),
     ) -> CallToolResult:
-        """Run a command, and return its answer; `document` is that of a command without one."""
+        """Run a command, and return its answer. `document` is for commands without a document."""
         outcomes = await self._run(ctx, [command], files)
         if not outcomes.outcomes:
             return _failure(outcomes.reason)
         (outcome,) = outcomes.outcomes
         values = outcome.document or files.json(command)
         if values is None:
-            # errors of a text are what `check` is asked for
+            # for `check`, errors in the text are the answer; codes are explained in `answer_schema`
             is_answer = outcome.code in (0, 1, 4) or (outcome.code == 3 and outcome.out)
             if not is_answer and not (tool == "check" and _CARET.search(outcome.err)):
                 return _failure(self._error(outcome.err, files))
@@ -398,12 +398,12 @@ class Tools:
         values = _without({_ROWS[tool]: values} if isinstance(values, list) else values, _LEFT_OUT)
         lines = _lines(outcome.out)
         if tool != "report":
-            # files of the call are removed
+            # the files of the call are temporary, so their paths are of no use
             lines = [line for line in lines if not line.startswith("wrote ")]
         return _answer(tool, outcome.code, lines, _lines(outcome.err), values, start)
 
     def _error(self, text: str, files: Files) -> str:
-        """Return the error of a command in the words of the tools."""
+        """Return the error of a command with arguments of the tools instead of options."""
         lines = _lines(text)
         errors = [line for line in lines if line.startswith("error: ")]
         text = "\n".join(lines if not errors or len(lines) < 12 else errors).removeprefix("error: ")
@@ -426,8 +426,8 @@ def _answer(
     """Return a part of an answer.
 
     Args:
-        extra: values that are short, as they are.
-        following: the `next` of an answer that is a part already.
+        extra: short values, which are not cut.
+        following: `next` of an answer that is already a part.
     """
     page = page_of(lines, warnings, document, _ROWS[tool], start)
     following = following or page.next
@@ -464,7 +464,7 @@ def _without(value: Any, keys: frozenset[str]) -> Any:
 
 
 def _facts(outcome: Outcome) -> dict[str, Any]:
-    """Return the row of a log: what `info` says of it, in a few values."""
+    """Return the row of a log: a few values from `info`."""
     document = outcome.document
     if document is None:
         return {
@@ -507,7 +507,7 @@ class Server(MCPServer[None]):
     async def call_tool(
         self, name: str, arguments: dict[str, Any], context: Context[None, Any] | None = None
     ) -> CallToolResult | InputRequiredResult:
-        """See `MCPServer.call_tool`; names of arguments that a tool has not are refused."""
+        """See `MCPServer.call_tool`. Arguments that a tool does not have are refused."""
         properties: Mapping[str, Any] = {}
         for tool in await self.list_tools():
             if tool.name == name:
@@ -566,7 +566,7 @@ def make_server(bounds: Bounds, limit_s: float, work: Work) -> Server:
 
 
 def answer_schema(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of the answers of a tool, given that of its document."""
+    """Return the schema of a tool's answers, given the schema of its document."""
     texts = {"type": "array", "items": {"type": "string"}}
     properties = {
         "exit_code": {
@@ -584,7 +584,7 @@ def answer_schema(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _write_specification(sentence: str, log: str = "") -> str:
-    """Return the steps from a sentence to a specification that means it."""
+    """Return instructions for writing a specification from a sentence."""
     over = f" with log={log!r}" if log else ""
     names = f"Call describe_log{over} for the names and units." if log else ""
     last = f"Call evaluate and explain{over}." if log else "Show the text, and a run that satisfies it."
@@ -607,6 +607,6 @@ def serve(bounds: Bounds, limit_s: float, work: Work) -> None:
     """Serve over standard input and output, until the client closes them.
 
     Args:
-        work: runs a call in a process of its own, and sends results and progress.
+        work: function that runs a call in its own process, and sends results and progress.
     """
     make_server(bounds, limit_s, work).run("stdio")

@@ -95,9 +95,7 @@ class RunDiff:
         return tuple(change for change in self.changes if change.kind == "flipped")
 
     def lines(self, *kinds: Kind) -> Iterator[str]:
-        """Yield lines on the results of some kinds, with reasons. A kind with many results lists the first
-        ones.
-        """
+        """Yield lines on the first results of some kinds, with reasons."""
         for kind in kinds:
             changes = [change for change in self.changes if change.kind == kind]
             if changes:

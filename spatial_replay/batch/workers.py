@@ -105,9 +105,7 @@ def _results(
     ahead: int,
     suspects: list[_Task],
 ) -> Iterator[tuple[_Task, _Result]]:
-    """Yield results until the tasks end or the pool breaks. `suspects` gets the unfinished tasks of a broken
-    pool.
-    """
+    """Yield results until the tasks end or the pool breaks; `suspects` gets its unfinished tasks."""
     waiting: dict[Future[_Result], _Task] = {}
     is_whole = True
     while True:

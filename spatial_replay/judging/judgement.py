@@ -55,7 +55,7 @@ _AGREEMENTS: Final[Mapping[tuple[bool, bool], Kind]] = {
 _MOST_RUNS: Final = 8
 """The greatest k of `pass_k`."""
 _SMALL_M: Final = 0.1
-"""Shorter lengths are reported in millimetres."""
+"""Length below which lengths are reported in millimetres, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,8 @@ class Agreement:
     Attributes:
         both, neither: label and verdict agree on a success, or on a failure.
         only_theirs, only_ours: only the label counts a success, or only the verdict.
-        unstored: the label is about a state that is not stored, and the stored ones miss the success.
+        unstored: the label is a success in a state that is not stored; the verdict on the stored states is
+            none.
         undecided: the verdict is unknown, untested, doubtful or an error.
         unlabelled: decided episodes without a label.
     """
@@ -92,16 +93,16 @@ class JudgedEpisode:
         episode: the log's name without folder and ending, or its address in a data set: `push_v3#17`.
         label: whether the label counts a success; None without a label.
         verdict: "satisfied", "violated", "unknown", or None for an error.
-        kind: how label and verdict compare, see `Agreement`.
+        kind: agreement of label and verdict, see `Agreement`.
         margin: the robustness; None where not determined.
         success_at: seconds from the begin of the episode to its first success; None without one.
         tested: see `SpecResult.tested`.
         reason: a sentence on what decided.
-        task, seed: where the data set has them.
-        log: its path or address.
-        failure, failure_at: the name and the time in seconds of the first failure that happened in it; of
-            a failed episode that is judged with a file of failures.
-        stage, progress: those at its end, if stages are wanted; see `annotate.stages`.
+        task, seed: values in the data set, or None.
+        log: path or address.
+        failure, failure_at: name and time in seconds of a failed episode's first failure, if a file of
+            failures is given.
+        stage, progress: stage and progress at the end, if stages are requested; see `annotate.stages`.
     """
 
     episode: str
@@ -139,13 +140,13 @@ class Judgement:
     """Episodes judged by one result of a specification.
 
     Attributes:
-        name: of their folder or data set.
+        name: name of the folder or data set.
         file, result, formula: the specification file, the name of the spec, and its text.
         rows: one for each episode, in their order.
         batch: the results of all specs.
-        comparison: with earlier episodes, if there are any.
+        comparison: comparison with earlier episodes, or None.
         failure_file: the name of the file of failures, or "".
-        stages: names of the stages of the task, the farthest from success first; none unless they are wanted.
+        stages: names of the task's stages, the farthest from success first; empty unless requested.
         data_set_remarks: messages about whole data sets.
     """
 
@@ -168,7 +169,7 @@ class Judgement:
 
     @cached_property
     def failures(self) -> dict[str | None, tuple[JudgedEpisode, ...]]:
-        """The failed episodes by their first failure, the most frequent first; None is another failure."""
+        """The failed episodes by their first failure, the most frequent first; None is any other failure."""
         failed = [row for row in self.rows if row.is_success is False]
         counts = Counter(row.failure for row in failed)
         names = sorted(counts, key=lambda name: (name is None, -counts[name]))
@@ -208,9 +209,9 @@ class Judgement:
 
     @property
     def pass_k(self) -> dict[int, float]:
-        """Mean probability that k runs of one start all succeed, by k from 2; none without repeated starts.
+        """Mean probability that k runs of one start all succeed, by k from 2; empty without repeated starts.
 
-        A start is a task with a seed, or a log whose name differs only in the number of its run: `cross#2`.
+        Runs of one start have the same task and seed, or logs whose names differ only in the run: `cross#2`.
         """
         outcomes = defaultdict[object, list[bool]](list)
         for row in self.rows:
@@ -264,7 +265,7 @@ class Judgement:
 
     @property
     def table(self) -> pa.Table:
-        """The rows with the columns of `document`; null where there is none."""
+        """The rows with the columns of `document`. Missing values are null."""
         import pyarrow as pa
 
         types = {"label": pa.bool_(), "seed": pa.int64()}
@@ -286,7 +287,7 @@ class Comparison:
         new: name of the new episodes.
         old: the judgement of the old ones.
         pairs: decided episodes of both that have the same key and first places.
-        elsewhere: number of pairs with the same key whose objects start elsewhere, or are others.
+        elsewhere: number of pairs with the same key but different objects or first places.
         undecided: number of pairs in which one episode is undecided, or its success unstored.
         alone: number of episodes without a partner.
     """
@@ -320,7 +321,7 @@ class Comparison:
 
     @property
     def more_pairs(self) -> int | None:
-        """How many further pairs would decide, see `statistics.more_pairs`."""
+        """Estimated number of further pairs until a decision, see `statistics.more_pairs`."""
         return more_pairs(self.won, self.lost, len(self.pairs))
 
     @property
@@ -368,7 +369,7 @@ class PreparedJudgement:
     """Episodes with their labels, and the result that judges them.
 
     Attributes:
-        case: for `run_batch`.
+        case: the case for `run_batch`.
         failure_file: the name of the file of failures among its files, or "".
     """
 
@@ -382,13 +383,13 @@ class PreparedJudgement:
         """Return the judgement, given the results of a batch with the case.
 
         Args:
-            allow: "vacuous", "dropped" and "doubtful": verdicts that count although they show nothing.
+            allow: kinds of inconclusive verdicts that count: "vacuous", "dropped" and "doubtful".
         """
         paths = {log.name: log.path for log in self.case.logs}
         batch = _part_of_batch(batch, set(paths))
         rows_by_log: dict[str, Values] = {}
         for row in worst_rows(_rows_of(batch.table, self.spec), len(batch.table)):
-            # of a template, the worst object
+            # rows are sorted, so the first one of a template is the worst object
             rows_by_log.setdefault(row["log"], row)
         episodes = _episode_names(list(paths))
         rows = tuple(
@@ -422,7 +423,7 @@ class PreparedJudgement:
         is_exported: bool = True,
         progress: Progress = no_progress,
     ) -> BatchResult:
-        """Return a batch in which episodes that differ from their labels, or are undecided, are explained.
+        """Return a batch with explanations of undecided episodes and of disagreements with labels.
 
         Args:
             is_exported: whether violated episodes that agree with their labels are explained as well.
@@ -471,7 +472,7 @@ def prepare_judgement(
 
 
 def _judging_spec(case: PreparedCase, result: str | None, first: int) -> _Spec:
-    """Return the spec that judges, of the files from the first one on that may."""
+    """Return the spec that judges. Files before the place `first` are not considered."""
     texts = tuple(file.text for file in case.files)
     files = parsed_specifications(texts, case.case.conditions)
     specs = [
@@ -496,7 +497,7 @@ def _judging_spec(case: PreparedCase, result: str | None, first: int) -> _Spec:
 
 
 def _name_of(case: PreparedCase) -> str:
-    """Return the name of the folder or data set that the episodes are in, or "episodes"."""
+    """Return the name of the episodes' folder or data set, or "episodes"."""
     patterns = [pattern.text for pattern in case.case.logs]
     if len(patterns) == 1 and Path(patterns[0]).is_dir():
         return Path(patterns[0]).resolve().name or "episodes"
@@ -516,7 +517,7 @@ def _episode_names(logs: Sequence[str]) -> dict[str, str]:
 
 
 def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
-    """Return the part of a batch that is about some logs."""
+    """Return the part of a batch with the results of some logs."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -546,7 +547,7 @@ _READ: Final = (
         "error",
     ),
 )
-"""The columns of a run that a judgement reads: the others hold long texts."""
+"""The columns of a run that a judgement reads. The long texts are in other columns."""
 
 
 def _judged_episode(
@@ -585,7 +586,7 @@ class _Failure(NamedTuple):
     """A failure of an episode.
 
     Attributes:
-        name: the title of the spec that it satisfies or, without one, its name.
+        name: title of the satisfied spec; its name if it has no title.
         at: seconds from the begin of the episode; None if only its end decides.
     """
 
@@ -596,7 +597,7 @@ class _Failure(NamedTuple):
 def _first_failures(table: pa.Table, file: str) -> dict[str, _Failure]:
     """Return the first failure in each log, by the log's name, from the results of a batch.
 
-    _Failures that only the end of the log decides come last. At equal times, the first in the file counts.
+    Failures that only the end of the log decides come last. At equal times, the first in the file counts.
     """
     import pyarrow.compute as pc
 

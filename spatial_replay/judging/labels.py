@@ -35,8 +35,8 @@ class SuccessLabel(NamedTuple):
 
     Attributes:
         success: None without a label.
-        is_unstored: whether it is about the state after the last frame, which is not stored.
-        task, seed: where the data set has them.
+        is_unstored: whether the label describes the state after the last frame, which is not stored.
+        task, seed: values in the data set, or None.
     """
 
     success: bool | None
@@ -65,8 +65,8 @@ def read_labels(
 
     Raises:
         MissingFileError: there is no such file.
-        UsageError: entries for other episodes, for frames, or twice for an episode; all are listed. A field
-            that the data set does not have.
+        UsageError: entries name other episodes, frames, or an episode twice (all are listed), or the data set
+            lacks the field.
     """
     is_file = labels is not None and (labels.lower().endswith((".json", ".csv")) or Path(labels).is_file())
     if labels is not None and not is_file:
@@ -80,7 +80,7 @@ def read_labels(
         if address is not None and data_set is not None:
             remarks |= dict.fromkeys(f"{data_set.name}: {remark}" for remark in data_set.remarks)
             label = _stored_label(data_set, address[1], reading)
-            # a file replaces all labels of the data set: a mixture has a rate of neither
+            # a file replaces all labels of the data set, because a rate of mixed labels has no meaning
             by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
@@ -99,7 +99,7 @@ def read_labels(
 
 
 def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> SuccessLabel:
-    """Return the label of an episode by its data set; its row reports data that cannot be read."""
+    """Return the label of an episode in its data set; no label if the data is unreadable."""
     episode, label = data_set.episode(number), data_set.label
     about = SuccessLabel(None, task=episode.task, seed=episode.seed)
     field = reading.label
@@ -109,7 +109,7 @@ def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> Su
         return about
     if success is None or not success.size:
         return about
-    # a label in an earlier frame is about a state that is stored
+    # a label in an earlier frame describes a stored state
     is_last = success.ndim == 1 and not success[:-1].any()
     is_own = field is None or (label is not None and label.field == field)
     is_about_next = label is not None and label.is_about_next if is_own else str(field).startswith("next.")
@@ -120,7 +120,7 @@ def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> Su
 
 
 def _labels_of(file: Path, logs: Sequence[FoundLog]) -> dict[str, bool | None]:
-    """Return the labels of a file; entries about other logs that exist are left out."""
+    """Return the labels in a file. Entries of existing logs that are not judged are left out."""
     paths_by_name = _paths_by_name(logs)
     labels: dict[str, bool | None] = {}
     places: dict[str, str] = {}
@@ -184,12 +184,12 @@ def _success(entry: Mapping[str, Any]) -> bool | None:
 def _entry_path(
     entry: Mapping[str, Any], paths_by_name: Mapping[str, Sequence[str]], file: Path
 ) -> str | None:
-    """Return the path of the log that an entry is about; None for one that exists and is not judged."""
+    """Return the path of the log that an entry names; None if that log exists but is not judged."""
     value = entry.get("log") if entry.get("log") is not None else entry.get("episode")
     if not isinstance(value, str | int) or isinstance(value, bool):
         raise UsageError("it names no episode; give 'log', a path, or 'episode', a number or name")
     name = str(value).strip()
-    # next to the label file first: other folders may have logs of that name
+    # first next to the label file, because other folders may have logs of the same name
     paths = paths_by_name.get(_stem(str(file.parent / name))) or paths_by_name.get(_stem(name)) or []
     if len(paths) > 1:
         raise UsageError(f"{name!r:.100} names {plural(len(paths), 'log')}; write more of the path")
@@ -209,7 +209,7 @@ def _entry_path(
 
 
 def _paths_by_name(logs: Sequence[FoundLog]) -> Mapping[str, list[str]]:
-    """Return the paths of logs by all names that a label may use: ends of their paths, episode numbers."""
+    """Return the paths of logs by all names in labels: ends of paths, and numbers of episodes."""
     paths_by_name = defaultdict[str, list[str]](list)
     for log in logs:
         parts = PurePosixPath(log.path).parts

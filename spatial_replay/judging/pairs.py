@@ -21,7 +21,7 @@ from spatial_replay.judging.statistics import (
 from spatial_replay.text import plural
 
 SAME_START: Final = 0.001
-"""Distance of first places that counts as none, in units of length."""
+"""Largest distance of equal first places, in units of length."""
 _Place: TypeAlias = tuple[float, float, float]
 
 
@@ -31,10 +31,10 @@ def judge_batch(
     allow: AbstractSet[str] = frozenset(),
     same_start: float | None = None,
 ) -> Judgement:
-    """Return the judgement of new episodes, compared with earlier ones if these are prepared, too.
+    """Return the judgement of new episodes, with a comparison if earlier episodes are prepared.
 
     Args:
-        prepared: the new episodes, and perhaps the earlier ones.
+        prepared: the new episodes, and optionally the earlier ones.
         batch: the results of both.
         allow: see `PreparedJudgement.judgement`.
         same_start: see `compare_judgements`; 0.001 unless given.
@@ -54,7 +54,7 @@ def compare_judgements(
 
     Args:
         conditions: how the logs are read.
-        same_start: how far first places may be apart in each object.
+        same_start: largest distance of an object's first places.
     """
     by_seed = all(row.seed is not None for row in (*new.rows, *old.rows))
     partners = dict(_rows_by_key(old.rows, by_seed))
@@ -77,7 +77,7 @@ def compare_judgements(
 def _rows_by_key(
     rows: Sequence[JudgedEpisode], by_seed: bool
 ) -> Iterator[tuple[tuple[object, ...], JudgedEpisode]]:
-    """Yield each row with its key; of rows with one key, the first ones of both sides belong together."""
+    """Yield each row with its key. Equal keys are numbered, so that the nth rows of both sides are a pair."""
     counts = Counter[tuple[object, ...]]()
     for row in rows:
         key = (row.task, row.seed) if by_seed else (row.episode.rpartition("#")[2],)
@@ -114,7 +114,7 @@ def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
 
 
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield how many pairs there are, which side is better, and how sure that is."""
+    """Yield lines with the number of pairs, the better side and the significance."""
     pairs, won, lost = len(comparison.pairs), comparison.won, comparison.lost
     parts = [f"{plural(pairs, 'pair')} with the same start"]
     parts += [f"{comparison.elsewhere:,} with another start"] if comparison.elsewhere else []

@@ -17,12 +17,12 @@ _TITLES: Final[dict[Kind, str]] = {
     "undecided": "undecided",
 }
 _MOST: Final = 10
-"""Lines of a kind that are listed."""
+"""Listed lines per kind."""
 _MOST_IN_LINE: Final = 5
 
 
 def summary_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield what was judged, the rates of verdicts and labels, and how many agree."""
+    """Yield lines with the judged episodes, the rates of verdicts and labels, and their agreement."""
     count = plural(len(judgement.rows), "episode")
     yield f"{judgement.name}: {count} judged by `{judgement.result}`, `{judgement.formula}`"
     agreement = judgement.agreement
@@ -54,7 +54,7 @@ def summary_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def _rates(name: str, judgement: Judgement) -> Iterator[tuple[str, Rate, str]]:
-    """Yield the names and rates of a judgement, and what is after them in their lines."""
+    """Yield name, rate and end of line for each rate of a judgement."""
     yield name, judgement.rate, ""
     if unstored := judgement.agreement.unstored:
         yield "", judgement.rate_with_unstored, f"   if the {unstored:,} unstored count"
@@ -68,7 +68,7 @@ def _percents(rate: Rate) -> str:
 
 
 def difference_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield the episodes in which label and verdict differ, and the undecided ones, with reasons."""
+    """Yield lines with undecided episodes and disagreements of label and verdict, with reasons."""
     for kind, title in _TITLES.items():
         rows = [row for row in judgement.rows if row.kind == kind]
         if rows:
@@ -76,7 +76,7 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
             yield f"{title} {len(rows):,}:"
             lines = defaultdict[tuple[str, str], list[str]](list)
             for row in rows:
-                # what keeps an episode from being read often keeps all
+                # undecided episodes often share one reason, which is listed once
                 lines[_reason(row), "" if kind == "undecided" else row.episode].append(row.episode)
             names = [listing(episodes, _MOST_IN_LINE) for episodes in lines.values()]
             width = max(map(len, names[:_MOST]))
@@ -85,7 +85,7 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def failure_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield how many episodes failed by which failure, and the first of them."""
+    """Yield a line per first failure: its name, its number of episodes, and the first of them."""
     failed = sum(map(len, judgement.failures.values()))
     yield f"first failures of the {plural(failed, 'episode')} that fail `{judgement.result}`"
     names = {name: name or "another failure" for name in judgement.failures}
@@ -96,7 +96,7 @@ def failure_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def stage_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield how many episodes ended at which stage, also of those that the label calls failures."""
+    """Yield a line per stage: the number of episodes that end there, and of failures by label among them."""
     failures = [row for row in judgement.rows if row.label is False]
     title, end = f"stages of `{judgement.result}`", "at the end"
     width = max(map(len, (*judgement.stages, title)))

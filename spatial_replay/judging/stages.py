@@ -1,4 +1,4 @@
-"""Stages of episodes: how far each came in the task that it is judged by."""
+"""Stages of episodes: the progress of each episode in its task."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SUBTASK: Final = "subtask_index"
 PROGRESS: Final = "judge.progress"
 LANGUAGE: Final = "language_persistent"
-"""Columns of frames that have stages."""
+"""Columns of frames with stages."""
 
 
 def episode_stages(
@@ -36,11 +36,11 @@ def episode_stages(
     """Return the stages of each episode that can be read, by the path of its log.
 
     Args:
-        case: the one that was judged.
+        case: the judged case.
 
     Raises:
         NoAutomatonError: the spec that judges has no automaton.
-        UsageError: it is a template, or under the paper's semantics.
+        UsageError: the spec is a template, or has the paper's semantics.
     """
     conditions, texts = case.case.conditions, tuple(file.text for file in case.files)
     specifications = parsed_specifications(texts, conditions)
@@ -48,7 +48,7 @@ def episode_stages(
     stages: dict[str, Stages] = {}
     with progress("stages", len(judgement.rows)) as advance:
         for row in judgement.rows:
-            # what is wrong with a log is in its row
+            # the row of a log already reports its errors
             if row.verdict is not None:
                 with suppress(GeometryError, LogError, TraceError):
                     task = Task(row.log, (texts[place],), conditions)
@@ -88,9 +88,9 @@ def _at_stage(row: JudgedEpisode, stages: Stages | None) -> JudgedEpisode:
 def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Sequence[str]) -> pa.Table:
     """Return a table of frames of a LeRobot data set with the stages of episodes.
 
-    Column `subtask_index` is the place of the frame's stage in `names`, `judge.progress` the progress.
+    `subtask_index` is the index of the frame's stage in `names`, and `judge.progress` is its progress.
     `language_persistent` has a row for each change of the stage, with the style `subtask`. Frames of other
-    episodes have -1, NaN and no rows, and so have episodes with more or fewer frames than samples.
+    episodes have -1, NaN and no rows. So do episodes with different numbers of frames and samples.
     """
     import pyarrow as pa
 
@@ -114,10 +114,10 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
     columns = {
         SUBTASK: pa.array(indices),
         PROGRESS: pa.array(progress),
-        # the types that lerobot's own annotations have
+        # the types of lerobot's own annotations
         LANGUAGE: pa.array(rows, pa.list_(_row_type())),
     }
-    # without descriptions of the old columns
+    # the metadata describes the old columns only
     table = table.drop_columns([name for name in columns if name in table.column_names])
     table = table.replace_schema_metadata(None)
     for name, column in columns.items():
@@ -147,7 +147,7 @@ def annotate_frames(folder: Path, runs: Mapping[str, Stages], names: Sequence[st
     """Write the stages of episodes into a LeRobot data set, whose files are replaced.
 
     Args:
-        runs: by the address of each episode.
+        runs: stages by the address of the episode.
         names: see `frames_with_stages`.
     """
     import pyarrow as pa
@@ -158,6 +158,7 @@ def annotate_frames(folder: Path, runs: Mapping[str, Stages], names: Sequence[st
         with parquet.ParquetFile(file) as source:
             groups = [source.read_row_group(place) for place in range(source.num_row_groups)]
         table = frames_with_stages(pa.concat_tables(groups), numbered, names)
+        # the file may be a link to the original data set, which must not change
         file.unlink()
         with parquet.ParquetWriter(file, table.schema) as writer:
             begin = 0
@@ -165,7 +166,7 @@ def annotate_frames(folder: Path, runs: Mapping[str, Stages], names: Sequence[st
                 writer.write_table(table.slice(begin, len(group)))
                 begin += len(group)
     subtasks = pa.table({SUBTASK: pa.array(range(len(names)), pa.int64()), "subtask": list(names)})
-    # read by pandas, the names are the index, as those of tasks
+    # pandas reads the names as the index, as in LeRobot's table of tasks
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind, "metadata": None}
         for name, kind in ((SUBTASK, "int64"), ("subtask", "object"))

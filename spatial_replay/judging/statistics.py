@@ -1,4 +1,4 @@
-"""Numbers on rates and pairs of episodes, by SciPy."""
+"""Statistics of rates and pairs of episodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from spatial_replay.geometry.arrays import Integers
 
 SIGNIFICANCE: Final = 0.05
-"""The greatest p that decides between two sets of episodes."""
+"""Largest p-value that decides between two sets of episodes."""
 EVIDENCE: Final = 1.0 / SIGNIFICANCE
 """The least e-value that decides."""
 _POWER: Final = 0.8
@@ -56,9 +56,9 @@ def mcnemar_p(won: int, lost: int) -> float:
 
 
 def e_value(won: int, lost: int) -> float:
-    """Return the evidence that one side wins more often; it may be looked at after every episode.
+    """Return the e-value for one side winning more often; it may be checked after every episode.
 
-    It is a ratio of likelihoods: of a uniformly distributed chance of winning to a chance of 1/2.
+    It is the likelihood of a uniformly distributed chance of winning, divided by that of a chance of 1/2.
     """
     _scipy()
     from scipy.special import betaln
@@ -67,7 +67,7 @@ def e_value(won: int, lost: int) -> float:
 
 
 def more_pairs(won: int, lost: int, pairs: int) -> int | None:
-    """Return how many further pairs would decide with 80 % probability, at the same shares.
+    """Return the number of further pairs that decide with 80 % probability, at the same shares.
 
     None if neither side is ahead, or no number up to 100,000 suffices.
     """
@@ -82,7 +82,7 @@ def more_pairs(won: int, lost: int, pairs: int) -> int | None:
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if _power(middle, won, lost, pairs) >= _POWER else (middle, high)
-    # the power is that of whole numbers, and not quite monotone
+    # the test is discrete, so its power is not monotone in the number of pairs
     while high > 1 and _power(high - 1, won, lost, pairs) >= _POWER:
         high -= 1
     return max(high - pairs, 0)
@@ -93,7 +93,7 @@ def _power(count: int, won: int, lost: int, pairs: int) -> float:
     binom = _scipy().binom
     differing = np.arange(count + 1)
     weights = binom.pmf(differing, count, (won + lost) / pairs)
-    # far from the mean, weights are below the last bit of the sum
+    # weights far from the mean do not change the sum of doubles
     differing, weights = differing[weights > 1e-17], weights[weights > 1e-17]
     limits = _critical(differing)
     share = won / (won + lost)

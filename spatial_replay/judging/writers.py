@@ -32,13 +32,13 @@ _WORDS: Final = {True: "success", False: "failure", None: None}
 
 
 def labelled_batch(judgement: Judgement) -> BatchResult:
-    """Return the batch of a judgement with its labels, of which disagreements are the failures."""
+    """Return the batch of a judgement with its labels. Its failures are the disagreements."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     table = judgement.batch.table
     if judgement.failure_file:
-        # a failure that does not happen is no failing result
+        # a violated spec of this file is a failure that did not happen
         table = table.filter(pc.not_equal(table["file"], judgement.failure_file))
     paths = {request.log.name: request.log.path for request in judgement.batch.requests}
     episodes = {row.log: row for row in judgement.rows}
@@ -63,14 +63,14 @@ def _failure(row: JudgedEpisode, failure: str | None) -> str | None:
 def label_table(judgement: Judgement) -> pa.Table:
     """Return a table of decided episodes for training and for comparing rates.
 
-    `success` is true or false, `policy_id` the name of the data set. Columns `task` and `seed` are left out
-    where the data set has none.
+    `success` is true or false, and `policy_id` is the name of the data set. `task` and `seed` are left out if
+    the data set has none.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     table = _table_with_success(judgement)
-    # names that read as numbers would become one: 0.10 and 0.1
+    # readers of CSV would take the names 0.10 and 0.1 for the same number
     name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
     numbers = pa.array(_episode_numbers(judgement), pa.int64())
     names = pa.array([name] * len(table), pa.string())
@@ -116,7 +116,7 @@ def write_labels(judgement: Judgement, file: Path, inputs: Sequence[Path] = ()) 
     """Write the table of labels as Parquet or CSV, by the ending of the file's name.
 
     Raises:
-        UsageError: another ending, or an output that is an input.
+        UsageError: the ending is another one, or the output is an input.
         OutputError: the file cannot be written.
     """
     from pyarrow import csv, parquet
@@ -130,7 +130,7 @@ def write_labels(judgement: Judgement, file: Path, inputs: Sequence[Path] = ()) 
 
 
 def check_annotation(logs: Sequence[str], new: Path) -> Path:
-    """Return the data set that a copy with labels is made of.
+    """Return the folder of the data set to copy.
 
     Raises:
         UsageError: the copy exists, or the logs are no episodes of one LeRobot data set of version 3.
@@ -153,14 +153,13 @@ def check_annotation(logs: Sequence[str], new: Path) -> Path:
 def annotate_data_set(
     judgement: Judgement, folder: Path, new: Path, stages: Mapping[str, Stages] | None = None
 ) -> None:
-    """Make a copy of a LeRobot data set, whose episodes have the columns `judge/success` and so on.
+    """Copy a LeRobot data set, and add columns such as `judge/success` to its episodes.
 
-    With stages of episodes, by their addresses, its frames have them, see `frames_with_stages`.
-
-    Files of data and videos are links to those of the original, the metadata is copied.
+    If stages are given by the addresses of episodes, frames have them, see `frames_with_stages`. Files of
+    data and videos are links to the original, and the metadata is copied.
 
     Raises:
-        OutputError: the copy cannot be written; nothing stays of it.
+        OutputError: the copy cannot be written; the partial copy is removed.
     """
     from pyarrow import parquet
 
@@ -180,6 +179,7 @@ def annotate_data_set(
             parquet.write_table(_with_labels(parquet.read_table(file), judgement), file)
         if stages:
             annotate_frames(partial, stages, stage_names(stages))
+        # `mkdtemp` makes folders that only their owner can read
         partial.chmod(0o755)
         partial.rename(new)
     except OSError as error:
@@ -196,7 +196,7 @@ def _with_labels(table: pa.Table, judgement: Judgement) -> pa.Table:
     places = {number: place for place, number in enumerate(_episode_numbers(judgement))}
     order = [places.get(number) for number in table["episode_index"].to_pylist()]
     labels = _table_with_success(judgement).take(pa.array(order, pa.int64()))
-    # without columns of an earlier judgement, and descriptions of the old columns
+    # columns of an earlier judgement are replaced, and the metadata describes the old columns only
     names = [name for name in table.column_names if not name.startswith("judge/")]
     table = table.select(names).replace_schema_metadata(None)
     for name in ("success", "margin", "success_at", "tested", "reason"):
