@@ -1,4 +1,4 @@
-"""The results of a replay as JSON, and the explanations of their verdicts, as sentences and as JSON."""
+"""Results of a replay as JSON, and explanations of verdicts as sentences and JSON."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def document_from_replay(
     """Return one JSON object; infinite numbers are the strings "inf" and "-inf", undetermined ones null.
 
     Args:
-        signal: add to the series each node's robustness from each sample to the end.
-        window_ns: add to the series each node's robustness over a sliding window of that width.
+        signal: whether the series include each node's robustness from each sample to the end.
+        window_ns: width of a sliding window; the series include each node's robustness over it.
 
     Raises:
-        UsageError: a signal or a window under semantics that lack them.
+        UsageError: the semantics have no signal or no window.
     """
     return {
         "log": {
@@ -64,7 +64,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         **json_fields(result, *RESULT_COLUMNS),
         "requirement": result.spec.id,
         "title": result.spec.title,
-        # what headline, arrow and event name
+        # the witness of headline, arrow and event
         "worst": None if result.worst is None else witness_document(result.worst, first_ns),
         "causes": [_cause(cause, first_ns) for cause in result.causes],
         "violations": [_invariant(invariant) for invariant in result.violated_invariants],
@@ -93,7 +93,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
 
 
 def _of_node(node: NodeResult) -> dict[str, Any]:
-    """Return what nodes and explanations of them have in common."""
+    """Return the fields that a node and its explanation share."""
     return {
         **json_fields(node, "name", "requirement", "title", "verdict", "robustness"),
         "lower": json_number(node.final_lower),
@@ -114,7 +114,7 @@ def _untested_part(part: UntestedPart, first_ns: int) -> dict[str, Any]:
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
-    """Return what decides a node's verdict, with sentences that count time from `first_ns`."""
+    """Return the witness of a node's verdict. Its sentences count time from `first_ns`."""
     deciding, threshold = witness.deciding, witness.threshold
     value: dict[str, Any] = {
         **json_fields(witness, "node", "verdict", "lower", "upper", "time_ns", "obstacle"),
@@ -144,7 +144,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
 
 
 def _missed_response(witness: Witness, missed: MissedResponse) -> dict[str, Any]:
-    """Return a response that was missed, with what came closest to it, if that is not what decides."""
+    """Return a missed response, with the closest atom if another atom decides."""
     atom, time_ns = witness.closest or (None, None)
     threshold = witness.closest_threshold
     return {
@@ -196,12 +196,12 @@ def _measurement(measured: Measured) -> dict[str, Any]:
 
 
 def _numbers(rows: Floats) -> list[list[float | str | None]]:
-    """Return one list for each node."""
+    """Return one list of numbers for each node."""
     return [[json_number(number) for number in row] for row in rows.tolist()]
 
 
 def idle_document(template: UntestedPart) -> dict[str, Any]:
-    """Return a template without instances as JSON beside explanations: it has a reason, but no verdict."""
+    """Return a template without instances in the format of explanations: a reason, but no verdict."""
     return {
         "specification": template.text.partition("(")[0],
         "object": None,
@@ -233,18 +233,18 @@ class Explanation:
 def explain_results(
     replayed: Replayed, *, node: str | None = None, object: str | None = None, goes_on: bool = False
 ) -> list[Explanation]:
-    """Explain the verdicts of results, or of the nodes of a name in them.
+    """Explain the verdicts of results, or of their nodes with a given name.
 
     Args:
         replayed: a replay that kept series and leaves.
         object: explain only results about this object of a template.
-        goes_on: whether the log has samples after those evaluated, which could change a verdict.
+        goes_on: whether the log has later samples, which could change a verdict.
 
     Returns:
-        One explanation for each; none where all that there is are templates without objects.
+        One explanation for each result; none if all specs are templates without objects.
 
     Raises:
-        UsageError: no such node or object.
+        UsageError: there is no such node or object.
     """
     results = [result for result in replayed.results if object in (None, result.object)]
     if not results and node is None and object is None:
@@ -281,7 +281,7 @@ def _find_nodes(result: SpecResult, name: str | None) -> Iterator[int]:
 
 
 def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdict | None:
-    """Return the verdict that `explain_results` explains, without the reasons; None without such a node."""
+    """Return the verdict that `explain_results` explains; None without such a node."""
     for identifier in _find_nodes(result, node):
         is_open = _is_open(result, identifier, goes_on=goes_on)
         return Verdict.PENDING if is_open else result.nodes[identifier].verdict
@@ -289,7 +289,7 @@ def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdic
 
 
 def _is_open(result: SpecResult, node: int, *, goes_on: bool) -> bool:
-    """Return whether samples that follow decide the verdict of a node."""
+    """Return whether the verdict of a node is pending: later samples decide it."""
     _, _, lower, upper = result.series[node]
     return goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
 

@@ -77,19 +77,19 @@ if TYPE_CHECKING:
 
 
 _MOST_DIGITS = 18
-"""Greatest valid count in the metadata of a log."""
+"""Digits of a valid count in the metadata of a log, at most."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
-"""Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
+"""Limits of the samples kept in memory for explanations, bytes: per result and in total."""
 _SAMPLES_AT_ONCE, _RESULTS_AT_ONCE = 2**12, 2**16
-"""Samples, and samples times results, whose messages are made and written together: some 30 MB.
+"""Limits of samples, and of samples times results, whose messages are written together: some 30 MB.
 
-The memory of earlier messages serves these. Fresh memory from the system costs as much as filling it.
+The memory of earlier messages is reused, because fresh memory of the system costs as much as filling it.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """How many samples the recorder of a log had no time for, of how many, and whether it was interrupted."""
+    """Numbers of a recorder's dropped samples and of all its samples, and whether it was interrupted."""
 
     count: int
     of: int
@@ -113,22 +113,23 @@ class Replayed:
 
     Attributes:
         log: base name of the log.
-        samples: how many samples were evaluated, without those that fill pauses.
-        first_ns: the time that texts count from: the log's first sample, evaluated or not, or the zero that a
-            cut log names.
-        start_ns, end_ns: times of the first and the last of those evaluated.
-        faults: what was lost while reading, each with its place.
-        remarks: what the source reports about its samples where nothing was lost; doubts come first.
-        missing: a warning for each name in the specifications that the log never has: it is unknown.
-        dropped: the samples that the recorder of the log had no time for.
-        unreadable: how many observations have no usable value: a number is not finite, or too old.
+        samples: number of evaluated samples, without those that fill pauses.
+        first_ns: zero of times in texts: the log's first sample (evaluated or not), or the zero recorded in a
+            cut log.
+        start_ns, end_ns: times of the first and the last evaluated sample.
+        faults: losses while reading, each with its place.
+        remarks: remarks on the samples apart from losses; doubts come first.
+        missing: a warning for each missing name in the specifications, which is unknown.
+        dropped: samples that the recorder dropped.
+        unreadable: number of observations without a usable value: not finite, or too old.
         results: one per spec and object.
-        vacuous: templates without instances; what decided nothing within a result is in its own `vacuous`.
-        certificate: hashes of what went in and came out; empty if none was asked for.
+        vacuous: templates without instances; a result has its parts that decided nothing in its own
+            `vacuous`.
+        certificate: hashes of inputs and results; empty unless requested.
         semantics: the semantics of the formulas.
-        left: members of open groups, and objects of `present`, that left within reach of a threshold and came
+        left: members of open groups and objects of `present` that left within reach of a threshold and came
             back; also in `remarks`.
-        doubts: assumptions that the log contradicts; each result has those that it rests on.
+        doubts: assumptions that the log contradicts; each result has those of its own assumptions.
     """
 
     log: str
@@ -159,9 +160,9 @@ class ReplayPlan:
 
     Attributes:
         files: the specifications, as an annotated log stores them.
-        instances: what to evaluate of each file.
-        departures: of each file, before the first sample.
-        heights: of all files, before the first sample.
+        instances: instances of each file.
+        departures: departures of each file, before the first sample.
+        heights: height comparisons of all files, before the first sample.
     """
 
     files: Sequence[Specification]
@@ -171,10 +172,10 @@ class ReplayPlan:
 
     @classmethod
     def of(cls, selection: Selection) -> ReplayPlan:
-        """Prepare the specifications of a selection; for templates, its log is read once to find objects.
+        """Prepare the specifications of a selection. For templates, its log is read once to find objects.
 
         Raises:
-            UsageError: a template without its objects.
+            UsageError: the objects of a template are not given.
         """
         units = selection.source.axes.units
         files = logged_specifications(selection.files, units)
@@ -187,10 +188,10 @@ class ReplayPlan:
 
 
 class LogAccount:
-    """The account of a log beside its results, block by block: its names, losses, remarks and doubts.
+    """Collects names, losses, remarks and doubts of a log, block by block.
 
     Attributes:
-        samples: how many were evaluated, without those that fill pauses.
+        samples: number of evaluated samples, without those that fill pauses.
     """
 
     def __init__(self, plan: ReplayPlan) -> None:
@@ -207,7 +208,7 @@ class LogAccount:
         self._departures = [departures.restart() for departures in plan.departures]
 
     def add(self, block: Block, trace: Trace) -> None:
-        """Add the next block, with those of its samples that are evaluated."""
+        """Add the next block, with its evaluated samples."""
         self._remarks += block.remarks
         self._doubts += block.doubts
         self._faults += trace.faults
@@ -226,7 +227,7 @@ class LogAccount:
         """Check that a sample was evaluated.
 
         Raises:
-            LogError, UsageError: none was.
+            LogError, UsageError: no sample was evaluated.
         """
         if not self.samples:
             raise selection.nothing_to_evaluate(self._faults)
@@ -242,10 +243,10 @@ class LogAccount:
         results: Sequence[SpecResult],
         certificate: Mapping[str, str] = MappingProxyType({}),
     ) -> Replayed:
-        """Return the results of the log with this account.
+        """Return the results of the log with the collected facts.
 
         Args:
-            first_ns: the time that texts count from.
+            first_ns: zero of times in texts.
 
         Raises:
             SpecificationError: names that the log never has, if names are strict.
@@ -287,7 +288,7 @@ class LogAccount:
         )
 
     def _departures_by_time(self, first_ns: int) -> tuple[Departure, ...]:
-        """Return each departure once, whichever specifications it is of, by time."""
+        """Return the departures of all specifications by time, each once."""
         by_start = {
             (departure.start_ns, departure.name): departure
             for departures in self._departures
@@ -299,7 +300,7 @@ class LogAccount:
         )
 
     def _empty_ends(self, window: Window, first_ns: int) -> Iterator[Sentence]:
-        """Remark that the window goes on where there is no sample: the log pauses, or has ended."""
+        """Yield remarks on ends of the window without samples: the log pauses, or has ended."""
         begin_ns, last_ns = self._times_ns[0], self._times_ns[-1]
         usual_ns = (last_ns - begin_ns) / max(self.samples - 1, 1)
         asked_ns = max(window.start_ns, first_ns) if window.start_ns else begin_ns
@@ -314,7 +315,7 @@ class Replay:
 
     Attributes:
         files: the specifications, as an annotated log stores them.
-        trees: every result, under the name it is reported by.
+        trees: all results, with their reported names.
     """
 
     def __init__(
@@ -328,17 +329,17 @@ class Replay:
         certify: bool = True,
         show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
-        """Prepare; templates read the source once to find their objects.
+        """Prepare the evaluation. For templates, the source is read once to find objects.
 
         Args:
             keep_series: keep every sample's numbers in memory.
             keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
-            certify: hash what is read and what comes out, which takes about as long as evaluating it.
-            show: takes what the messages of the scene show.
+            certify: hash inputs and results, which takes about as long as the evaluation.
+            show: receives the frames of the scene.
 
         Raises:
-            UsageError: a template without its objects, or objects for a parameter that no template has; an
-                operator that the semantics lacks; no result for the arrow.
+            UsageError: a template lacks its objects, or no template has a given parameter; the semantics lack
+                an operator; the arrow has no result.
         """
         self._source = source
         self._written_files = files
@@ -382,7 +383,7 @@ class Replay:
 
         Args:
             write: receives the messages of the annotated log, block by block; without it, none are made.
-            begin: called before `write` with the time that texts count from.
+            begin: called before `write` with the zero of times in texts.
             layer: leave out the source's own messages.
             advance: called with the number of samples of each block that is done.
 
@@ -422,7 +423,7 @@ class Replay:
     def _annotate(
         self, write: Callable[[Messages], None], trace: Trace, stretches: Sequence[SeriesBlock], own: Messages
     ) -> None:
-        """Write the messages of a block, of some samples at a time: those of many results are large."""
+        """Write the messages of a block in parts, because messages of many results are large."""
         most = max(1, min(_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE // max(len(stretches), 1)))
         begins = range(0, max(len(trace), 1), most)
         starts_ns = [-FOREVER, *(int(trace.times_ns[begin]) for begin in begins[1:]), FOREVER]
@@ -439,9 +440,9 @@ class Replay:
         """Draw the scene at some samples, also at those without a message of the scene.
 
         Args:
-            results: what `run` returned, with series and leaves.
-            times_ns: those of the samples, increasing.
-            show: takes what the scene shows at each.
+            results: results of `run`, with series and leaves.
+            times_ns: times of the samples, increasing.
+            show: receives the scene at each of them.
         """
         if not times_ns:
             return
@@ -489,7 +490,7 @@ class Replay:
         )
 
     def _shown_start(self) -> tuple[int, str]:
-        """Return the first message that a viewer shows, of this log or of the one opened next to it."""
+        """Return time and log of the first message in a viewer: of this log or the source next to it."""
         is_bag = self._selection.options.keep == () and not isinstance(self._source, McapSource)
         start_ns = first_message_ns(self._source) if self._is_beside or is_bag else None
         return (self._start_ns, "this log") if start_ns is None else (start_ns, self._source.name)
@@ -510,12 +511,12 @@ class Replay:
             if self._keep_series or self._keep_leaves:
                 blocks = self._kept[index]
                 blocks.append(self._kept_part(stretch))
-                # a few large arrays lie in files, many small ones would stay in memory
+                # joined arrays lie in temporary files: 0.25 instead of 0.64 GB for a million samples
                 while len(blocks) > 1 and len(blocks[-2].times_ns) <= len(blocks[-1].times_ns):
                     blocks[-2:] = [join_blocks(blocks[-2:])]
 
     def _kept_part(self, stretch: SeriesBlock) -> SeriesBlock:
-        """Return a stretch without what is not to stay in memory."""
+        """Return a stretch with only those arrays that are kept."""
         series = stretch.series if self._keep_series else np.empty((len(stretch.series), 4, 0))
         leaves = stretch.leaves if self._keep_leaves else np.empty((1, stretch.leaves.shape[1], 0))
         return SeriesBlock(stretch.times_ns, series, leaves)
@@ -547,7 +548,7 @@ class Replay:
 
 
 def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trace, list[SeriesBlock]]:
-    """Return samples with the part of each stretch that is about them."""
+    """Return samples with the part of each stretch at their times."""
     if not len(trace):
         return trace, [stretch.between(0, 0) for stretch in stretches]
     first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
@@ -555,7 +556,7 @@ def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trac
 
 
 class _KeptTraces:
-    """The samples of a log that is not very long, so that explaining a verdict does not read it again."""
+    """The samples of a short log, kept so that explanations need not read it again."""
 
     def __init__(self, selection: Selection, most_bytes: int) -> None:
         self._selection = selection
@@ -564,7 +565,7 @@ class _KeptTraces:
         self._bytes = 0
 
     def add(self, trace: Trace) -> None:
-        """Take in the next samples; too many are dropped, all of them."""
+        """Keep the next samples. Above the limit, all samples are dropped."""
         self._bytes += trace.nbytes
         if self._bytes > self._most_bytes:
             self._traces = None
@@ -577,7 +578,7 @@ class _KeptTraces:
 
 
 def dropped_samples(source: Source) -> Dropped:
-    """Return what the recorder of a log dropped, and how it ended, as the log says."""
+    """Return the dropped samples of a recorder, and its interruption, from a log's metadata."""
     ending = dict(source.metadata()).get(ENDING, {})
     texts = [ending.get(name, "0") for name in ("samples", "dropped")]
     written_count, count = (
@@ -600,16 +601,16 @@ def replayed_specs(
     has_leaves: bool = True,
     doubts: Sequence[Doubt] = (),
 ) -> tuple[SpecResult, ...]:
-    """Return the results of streams that have taken in all samples.
+    """Return the results of streams after the last sample.
 
     Args:
-        trees: the results, under the names they are reported by.
-        blocks: of each stream every sample, or None if nothing was kept.
-        traces: reads the samples again.
-        zero_ns: the time that sentences count from.
-        units: those that are declared, see `unit_of`.
+        trees: the results, with their reported names.
+        blocks: all samples of each stream as one block; None if nothing was kept.
+        traces: function that reads the samples again.
+        zero_ns: zero of times in sentences.
+        units: declared units, see `unit_of`.
         has_series, has_leaves: whether the blocks hold the numbers, and the atoms.
-        doubts: those about the log.
+        doubts: doubts about the log.
     """
     doubts_by_result = doubts_of_instances([stream.instance for stream in streams], doubts, traces)
     return tuple(
@@ -643,7 +644,7 @@ def planned_result(source: Source) -> str:
 
 
 def planned_for(source: Source, files: Sequence[Specification]) -> str:
-    """Return the name of the file that decisions were made for, if none of these says the same; else ""."""
+    """Return the name of the planner's specification file if none of these has its meaning; else ""."""
     name = plan_of(source).get("file", "")
     recorded = {
         attachment.name: attachment.data.decode("utf-8", "replace") for attachment in source.attachments()
@@ -669,22 +670,22 @@ def run_replay(
     certify: bool = True,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> Replayed:
-    """Evaluate specifications over a source and, if asked to, write the annotated log.
+    """Evaluate specifications over a source, and write the annotated log if an output is given.
 
-    Equal sources, specifications and options give equal results and an equal file; a replay of an annotated
-    log gives what a replay of its source gives.
+    Equal sources, specifications and options give equal results and an equal file. A replay of an annotated
+    log gives the same as a replay of its source.
 
     Args:
         keep_series: keep every sample's numbers in memory.
         keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
-        output: the annotated log; it replaces a file of that name only when it is complete.
+        output: path of the annotated log; an existing file is replaced only when the log is complete.
         inputs: files that the output must not be.
         layer: leave the source's own messages, metadata and attachments out of the output.
-        certify: hash what is read and what comes out, as for every output; for that, messages are read, too.
+        certify: hash inputs and results, for which messages are read, too; always done with an output.
         advance: called with the number of samples of each block that is done.
 
     Raises:
-        UsageError: an option that cannot work, no sample in the window, the output is an input.
+        UsageError: an option is invalid, the window has no sample, or the output is an input.
         SpecificationError: names that the log never has, if names are strict.
         LogError: no sample in the log.
         OutputError: the output cannot be written.
@@ -736,16 +737,16 @@ def load_files(
     *,
     constants: Mapping[str, float | str] | None = None,
 ) -> list[Specification]:
-    """Load the named specifications or, without any, those that the log was written with.
+    """Load the named specifications; without any, the specifications in the log.
 
-    A replayed log gives those of the last replay, another log those that it was recorded with.
+    A replayed log has the specifications of the last replay, and another log those of the recording.
 
     Args:
-        constants: values in place of those that the specifications have; see `load_specifications`.
+        constants: values that replace those in the specifications, see `load_specifications`.
 
     Raises:
-        UsageError: none was named and the log has none, or no specification has one of the constants.
-        SpecificationError: a specification with errors.
+        UsageError: no specification is named or in the log, or no specification has one of the constants.
+        SpecificationError: a specification has errors.
     """
     named: Sequence[Path | SpecificationText] = tuple(dict.fromkeys(paths)) or recorded_texts(source)
     if not named:
@@ -754,9 +755,9 @@ def load_files(
 
 
 def recorded_texts(source: Source) -> list[SpecificationText]:
-    """Return the specifications that a log was written with, as they were written.
+    """Return the texts of the specifications in a log.
 
-    A replayed log gives those of the last replay, another log those that it was recorded with.
+    A replayed log has the specifications of the last replay, and another log those of the recording.
     """
     attachments = source.attachments()
     for prefix in (REPLAYED_PREFIX, RECORDED_PREFIX):
@@ -775,14 +776,14 @@ def recorded_texts(source: Source) -> list[SpecificationText]:
 def _begin(
     sink: Sink, source: Source, replay: Replay, options: ReplayOptions, zero_ns: int, *, layer: bool
 ) -> None:
-    """Write what comes before the first message: our metadata, and that of the source."""
+    """Write the metadata and the attachments, which come before the first message."""
     before = dict(source.metadata()).get(METADATA, {})
     is_replayed = before.get("written_by") == "replay"
     about = {
         "version": __version__,
         "written_by": "replay",
         "semantics": options.semantics,
-        # a replay of a replay says what a replay of the first source says
+        # a replay of a replay names the first source, so that both logs are equal
         "source": before.get("source", source.name) if is_replayed else source.name,
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),

@@ -1,7 +1,7 @@
-"""A log in memory, evaluated again and again with other values for the constants of its specifications.
+"""A log in memory, evaluated repeatedly with other values for the constants of its specifications.
 
-`LoadedLog` holds the log, `EditedFiles` the specifications with some values, `Evaluated` their results,
-`OwnMessages` the messages of the log itself; `Playback` plays them.
+`LoadedLog` holds the log, `EditedFiles` the specifications with some values, and `Evaluated` their results.
+`OwnMessages` holds the log's own messages, and `Playback` plays all messages.
 """
 
 from __future__ import annotations
@@ -62,17 +62,17 @@ from spatial_replay.trace.trace import Trace, within
 
 _FEW: Final = 2_000
 _FEW_BYTES: Final = 1 << 26
-"""The most messages of one topic, and bytes of all such topics, that are kept in memory."""
+"""Limits of messages kept in memory: messages of one topic, and bytes of all such topics."""
 
 _PIECE: Final = 256
-"""Samples that are encoded at once."""
+"""Samples per encoded piece."""
 
 
 class OwnMessages:
-    """The messages that a copy of a log has: those of the log, and samples that are not among them.
+    """The messages of a copy of a log: its own messages, and encoded samples if it has none of them.
 
-    Topics with few messages (a map, a transform) stay in memory, since viewers show a message until the next
-    one of its topic, however old it is. The other topics are read again when they are played.
+    Topics with few messages (a map, a transform) are kept in memory, because viewers show a message until the
+    next one of its topic. The other topics are read again for playback.
 
     Attributes:
         channels: in the order of their first messages.
@@ -101,7 +101,7 @@ class OwnMessages:
         self._span(times_ns)
         if len(times_ns):
             first_ns, end_ns = self._samples_ns
-            # a log may begin at 0
+            # the end is tested, because a log may begin at 0
             self._samples_ns = (first_ns if end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
         self._count(messages)
         # a log without messages is played from memory; others are read again
@@ -132,10 +132,10 @@ class OwnMessages:
         return latest_messages(merge(before), time_ns)
 
     def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
-        """Read the log from a time on; from memory, in small pieces, if samples are all that it has."""
+        """Read the log from a time on. A log of samples only is read from memory, in small pieces."""
         if self._counts:
             for block in read_blocks(self._selection.source, start_ns, self._selection.window.end_ns):
-                # samples at the ends of the log are left out
+                # trimmed samples at the ends of the log are left out
                 yield replace(block, trace=within(block.trace, *self._samples_ns))
             return
         if len(self._samples) > 1:
@@ -152,7 +152,7 @@ class OwnMessages:
             self.end_ns = max(self.end_ns, last_ns)
 
     def _count(self, messages: Messages) -> None:
-        """Count messages in the window; topics that turn out to have many leave the memory."""
+        """Count messages in the window. Topics with many messages are removed from memory."""
         for channel, rows in messages.by_channel():
             if channel not in self._counts:
                 self._few[channel] = []
@@ -175,7 +175,7 @@ class MessageCursor:
         self._is_over = False
 
     def take_before(self, end_ns: int) -> Messages:
-        """Return the messages before a time that were not taken yet.
+        """Return the remaining messages before a time.
 
         Raises:
             LogError: the log can no longer be read.
@@ -193,7 +193,7 @@ class MessageCursor:
 
 
 def latest_messages(messages: Messages, time_ns: int) -> Messages:
-    """Return of each channel the messages from a time on or, if it has none, the last one before."""
+    """Return the messages of each channel from a time on; if it has none, its last message before."""
     _, last = np.unique(messages.channel[::-1], return_index=True)
     is_shown = messages.log_time_ns >= time_ns
     is_shown[len(messages) - 1 - last] = True
@@ -210,7 +210,7 @@ def _size(messages: Messages) -> int:
 
 
 MOST_NUMBERS: Final = 1 << 27
-"""Numbers of nodes at samples, four for each, that an evaluation may have: 1 GiB of them."""
+"""Limit of numbers in an evaluation, which has four per node and sample: 1 GiB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +218,9 @@ class EditedFiles:
     """The specifications with some values for their constants.
 
     Attributes:
-        loaded: the log that they are evaluated over.
-        files: as a log stores them.
-        given: the values that were given in place of those in the text.
+        loaded: the evaluated log.
+        files: specifications as a log stores them.
+        given: values that replace those in the text.
         constants: all values, by the names of `LoadedLog.constants`.
     """
 
@@ -237,16 +237,16 @@ class LoadedLog:
 
     Attributes:
         name: the log's name.
-        options: how it is evaluated.
-        constants: those of the specifications, as they are written, by the names to change them by.
-        trace: every sample that is read; those before the window that are only looked back at, too.
-        inside: those in the window.
-        own: the messages of the log itself.
-        faults, remarks: what was lost while reading, and what else the source reports.
+        options: options of the evaluation.
+        constants: constants of the specifications as written, by the names that edits use.
+        trace: all samples that are read, also those before the window that operators look back at.
+        inside: samples in the window.
+        own: the log's own messages.
+        faults, remarks: losses while reading, and other remarks of the source.
         doubts: assumptions that the log contradicts.
-        missing: a warning for each name in the specifications that the log never has.
-        dropped: the samples that its recorder had no time for.
-        plan: the metadata of the plan that it was recorded with; empty without any.
+        missing: a warning for each missing name in the specifications.
+        dropped: samples that the recorder dropped.
+        plan: metadata of the plan that was recorded with the log; empty without one.
     """
 
     def __init__(
@@ -261,12 +261,12 @@ class LoadedLog:
         """Read the log.
 
         Args:
-            saved: the files that the specifications are from, if constants may be written into them.
+            saved: files of the specifications, if constants may be written into them.
             advance: called with the number of samples of each block that is read.
 
         Raises:
-            LogError: no sample in the log, or it cannot be read.
-            UsageError: no sample in the window, an option that cannot work.
+            LogError: the log has no sample, or cannot be read.
+            UsageError: the window has no sample, or an option is invalid.
             SpecificationError: names that the log never has, if names are strict.
         """
         keep = KEEP_ALL if options.keep is None else options.keep
@@ -303,13 +303,13 @@ class LoadedLog:
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
-        """Return the log with other specifications; samples and measurements are those in memory.
+        """Return the log with other specifications, and with the samples and measurements in memory.
 
-        The log is read again if these look back at samples before the window, and the former did not. It is
-        also read again if these name other objects or signals of a log whose ends are trimmed.
+        The log is read again if only the new specifications look back at samples before the window. It is
+        also read again if its ends are trimmed and the new specifications name other objects or signals.
 
         Raises:
-            UsageError: an option that does not fit these specifications.
+            UsageError: an option does not fit the specifications.
             SpecificationError: names that the log never has, if names are strict.
         """
         looks_farther = self.options.window.start_ns and look_before(files) and not self._looks_back
@@ -325,14 +325,14 @@ class LoadedLog:
         return log
 
     def write_constants(self, values: Mapping[str, float | str]) -> Mapping[str, float | str]:
-        """Write values of constants into the files that the specifications are from; only numbers change.
+        """Write values of constants into the files of the specifications. Only numbers change.
 
         Returns:
-            Those that changed.
+            The changed values.
 
         Raises:
-            UsageError: the files may not be written; no such constant; a save has changed one of them since.
-                SpecificationError, MissingFileError, OutputError: see `write_constants`.
+            UsageError: the files may not be written, a constant is missing, or a save has changed one since.
+            SpecificationError, MissingFileError, OutputError: see `write_constants`.
         """
         if self._saved is None:
             raise UsageError(
@@ -341,7 +341,7 @@ class LoadedLog:
         return self._saved.write(self._by_file(values), self._files)
 
     def was_written(self, name: str) -> bool:
-        """Say whether a constant has the value in its file that `write_constants` gave it."""
+        """Return whether a constant has the value in its file that `write_constants` wrote."""
         return self._saved is not None and self._saved.was_written(*self._places[name])
 
     def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
@@ -352,14 +352,15 @@ class LoadedLog:
         return edits
 
     def edit(self, values: Mapping[str, float | str]) -> EditedFiles:
-        """Return the specifications with other values for some constants; a file is parsed if it changes.
+        """Return the specifications with other values for some constants. Only changed files are parsed.
 
         Args:
-            values: numbers and, as texts, durations ("2s"), by name; the others stay as they are written.
+            values: numbers, and durations as texts ("2s"), by name; other constants keep their written
+                values.
 
         Raises:
-            UsageError: no such constant, a value of another kind.
-            SpecificationError: a specification that is invalid with these values.
+            UsageError: a constant is missing, or a value is of another kind.
+            SpecificationError: a specification is invalid with these values.
         """
         edits = self._by_file(values)
         edited = [_edit_file(file, edit) for file, edit in zip(self._files, edits, strict=True)]
@@ -375,14 +376,15 @@ class LoadedLog:
         """Evaluate the specifications over all samples, with other values for some constants.
 
         Args:
-            values: as for `edit`, or what that returned.
+            values: as for `edit`, or a result of `edit`.
 
         Raises:
-            UsageError: no such constant, a value of another kind, more numbers than fit into memory.
-            SpecificationError: a specification that is invalid with these values.
+            UsageError: a constant is missing, a value is of another kind, or the numbers do not fit into
+                memory.
+            SpecificationError: a specification is invalid with these values.
         """
         edited = values if isinstance(values, EditedFiles) else self.edit(values or {})
-        # the samples in memory are every Nth already
+        # `every` was applied when the samples were read
         options = replace(self.options, window=replace(self.options.window, every=1))
         selection = Selection(MemorySource(self.trace, self.name), edited.files, options)
         instances = [selection.instances(file) for file in edited.files]
@@ -402,7 +404,7 @@ class LoadedLog:
         )
 
     def _place(self, name: str, value: object) -> tuple[int, str]:
-        """Return the file of a constant and its name there, if a value is of its kind."""
+        """Return the number of a constant's file and its name there, after a check of the value's kind."""
         if name not in self._places:
             constant_names = tuple(self._places)
             hint = (
@@ -430,7 +432,7 @@ class LoadedLog:
 
 
 _MOST_NAMED: Final = 5
-"""The most results, and constants, that a summary names."""
+"""Results and constants that a summary names, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,8 +442,8 @@ class Evaluated:
     Attributes:
         edited: the specifications with these values.
         selection: the samples in memory.
-        evaluation: the evaluation, which has taken in all of them.
-        stretches: for each of its trees, every sample.
+        evaluation: the evaluation after the last sample.
+        stretches: all samples, for each of its trees.
     """
 
     loaded: LoadedLog
@@ -504,7 +506,7 @@ class Evaluated:
 
     @property
     def summary(self) -> str:
-        """The verdict of each result, the worst first, and which constants differ from the text."""
+        """The verdicts of the results, the worst first, and the constants that differ from the text."""
         results = [self.replayed.results[place] for place in worst_first(self.replayed.results)]
         text = "; ".join(map(_result_text, results[:_MOST_NAMED])) or "the template matched no objects"
         if len(results) > _MOST_NAMED:
@@ -531,7 +533,7 @@ class Evaluated:
         return layout_attachment(contents, live=True)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
-        """Return samples `begin` to before `end` of those in the window, with their evaluation."""
+        """Return the samples in the window from number `begin` to before `end`, with their evaluation."""
         return with_stretches(self.loaded.inside.slice(begin, end), self.stretches)
 
 
@@ -548,12 +550,12 @@ def constant_text(constant: Constant) -> str:
 
 
 def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]:
-    """Return constants as `LoadedLog.edit` takes them."""
+    """Return constants as arguments of `LoadedLog.edit`."""
     return {name: constant_value(constant) for name, constant in constants.items()}
 
 
 def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
-    """Return for each constant its file and its name there; names in two files follow their file's stem."""
+    """Return the file number and the name of each constant. Names in two files get their file's stem."""
     names = [name for file in files for name in file.constants]
     return {
         f"{PurePath(file.filename).stem}.{name}" if names.count(name) > 1 else name: (index, name)
@@ -569,10 +571,10 @@ def _edit_file(file: Specification, values: Mapping[str, float | str]) -> Specif
 
 
 def _storable(edited: Specification, written: Specification, stored: Specification) -> Specification:
-    """Return an edited specification as a log stores it: its text says the new values.
+    """Return an edited specification as a log stores it, with the new values in its text.
 
-    Messages refer to nodes by their place in the text. If a log stores a canonical text of the written one,
-    that of the edited one is parsed to get the places.
+    Messages refer to nodes by their place in the text. If the log stores a canonical text, the canonical text
+    of the edited specification is parsed to get the places.
 
     Args:
         stored: the written specification as a log stores it.
@@ -587,32 +589,32 @@ def _storable(edited: Specification, written: Specification, stored: Specificati
 
 
 _LOOK_BACK_NS: Final = 2_000_000_000
-"""How far before a seek the latest message of each topic is looked for."""
+"""Time before a seek that is searched for the latest message of each topic, nanoseconds."""
 
 _MOST_EVENTS: Final = 500
-"""The most earlier events that a seek sends."""
+"""Earlier events that a seek sends, at most."""
 
 _MOST_CHANGES: Final = 100
-"""The most earlier changes of verdicts that a seek sends."""
+"""Earlier changes of verdicts that a seek sends, at most."""
 
 
 class Playback:
     """The messages that an annotated log would have, in the order of time.
 
-    From a seek on they are those that a replay writes, for any division into stretches, except for the scene.
-    It is drawn again at once, and entities of another time are deleted.
+    After a seek, they equal the messages of a replay, for any division into stretches. Only the scene
+    differs: it is drawn again at once, and entities of another time are deleted.
 
     Attributes:
         evaluated: the evaluation; another one of the same log may replace it before a `seek`.
-        start_ns, end_ns: from the first sample to the last sample or message of the log.
+        start_ns, end_ns: times of the first sample, and of the last sample or message of the log.
         arrow: the title of the result whose violation the scene points at, from the next `seek` on; "" for
             the first one.
         time_ns: the time up to which messages were taken, inclusive.
-        past: how results stood at the last changes before the sample of the last `seek`, by time.
+        past: states of results at the last changes before the sample of the last `seek`, by time.
     """
 
     def __init__(self, evaluated: Evaluated) -> None:
-        """Begin before the first message; `seek` first."""
+        """Start before the first message. Call `seek` before anything else."""
         log_messages = evaluated.loaded.own
         self._times_ns = evaluated.loaded.inside.times_ns
         self.start_ns, self.end_ns = int(self._times_ns[0]), log_messages.end_ns
@@ -642,10 +644,10 @@ class Playback:
         return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *log_messages.channels)))
 
     def seek(self, time_ns: int) -> Messages:
-        """Go to a time, and return what a viewer shows there.
+        """Go to a time, and return the messages that a viewer shows at it.
 
-        The state has the sample at or before it with all its messages, the specification, the latest events,
-        and the last message of each of the log's own topics. `past` has how results stood before it.
+        These are the messages of the last sample, the specification, the latest events, and the last message
+        of each of the log's own topics. `past` has the states of results before that sample.
 
         Raises:
             LogError: the log can no longer be read.
@@ -668,7 +670,7 @@ class Playback:
         return join([shown_there, _last(self._end())])
 
     def advance_to(self, time_ns: int) -> Messages:
-        """Return the messages after those taken so far, up to and including a time.
+        """Return the remaining messages up to a time, inclusive.
 
         Raises:
             LogError: the log can no longer be read.
@@ -681,7 +683,7 @@ class Playback:
         return join([coming, self._end()])
 
     def reach_ns(self, samples: int) -> int:
-        """Return the time of the sample that comes so many after the last one taken, or the end."""
+        """Return the time of the sample a number of samples after the last one taken, or the end."""
         index = self._next + samples - 1
         return int(self._times_ns[index]) if index < len(self._times_ns) else self.end_ns
 
@@ -693,7 +695,7 @@ class Playback:
         return merge(self._annotator.end(self.end_ns, self.evaluated.evaluation.finals))
 
     def _seek_own(self, sample_ns: int) -> Messages:
-        """Return the latest of the log's own messages of each topic, and all those at the present time."""
+        """Return the log's latest own message of each topic, and all its messages at the present time."""
         log_messages = self.evaluated.loaded.own
         since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), log_messages.start_ns)
         self._own = MessageCursor(log_messages, since_ns)

@@ -49,28 +49,28 @@ KEEP_ALL: Final = (ALL,)
 
 _DECIMAL: Final = re.compile(r"\d{1,19}", re.ASCII)
 CLIP_METADATA: Final = "spatial_replay_clip"
-"""The metadata record that says what a clip was cut from."""
+"""Metadata record of a clip with its origin."""
 
 
 def default_keep(source: Source) -> tuple[str, ...]:
-    """Return what an annotated log keeps of a source's messages: of ROS 2 nothing.
+    """Return the messages of a source that an annotated log keeps: none of ROS 2, else all.
 
-    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. So the bag stays as it
-    is, and the annotated log is opened next to it.
+    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. So the bag is unchanged,
+    and the annotated log is opened next to it.
     """
     messages = _external(source)
     return () if messages is not None and messages.profile == "ros2" else KEEP_ALL
 
 
 def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
-    """Return a source whose blocks hold the messages that a copy keeps, besides the samples.
+    """Return a source whose blocks hold the samples and the messages that a copy keeps.
 
     Args:
-        keep: "all", "mapped" for the topics that the samples are made of, or patterns of topics such as
-            "/camera/*"; several add up. None leaves the source as it is.
+        keep: "all", "mapped" for the topics of the samples, or patterns of topics such as "/camera/*";
+            several are combined. None leaves the source unchanged.
 
     Raises:
-        UsageError: a pattern that no topic of the log fits.
+        UsageError: no topic of the log fits a pattern.
     """
     if keep is None:
         return source
@@ -81,7 +81,7 @@ def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
 
 
 def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
-    """Check that every pattern fits a topic: with a misspelt one, what was meant would be lost."""
+    """Check that every pattern fits a topic, because a misspelt pattern would lose messages."""
     topics = _topics(source)
     if not topics:
         raise UsageError(f"{source.name} has no messages to keep; it holds samples only")
@@ -137,12 +137,12 @@ class ReplayOptions:
 
     Attributes:
         window: the samples to evaluate.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
+        each: objects for each parameter of a template: "all", "class:NAME" or a name.
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
-        strict_names: names that the log never has are errors; otherwise objects and signals are unknown, and
-            a template has no result for a class.
-        keep: which messages of the log a copy keeps: "all", "mapped", patterns of topics; () for the samples
-            only. None for `default_keep` in a copy and, without one, those that need not be read for it.
+        strict_names: whether missing names are errors; otherwise missing objects and signals are unknown, and
+            a template has no result for a missing class.
+        keep: messages of the log that a copy keeps: "all", "mapped", or patterns of topics; () for samples
+            only. None is `default_keep` for a copy, and otherwise leaves the source unchanged.
         arrow: the title of the result whose violation the scene points at; "" for the first one.
     """
 
@@ -157,7 +157,7 @@ class ReplayOptions:
 DEFAULT_OPTIONS = ReplayOptions()
 
 _FIRST_NS = 10**8
-"""Where the first sample is looked for, after a log's first message."""
+"""Time after a log's first message that is searched for the first sample, nanoseconds."""
 
 
 def look_before(files: Sequence[Specification]) -> bool:
@@ -169,11 +169,11 @@ def first_sample_ns(source: Source) -> int:
     """Return the time of a log's first sample.
 
     Raises:
-        LogError: it has none.
+        LogError: the log has no sample.
     """
     source = source.keeping()
     begin_ns = source.begin_ns
-    # its first chunks, if the log says when they are; else, or if nothing is in them, all of it
+    # first the begin of the log, if its index gives the time; then the whole log
     for end_ns in (None,) if begin_ns is None else (begin_ns + _FIRST_NS, None):
         for block in read_blocks(source, None, end_ns):
             if len(block.trace):
@@ -182,7 +182,7 @@ def first_sample_ns(source: Source) -> int:
 
 
 def named_zero_ns(source: Source) -> int | None:
-    """Return the zero that a log names: the first sample of the log that it was cut from."""
+    """Return the zero in a log's metadata: the first sample of the log that it was cut from."""
     records = dict(source.metadata())
     for name in (METADATA, CLIP_METADATA):
         text = records.get(name, {}).get(ZERO, "")
@@ -192,10 +192,10 @@ def named_zero_ns(source: Source) -> int | None:
 
 
 def zero_ns(source: Source) -> int:
-    """Return the time that texts about a log count from: its first sample, or the zero that it names.
+    """Return the zero of times in texts about a log: the zero in its metadata, or its first sample.
 
     Raises:
-        LogError: it has no sample.
+        LogError: the log has no sample.
     """
     named_ns = named_zero_ns(source)
     return first_sample_ns(source) if named_ns is None else named_ns
@@ -213,7 +213,7 @@ def first_message_ns(source: Source) -> int | None:
 
 
 def log_zero_ns(source: Source, window: Window, ends: RunEnds) -> int:
-    """Return the zero of a log of which samples were read (see `zero_ns`)."""
+    """Return the zero of a log whose samples were read, see `zero_ns`."""
     if window.start_ns or ends.begin_ns is None:
         return known_zero_ns(source)
     named_ns = named_zero_ns(source)
@@ -221,10 +221,10 @@ def log_zero_ns(source: Source, window: Window, ends: RunEnds) -> int:
 
 
 def last_sample_ns(source: Source) -> int:
-    """Return the time of a log's last sample; the whole log is read for it.
+    """Return the time of a log's last sample. The whole log is read.
 
     Raises:
-        LogError: it has none.
+        LogError: the log has no sample.
     """
     times_ns = [int(block.trace.times_ns[-1]) for block in read_blocks(source.keeping()) if len(block.trace)]
     if not times_ns:
@@ -236,7 +236,7 @@ def absolute_ns(point: TimePoint, source: Source) -> int:
     """Return a time on the clock of a log.
 
     Raises:
-        LogError: it counts from a sample, and the log has none.
+        LogError: the time counts from a sample, and the log has none.
     """
     if point.origin == "last sample":
         return point.absolute_ns(last_ns=last_sample_ns(source))
@@ -246,10 +246,10 @@ def absolute_ns(point: TimePoint, source: Source) -> int:
 def window_from_points(
     source: Source, start: TimePoint | None, end: TimePoint | None, every: int = 1
 ) -> Window:
-    """Return the window from one time to before another; without them, to the ends of the log.
+    """Return the window from `start` to before `end`; None is an end of the log.
 
     Raises:
-        UsageError: it is empty.
+        UsageError: the window is empty.
         LogError: a time counts from a sample, and the log has none.
     """
     whole = Window()
@@ -259,7 +259,7 @@ def window_from_points(
 
 
 def known_zero_ns(source: Source) -> int:
-    """Return the zero of a damaged log; 0 if it has no sample."""
+    """Return the zero of a log; 0 if it has no sample."""
     try:
         return zero_ns(source)
     except LogError:
@@ -273,7 +273,7 @@ def has_samples_from(source: Source, time_ns: int) -> bool:
 
 @dataclass(slots=True)
 class LogNames:
-    """The names of a log, collected while it is read: of its objects, signals and classes."""
+    """Names of objects, signals and classes in a log, collected while it is read."""
 
     objects: set[str] = field(default_factory=set)
     signals: set[str] = field(default_factory=set)
@@ -281,33 +281,33 @@ class LogNames:
 
     @classmethod
     def of(cls, trace: Trace) -> LogNames:
-        """Return those of a whole log."""
+        """Return the names in a whole log."""
         names = cls()
         names.add(trace)
         return names
 
     def add(self, trace: Trace) -> None:
-        """Add those of some samples."""
+        """Add the names in some samples."""
         self.objects.update(trace.names)
         self.signals.update(trace.signals)
         self.classes.update(name for name in trace.classes if name)
 
     def frozen(self) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
-        """Return those of objects, signals and classes as values."""
+        """Return the names of objects, signals and classes as immutable sets."""
         return frozenset(self.objects), frozenset(self.signals), frozenset(self.classes)
 
     def check(self, file: Specification, each: Mapping[str, str]) -> tuple[Diagnostic, ...]:
-        """Compare the names of a specification with these (see `check_names`)."""
+        """Compare the names in a specification with the names in the log, see `check_names`."""
         objects, signals, classes = sorted(self.objects), sorted(self.signals), sorted(self.classes)
         return check_names(file, objects, signals, classes=classes, each=each)
 
 
 class CheckedTrace(NamedTuple):
-    """The samples of a log that are evaluated.
+    """The evaluated samples of a log.
 
     Attributes:
-        missing: a warning for each name that they lack.
-        zero_ns: the time that texts about the log count from.
+        missing: a warning for each missing name.
+        zero_ns: zero of times in texts about the log.
     """
 
     trace: Trace
@@ -320,13 +320,13 @@ class Selection:
     """The part of a source that specifications are evaluated over; it can be read any number of times.
 
     Attributes:
-        files: the specifications; samples before the window that they look back at are read, too.
-        needs: the names that these use.
-        looks_back: whether they look back at samples before the window.
+        files: specifications; samples before the window that they look back at are read, too.
+        needs: names in the specifications.
+        looks_back: whether the specifications look back at samples before the window.
 
     Raises:
-        UsageError: objects for a parameter that no template has, an operator that the semantics lacks, a
-            window that may lie between two samples of a pause (`max_gap`).
+        UsageError: no template has a given parameter, the semantics lack an operator, or a time window may
+            lie between two samples of a pause (`max_gap`).
     """
 
     source: Source
@@ -340,7 +340,7 @@ class Selection:
         object.__setattr__(self, "source", source_keeping(self.source, self.options.keep))
         object.__setattr__(self, "needs", Needs.of(self.files, self.options.each))
         object.__setattr__(self, "looks_back", look_before(self.files))
-        # most of many logs have the same names
+        # many logs of a batch have the same names
         object.__setattr__(self, "_missing_names", lru_cache(maxsize=16)(self._find_missing))
         templates = [spec for file in self.files for spec in file.results if spec.parameter is not None]
         check_parameters(templates, self.options.each)
@@ -351,7 +351,7 @@ class Selection:
         """Return the same part of another log.
 
         Raises:
-            UsageError: a window that may lie between two samples of a pause (`max_gap`).
+            UsageError: a time window may lie between two samples of a pause (`max_gap`).
         """
         _check_windows(self.files, source.max_gap_ns or 0)
         selection = copy(self)
@@ -369,11 +369,11 @@ class Selection:
     def read_blocks(
         self, *, messages: bool = True, ends: RunEnds | None = None
     ) -> Generator[tuple[Block, Trace], None, None]:
-        """Read each block, with its samples in the window, and before it if a specification looks back.
+        """Read each block with its samples in the window, and also before it if a specification looks back.
 
         Args:
             messages: whether the blocks have to hold messages.
-            ends: new from `run_ends`, for callers who ask it afterwards.
+            ends: a new result of `run_ends`, which callers can read afterwards.
         """
         ends = ends or self.run_ends()
         waiting: deque[Block] = deque()
@@ -390,7 +390,7 @@ class Selection:
     def _read_samples(self, *, messages: bool) -> Iterator[tuple[Block, Trace]]:
         """Read each block, with every Nth of its samples."""
         window = self.window
-        # every Nth sample is counted from the log's first, wherever the window starts
+        # every Nth sample is counted from the log's first sample, independent of the window
         from_start = self.looks_back or window.every > 1
         read = 0
         source = self.source if messages else self.source.keeping()
@@ -417,7 +417,7 @@ class Selection:
             ends: see `read_blocks`.
         """
         if isinstance(self.source, MemorySource) and self.window.is_whole and not self.source.trace.spans:
-            # with the measurements that it has cached
+            # this trace has cached measurements
             advance(len(self.source.trace))
             return self.source.trace
         traces = []
@@ -427,11 +427,11 @@ class Selection:
         return replace(Trace.concatenate(traces), units=self.source.axes.units)
 
     def checked_trace(self, advance: Callable[[int], None]) -> CheckedTrace:
-        """Return that trace, with a warning for each name that it lacks; see `missing_names`.
+        """Return the trace with a warning for each missing name, see `missing_names`.
 
         Raises:
-            LogError, UsageError: it has no sample in the window.
-            SpecificationError: it lacks names, and these are strict.
+            LogError, UsageError: the window has no sample.
+            SpecificationError: a name is missing, and names are strict.
         """
         ends = self.run_ends()
         trace = self.trace(advance, ends)
@@ -441,11 +441,11 @@ class Selection:
         return CheckedTrace(trace, missing, log_zero_ns(self.source, self.window, ends))
 
     def inside(self, trace: Trace) -> Trace:
-        """Return those samples that are in the window."""
+        """Return the samples in the window."""
         return within(trace, self.window.start_ns, self.window.end_ns)
 
     def own_messages(self, block: Block, first: int) -> Messages:
-        """Return the source's messages in the window; samples that are not among them are encoded.
+        """Return the source's messages in the window, and encoded samples if it has no messages of them.
 
         Args:
             first: the number of the block's first sample in the window.
@@ -453,16 +453,16 @@ class Selection:
         messages = block.messages
         inside = messages.within(self.window.start_ns, self.window.end_ns)
         if any(channel.topic == OBJECTS for channel in messages.channels.values()):
-            # in the source, messages of one time come in the order of its numbers of channels
+            # the source orders messages of one time by its own channel numbers, and `merge` by content
             return merge([inside])
         trace = self.inside(block.trace)
         return merge([inside, sample_messages(trace, first)])
 
     def instances(self, file: Specification) -> list[Instance]:
-        """Return what is to be evaluated of a specification; for templates, the source is read for objects.
+        """Return the instances of a specification. For templates, the source is read to find objects.
 
         Raises:
-            UsageError: a template without its objects.
+            UsageError: the objects of a template are not given.
         """
         parameters = {spec.parameter for spec in file.results}
         choices = {
@@ -471,13 +471,13 @@ class Selection:
         return find_instances(file, choices, self.iter_traces(), self.window.start_ns, self.window.end_ns)
 
     def missing_names(self, names: LogNames) -> tuple[Diagnostic, ...]:
-        """Return a warning for each object, signal and class that is asked for and that the log never has.
+        """Return a warning for each missing object, signal and class of the specifications.
 
         Args:
-            names: those in the window.
+            names: names in the window.
 
         Raises:
-            SpecificationError: it lacks some, and names are strict.
+            SpecificationError: a name is missing, and names are strict.
         """
         missing = self._missing_names(*names.frozen())
         if missing and not self.window.is_whole:
@@ -494,7 +494,7 @@ class Selection:
         """Return the error for a window without any sample.
 
         Args:
-            faults: those of the log that are known so far.
+            faults: faults of the log so far.
         """
         name = self.source.name
         spans = [
@@ -523,12 +523,12 @@ class Selection:
 
 
 def _trim(block: Block, ends: RunEnds) -> Block:
-    """Return a block whose samples count, with all of its messages."""
+    """Return a block with its trimmed samples and all its messages."""
     return replace(block, trace=ends.trim(block.trace))
 
 
 def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
-    """Check that no window lies between two of the samples that fill a pause."""
+    """Check that no time window can lie between two samples that fill a pause."""
     if not max_gap_ns:
         return
     step_ns = max_gap_ns // SAMPLES_A_GAP
@@ -545,7 +545,7 @@ def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
 
 @dataclass(frozen=True)
 class _ClippedSource(SourceOf):
-    """A log from one time to before another, after the messages that are still valid then."""
+    """A log from one time to before another, preceded by the earlier messages that are still valid."""
 
     start_ns: int
     end_ns: int
@@ -559,7 +559,7 @@ class _ClippedSource(SourceOf):
         if len(self.latched) and (start_ns or 0) <= self.start_ns:
             yield Block(Trace.from_samples(()), self.latched)
         for block in self.source.iter_blocks(first, last):
-            # an external log is read from before the window, for what is valid in it
+            # an external log is read from before the window, to find the values valid in it
             yield replace(block, messages=block.messages.within(first, last))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
@@ -569,13 +569,14 @@ class _ClippedSource(SourceOf):
 
 
 def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
-    """Return the part of a log that a clip has, as its metadata says.
+    """Return the part of a log that a clip has, by the clip's metadata.
 
     Args:
-        about: the metadata record of the clip: the times of its first and last sample, and what it keeps.
+        about: metadata record of the clip: the times of its first and last sample, and the kept topics.
 
     Raises:
-        LogError: the record cannot be read. UsageError: a pattern that no topic of the log fits.
+        LogError: the record cannot be read.
+        UsageError: no topic of the log fits a pattern.
     """
     try:
         start_ns, end_ns = int(about["start_ns"]), int(about["end_ns"])
@@ -587,7 +588,7 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
 
 
 def _last_before(source: Source, start_ns: int) -> Messages:
-    """Return the last message before a time of each topic but the samples, and of each frame's transform."""
+    """Return the last message before a time of each topic except samples; for transforms, of each frame."""
     latest: dict[tuple[Channel, str], Messages] = {}
     frames: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
     for messages in _messages_before(source, start_ns):
@@ -609,7 +610,7 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
             topics = {channel.topic for channel in walk.channels.values()} - {OBJECTS}
-            # with samples alone, and what is derived from them, there is nothing to look for
+            # a log of samples and derived messages only has no such messages
             if not any(map(source.is_wanted, topics)):
                 return
     for block in read_blocks(source, None, end_ns):
@@ -617,7 +618,7 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
 
 
 def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:
-    """Return a function from a message to the frames that it places; one name for other messages."""
+    """Return a function from a message to its child frames; other messages give one empty name."""
     kind = "" if channel.schema is None else channel.schema.name
     decode: Callable[[bytes], Any] | None = None
     if short_type(kind) in TRANSFORM_TYPES:
@@ -630,7 +631,7 @@ def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:
         try:
             return [""] if decode is None else _children(decode(payload))
         except (LogError, LookupError, ValueError, AttributeError, TypeError):
-            # a broken message counts like one of another topic
+            # a broken message counts like a message without frames
             return [""]
 
     return names

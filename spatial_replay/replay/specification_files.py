@@ -1,4 +1,4 @@
-"""Specification files of a running command: read when they are saved, and their constants written."""
+"""Specification files of a running command: read again after saves, with constants that can be written."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from spatial_replay.spec.load import load_specification, load_specifications
 
 _MARK: Final = b"\xef\xbb\xbf"
 _SETTLE_S: Final = 0.04
-"""How long size and time of a file have to stay before it counts as saved."""
+"""Time without a change of size and times after which a file counts as saved, seconds."""
 _ERROR_SETTLE_S: Final = 0.1
-"""How long a file with errors, or one that is gone, is left to an editor that may be writing it."""
+"""Further wait for a file that has errors or is missing, because an editor may be writing it, seconds."""
 _PATIENCE_S: Final = 1.0
-"""How long a file that changes all the time is waited for before others get a turn."""
+"""Longest wait for a file that keeps changing, seconds."""
 _IDLE_MS: Final = 100
 _STEP_MS: Final = 10
-"""The longest wait for a change, and how long to wait for more after one."""
+"""Timeout for a change, and wait for further changes after one, milliseconds."""
 
 
 _State: TypeAlias = tuple[int, int, int, int]
@@ -33,10 +33,10 @@ _State: TypeAlias = tuple[int, int, int, int]
 
 
 class SpecificationFiles:
-    """Specification files, read again when they are saved.
+    """Specification files that are read again when they are saved.
 
-    Holds which state of the files was read last, and which constants were written into them. One thread
-    watches; others may write.
+    It holds the last read state of the files, and the constants that were written into them. One thread
+    watches, and others may write.
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class SpecificationFiles:
         *,
         constants: Mapping[str, float | str] | None = None,
     ) -> None:
-        """Name the files; nothing is read yet.
+        """Set the files without reading them.
 
         Args:
-            constants: values in place of those that the files give their constants.
+            constants: values that replace those in the files.
 
         Raises:
-            UsageError: no file.
+            UsageError: no file is given.
         """
         if not paths:
             raise UsageError("watching needs a specification file to watch; give --spec FILE")
@@ -69,7 +69,7 @@ class SpecificationFiles:
             MissingFileError, SpecificationError, UsageError: as `load_specifications`.
         """
         with self._turn:
-            # before the files are read: what is saved while they are is a change
+            # before the files are read, so that a save during the reading counts as a change
             self._read, self._sources = self._state(), []
             files = load_specifications(self.paths, constants=self._constants)
             self._sources = [file.source for file in files]
@@ -81,14 +81,14 @@ class SpecificationFiles:
             return files
 
     def was_written(self, index: int, name: str) -> bool:
-        """Say whether a constant of a file, by its number, has the value that `write` gave it."""
+        """Return whether a constant has the value that `write` wrote, given the number of its file."""
         return (index, name) in self._written
 
     def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
-        """Yield the files whenever one is saved with another text, or why they cannot be read.
+        """Yield the files after each save of another text, or the error if they cannot be read.
 
-        Between saves it yields None, about ten times a second. A file counts as saved when its size and time
-        have stayed for 0.04 s, and with errors, or while it is gone, for 0.1 s more.
+        Between saves it yields None, about ten times a second. A file counts as saved after 0.04 s without a
+        change of size and times. A file with errors, or a missing one, gets 0.1 s more.
 
         Raises:
             UsageError: the library that watches files is not installed.
@@ -111,18 +111,14 @@ class SpecificationFiles:
     def write(
         self, values: Sequence[Mapping[str, float | str]] = (), loaded: Sequence[Specification] = ()
     ) -> dict[str, float | str]:
-        """Write values of constants into the files; they are no longer used in place of what is there.
+        """Write values of constants into the files, together with the values given at the start.
 
         Args:
-            values: for each of the files, by their names in it, besides those given at the start.
+            values: values by name for each of the files, in addition to those given at the start.
             loaded: the files as they were loaded when the values were chosen.
 
         Returns:
-            Those that changed.
-
-        Raises:
-            UsageError: a save has changed one of the numbers since.
-                MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
+            The changed values by name.
         """
         with self._turn:
             files = load_specifications(self.paths, constants=self._constants)
@@ -153,7 +149,7 @@ class SpecificationFiles:
         loaded: Mapping[str, Constant],
         present: Mapping[str, Constant],
     ) -> None:
-        """Refuse to write over a number that somebody else has saved since the file was loaded."""
+        """Refuse to overwrite a number that was saved by somebody else after the file was loaded."""
         for name in names:
             constant = present.get(name)
             if constant not in (None, loaded[name], self._written.get((index, name))):
@@ -163,7 +159,7 @@ class SpecificationFiles:
                 )
 
     def _wait_for_save(self) -> list[Specification] | SpatialReplayError | None:
-        """Return the files as saved; None if their text is the one before, or they change all the time."""
+        """Return the saved files; None if their texts are unchanged, or if they keep changing."""
         before, give_up = self._sources, time.monotonic() + _PATIENCE_S
         while time.monotonic() < give_up:
             state = self._state()
@@ -179,12 +175,12 @@ class SpecificationFiles:
                 continue
             if self._state() == self._read:
                 return files if self._sources != before else None
-        # what was read may be half a file: the next turn reads it again
+        # the last read may have been incomplete, so the next call reads the files again
         self._read, self._sources = [], before
         return None
 
     def _state(self) -> list[_State | None]:
-        """Return the states of the files; None for one that is gone."""
+        """Return the states of the files; None for a missing file."""
         states: list[_State | None] = []
         for path in self.paths:
             try:
@@ -197,10 +193,10 @@ class SpecificationFiles:
 
 
 def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str, ...]:
-    """Write values of constants into a specification file, and change nothing but these numbers.
+    """Write values of constants into a specification file, and change only these numbers.
 
     Args:
-        values: numbers and, as texts, durations, by name; one that the file has already stays as written.
+        values: numbers, and durations as texts, by name; a value that the file already has is not rewritten.
 
     Returns:
         The names of the constants that changed.
@@ -208,7 +204,7 @@ def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str,
     Raises:
         MissingFileError: the file cannot be read.
         SpecificationError: the file has errors, now or with these values.
-        UsageError: a constant that the file does not have, or that it computes from others.
+        UsageError: a constant is missing, or is computed from others.
         OutputError: the file cannot be written.
     """
     try:
@@ -234,12 +230,13 @@ def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str,
     mark = _MARK if content.startswith(_MARK) else b""
     with replacing(path) as stream:
         stream.write(mark + changed_file.source.encode("utf-8"))
+    # `replacing` makes a new file, which gets the mode of the old one
     path.chmod(mode)
     return tuple(changed)
 
 
 def plain_values(file: Specification) -> dict[str, float | str]:
-    """Return the constants of a specification that follow from no others, as they are given."""
+    """Return the values of the constants that are not computed from others."""
     return {
         name: constant_value(constant)
         for name, constant in file.constants.items()
@@ -248,5 +245,5 @@ def plain_values(file: Specification) -> dict[str, float | str]:
 
 
 def constant_value(constant: Constant) -> float | str:
-    """Return a constant as it is given: a number or, as a text, a duration."""
+    """Return the value of a constant: a number, or a duration as a text."""
     return constant.value if constant.duration_ns is None else format_duration(constant.duration_ns)

@@ -1,4 +1,4 @@
-"""The numbers of an annotated log as a table: a row for each sample, a column for each node and automaton."""
+"""The numbers of an annotated log as a table: one row per sample, one column per node and automaton."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 _LONGEST_TEXT: Final = 60
 """Characters of a node's text in a title."""
 _FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
-"""Beginnings of a cell that spreadsheets evaluate."""
+"""Beginnings of cells that spreadsheets evaluate: https://owasp.org/www-community/attacks/CSV_Injection."""
 _Result: TypeAlias = tuple[str, str | None]
 """Name and object of a result."""
 _Node: TypeAlias = tuple[_Result, int]
@@ -50,9 +50,9 @@ class TableRows:
 
     Attributes:
         times_ns: (T,) int64.
-        seconds: (T,), since the zero that the log names, or else the first row.
-        numbers: (T, nodes); NaN where a node has no number, or no sample.
-        states: for each automaton, the states that it may be in after each sample: "2", "1|2" or "".
+        seconds: (T,), since the zero in the log's metadata, or else since the first row.
+        numbers: (T, nodes); NaN where a node has no number or no sample.
+        states: possible states of each automaton after each sample: "2", "1|2" or "".
     """
 
     times_ns: Integers
@@ -72,11 +72,12 @@ def export_table(
     """Write the robustness in an annotated log as CSV or Parquet, by the output's ending.
 
     Returns:
-        The numbers of rows and of nodes, and what was lost while reading, each with its place.
+        The numbers of rows and of nodes, and the losses while reading, each with its place.
 
     Raises:
-        UsageError: another ending, Parquet without its library, or a log without robustness.
-        LogError: a damaged log of which no robustness is left.
+        UsageError: the ending is another one, the library for Parquet is missing, or the log has no
+            robustness.
+        LogError: the log is damaged, and no robustness is left.
         OutputError: the output cannot be written.
     """
     check_table_name(output)
@@ -95,7 +96,7 @@ def export_table(
 
 
 def check_table_name(output: Path) -> None:
-    """Raise UsageError if the ending of a file's name is that of no table."""
+    """Raise UsageError if a file's name does not have the ending of a table."""
     if output.suffix.lower() not in _WRITERS:
         raise UsageError(
             f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending gives the format"
@@ -103,11 +104,11 @@ def check_table_name(output: Path) -> None:
 
 
 def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple[str, ...]]]:
-    """Read the robustness of a log, block by block, with what was lost.
+    """Read the robustness of a log block by block, with losses.
 
     Raises:
-        UsageError: a log of a format that cannot have any.
-        LogError: a message that cannot be read.
+        UsageError: the format of the log has no robustness.
+        LogError: a message cannot be read.
     """
     if not isinstance(source, McapSource):
         raise UsageError(
@@ -122,10 +123,10 @@ def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple
 
 
 def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]:
-    """Return the titles of the columns of nodes and of automata; all differ.
+    """Return the distinct titles of the columns of nodes and of automata.
 
-    A node is called after the named specs on the way to it, `task/deliver`; one without a name of its own,
-    after the nearest of them and its text.
+    The title of a node lists the named specs on the path to it: `task/deliver`. A node without a name has the
+    title of the nearest named spec, followed by its own text.
     """
     nodes: dict[_Node, str | None] = {}
     faults: list[str] = []
@@ -164,7 +165,7 @@ def _result_title(result: _Result) -> str:
 
 
 def _claim_title(title: str, fallback: str, used_titles: set[str]) -> str:
-    """Return the first of a title and its alternatives that no column has, and take it."""
+    """Return a title, or an alternative if a column has it already, and mark it as used."""
     choices = chain(
         [title, f"{title} #{fallback.rpartition('#')[2]}", fallback], (f"{fallback} ({n})" for n in count(2))
     )
@@ -174,7 +175,7 @@ def _claim_title(title: str, fallback: str, used_titles: set[str]) -> str:
 
 
 def _trees(source: Source) -> Mapping[_Result, SpecificationResult]:
-    """Return the trees of the results, as far as the log's specification can be read."""
+    """Return the trees of the results in the readable specifications of the log."""
     trees: dict[_Result, SpecificationResult] = {}
     for payload in _payloads(source, SPECIFICATION):
         try:
@@ -202,7 +203,7 @@ def _paths(result: _Result, tree: SpecificationResult) -> Mapping[int, str]:
 
 
 def _payloads(source: Source, topic: str) -> Iterator[bytes]:
-    """Yield the payloads of a topic; what is damaged is reported with the robustness."""
+    """Yield the payloads of a topic. Damage is reported with the robustness."""
     if isinstance(source, McapSource):
         for payloads, _ in source.iter_payloads(topic):
             yield from payloads
@@ -304,7 +305,7 @@ def _parquet_writer(
     try:
         yield write
     finally:
-        # one that is left open would go on writing when it is collected, to a closed file
+        # an open writer would write to the closed file when it is garbage-collected
         try:
             writer.close()
         finally:

@@ -1,4 +1,4 @@
-"""Many logs replayed with one plan: short ones are measured together, and each gets results of its own."""
+"""Many logs replayed with one plan. Short logs are measured together, and each has its own results."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from spatial_replay.trace.trace import Trace
 
 _MOST_SAMPLES: Final = 2**12
 _MOST_BYTES: Final = 2**22
-"""In a log that is measured together with others."""
+"""Limits of a log that is measured together with others: samples and bytes."""
 _ENOUGH_SAMPLES: Final = 2**14
 _ENOUGH_BYTES: Final = 2**25
-"""In all logs that are measured together."""
+"""Limits of all logs that are measured together: samples and bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShortLog:
-    """A log that was read, with its account.
+    """A log in memory, with its account.
 
     Attributes:
-        zero_ns: the time that sentences count from.
-        samples: how many are evaluated, with those that fill pauses.
-        nbytes: their size.
+        zero_ns: zero of times in sentences.
+        samples: number of evaluated samples, with those that fill pauses.
+        nbytes: size of the samples, bytes.
     """
 
     selection: Selection
@@ -50,22 +50,22 @@ class ShortLog:
 class JointReplay:
     """Replays of the same specifications over many logs with the same units.
 
-    Results are those of `Replay` with the leaves kept, to the bit.
+    Results are equal to those of `Replay` with `keep_leaves`, to the bit.
 
     Attributes:
-        trees: every result, under the name it is reported by.
+        trees: all results, with their reported names.
     """
 
     def __init__(
         self, source: Source, files: Sequence[Specification], options: ReplayOptions = DEFAULT_OPTIONS
     ) -> None:
-        """Prepare.
+        """Prepare the specifications.
 
         Args:
-            source: a log, which says the units.
+            source: a log, whose units all logs have to share.
 
         Raises:
-            UsageError: see `can_join`; an operator that the semantics lacks.
+            UsageError: see `can_join`; or the semantics lack an operator.
         """
         self._selection = Selection(source, files, options)
         self._plan = ReplayPlan.of(self._selection)
@@ -73,14 +73,14 @@ class JointReplay:
         self._units = source.axes.units
 
     def fits(self, source: Source) -> bool:
-        """Return whether the units of a log are those of the others."""
+        """Return whether a log has the units of the others."""
         return source.axes.units == self._units
 
     def read(self, source: Source) -> ShortLog | None:
-        """Read a log; None if it is a long one.
+        """Read a log; None if it is too long.
 
         Raises:
-            LogError, UsageError: it cannot be read, or has no sample.
+            LogError, UsageError: the log cannot be read, or has no sample.
         """
         selection, account = self._selection.over(source), LogAccount(self._plan)
         ends = selection.run_ends()
@@ -140,7 +140,7 @@ class JointReplay:
 def can_join(files: Sequence[Specification], options: ReplayOptions) -> bool:
     """Return whether specifications can be measured over many logs at once.
 
-    Templates have instances of their own in each log, and terms that look back need the samples before.
+    Templates have different instances in each log, and terms that look back need earlier samples.
     """
     has_templates = any(spec.parameter is not None for file in files for spec in file.results)
     return options.window.is_whole and not has_templates and not look_before(files)

@@ -1,7 +1,7 @@
-"""Certificates: a log against what it is certified to be, first differences, and signatures.
+"""Certificates of logs: verification, first differences, and signatures.
 
-Signatures are detached, made and checked by ssh-keygen with keys that people have. The signed text is the
-recorded certificate, in the namespace "spatial-replay", so that no signature for another purpose fits.
+Signatures are detached. ssh-keygen makes and checks them with existing SSH keys. The signed text is the
+recorded certificate. The namespace "spatial-replay" rules out signatures for other purposes.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ LARGEST_SIGNATURE = 2**16
 _HEADING = "spatial-replay certificate 1"
 _PUBLIC_KEY = re.compile(r"(?:ssh|ecdsa|sk)-[\w@.-]+ [A-Za-z0-9+/]+=*(?: (?P<comment>.*))?$")
 _LONGEST_S = 120.0
-"""How long a passphrase or a touch of a hardware key is waited for."""
+"""Timeout for a passphrase or a touch of a hardware key, seconds."""
 
 
 def statement(certificate: Mapping[str, str]) -> bytes:
-    """Return the text that is signed: a certificate, one entry a line, in the order of names."""
+    """Return the signed text of a certificate: one entry per line, in the order of names."""
     return "\n".join(
         [_HEADING, *(f"{key} {value}" for key, value in sorted(certificate.items())), ""]
     ).encode()
@@ -82,7 +82,7 @@ def sign_certificate(certificate: Mapping[str, str], key: Path) -> bytes:
 
 
 def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) -> str | None:
-    """Return who of some signers signed a certificate; None if none of them did.
+    """Return the signer of a certificate among given signers; None if none of them signed it.
 
     Args:
         signers: public keys, one a line, as in id_ed25519.pub or authorized_keys, or an allowed_signers file
@@ -90,7 +90,7 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
 
     Raises:
         MissingFileError: one of the files is missing.
-        UsageError: the signers are none, or ssh-keygen is missing.
+        UsageError: the file has no signers, or ssh-keygen is missing.
     """
     for file in (signature, signers):
         _require(file)
@@ -109,7 +109,7 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
 
 
 def _allowed_signers(signers: Path) -> tuple[str, dict[str, str]]:
-    """Return an allowed_signers file, and names for the principals that bare keys get in it."""
+    """Return the text of an allowed_signers file, and names for its principals of bare keys."""
     try:
         lines = [line.strip() for line in signers.read_text().splitlines()]
     except UnicodeDecodeError:
@@ -160,7 +160,7 @@ _LONGEST_LINE = 80
 
 
 class FirstDifferences:
-    """Compares the messages of a log with those of a new evaluation, topic by topic, as they come."""
+    """Compares the messages of a log with those of a new evaluation, topic by topic."""
 
     def __init__(self, log: LogFile) -> None:
         self._reader = McapLog(log)
@@ -174,7 +174,7 @@ class FirstDifferences:
                 self._compare(topic, row.log_time_ns, row.payload)
 
     def finish(self) -> dict[str, Sentence]:
-        """Compare what the log has beyond the evaluation; return the first difference of each topic."""
+        """Check for messages that only the log has, and return the first difference of each topic."""
         for topic in (topic_of_log.name for topic_of_log in self._reader.topics()):
             is_compared = topic in self._recorded or topic not in DERIVED
             if topic not in self._found and is_compared:
@@ -205,7 +205,7 @@ class FirstDifferences:
 def explain_differences(
     recorded: Mapping[str, str], computed: Mapping[str, str], differences: Mapping[str, Sentence]
 ) -> list[Sentence]:
-    """Return for each part of a certificate whether it is the same, and where it differs first.
+    """Return a sentence on each part of a certificate: equal, or where it differs first.
 
     Args:
         differences: the first difference of each topic, in a clause; see `FirstDifferences`.
@@ -246,7 +246,7 @@ def explain_differences(
 
 
 def _difference(topic: str, now: bytes, then: bytes) -> str | None:
-    """Return how a message differs from the recorded one; None if it only is encoded in another way."""
+    """Return the difference of a message from the recorded one; None if only the encoding differs."""
     try:
         match topic:
             case "/spatial/objects":
@@ -257,7 +257,7 @@ def _difference(topic: str, now: bytes, then: bytes) -> str | None:
                 return _of_specifications(
                     SpecificationMessage.FromString(now), SpecificationMessage.FromString(then)
                 )
-    # what is recorded need not be a message of ours
+    # the recorded payload may be any bytes
     except ValueError:
         return "what is recorded cannot be decoded"
     return f"{len(now)} bytes now, {len(then)} recorded, of other content"
@@ -317,7 +317,7 @@ _HASHES: Mapping[str, str] = MappingProxyType(
         "doubts": "other doubts",
     }
 )
-"""The meaning of a difference, for each entry of a certificate."""
+"""The meaning of a difference, by entry of a certificate."""
 
 _NOT_COVERED = (
     "plan settings are not covered by this certificate; --decisions recomputes what followed from them"
@@ -332,14 +332,12 @@ class Verified:
     """A certificate as recorded, and as computed now.
 
     Attributes:
-        recorded: the log's certificate; empty where it has none.
-        computed: the one of the new evaluation.
-        faults: what could not be read.
-        explanation: for each part of the certificate whether it is the same, and where it differs first;
-            empty unless it was asked for.
-        lacks_plan: whether the log says that it was planned, and neither has settings nor was certified with
-            any.
-        notes: what the certificate does not cover, as sentences.
+        recorded: the log's certificate; empty if it has none.
+        computed: certificate of the new evaluation.
+        faults: losses while reading.
+        explanation: result of `explain_differences`; empty unless requested.
+        lacks_plan: whether the log was planned, but neither the log nor its certificate has plan settings.
+        notes: sentences on parts that the certificate does not cover.
     """
 
     recorded: Mapping[str, str]
@@ -358,7 +356,7 @@ class Verified:
             f"{what}: {self.computed.get(key, 'nothing')} now, {self.recorded.get(key, 'nothing')} recorded"
             for key, what in _HASHES.items()
             if self.recorded.get(key) != self.computed.get(key)
-            # certificates of before have no hash of the settings
+            # older certificates have no hash of the plan settings
             and not (key == PLAN_SHA256 and key not in self.recorded)
         ]
         return (*differences, *([_NO_PLAN] if self.lacks_plan else []))
@@ -374,12 +372,11 @@ def verify_certificate(
     """Evaluate a log, or its source, again with the log's own specifications and options.
 
     Args:
-        source: the log that it was made from; None evaluates the log itself.
+        source: the source of the log; None evaluates the log itself.
         advance: called with the number of samples of each block that is done.
-        explain: say where a certificate that differs does so first, which takes another evaluation.
+        explain: find the first differences, which takes another evaluation.
 
-    Raises:
-        UsageError, LogError, SpecificationError: it cannot be evaluated.
+        Raises: UsageError, LogError, SpecificationError: the log cannot be evaluated.
     """
     metadata = dict(log.metadata())
     recorded, about = metadata.get(CERTIFICATE, {}), metadata.get(METADATA, {})
@@ -392,7 +389,7 @@ def verify_certificate(
         )
     keep = None if source is None else _topics_of_copy(about, options)
     clip = metadata.get(CLIP_METADATA, {})
-    # a replay of a clip has its record, too: where the source is that clip, all of it counts
+    # a replay of a clip also has the clip's record; if the source is that clip, it is not cut again
     if source is not None and clip and dict(source.metadata()).get(CLIP_METADATA) != clip:
         source, keep = clipped_source(source, clip), None
     evaluated = log if source is None else source
@@ -407,7 +404,7 @@ def verify_certificate(
     computed = dict(replayed.certificate)
     plan = metadata.get(PLAN_METADATA)
     if not options.get("layer") and recorded.get(PLAN_SHA256) == computed.get(PLAN_SHA256):
-        # its source has those that were certified; the log's own copy of them counts, too
+        # the source has the certified settings, and the log's own copy of them is checked, too
         computed |= {} if plan is None else {PLAN_SHA256: plan_sha256(plan)}
         if plan is None:
             computed.pop(PLAN_SHA256, None)
@@ -433,7 +430,7 @@ def recorded_reading(log: Source, source: str) -> dict[str, Any]:
     """Return the options with which a log's source was read, such as the rate of its frames.
 
     Args:
-        source: the name of the file that is given as the source; no option applies to another one.
+        source: file name of the given source; options apply only to the recorded source.
     """
     about = dict(log.metadata()).get(METADATA, {})
     if about.get("source") != source:
@@ -465,7 +462,7 @@ def _options(about: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _topics_of_copy(about: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
-    """Return which messages of its source a log kept: none in a recording, all in a copy by default."""
+    """Return the topics of its source that a log kept: none in a recording, by default all in a copy."""
     if about.get("written_by") != "replay":
         return ()
     return None if options.get("layer") else tuple(options.get("keep", KEEP_ALL))
