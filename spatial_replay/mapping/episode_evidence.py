@@ -1,4 +1,4 @@
-"""Evidence against an episode of a data set: jumps of its objects, and the order of its quaternions."""
+"""Remarks on an episode of a data set: jumps of objects, and quaternions in the wrong order."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from spatial_replay.text import Instant, Sentence, number_text
 from spatial_replay.trace.trace import Trace
 
 _FAR: Final = 0.05
-"""Share of the scene's extent that an object crosses in a jump, at least."""
+"""Least length of a jump, as a share of the scene's extent."""
 _SUDDEN: Final = 20.0
-"""How many times longer a jump is than the steps before and after it."""
+"""Least ratio of a jump to the steps before and after it."""
 _GRAVITY: Final = 9.81
-"""Metres a second squared."""
+"""Standard gravity, metres per second squared."""
 
 
 def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     """Return a remark on the farthest jump of an object from one frame to the next; None without one.
 
-    An object that is thrown or pushed moves for several frames; one that jumps is at rest around its jump, or
-    moves much slower. Exchanged ranges of frames, and frames from before a reset, look like this.
+    An object that is thrown or pushed moves for several frames. An object that jumps is at rest, or much
+    slower, before and after the jump. Causes are exchanged ranges of frames, and frames from before a reset.
     """
     if len(trace) < 3 or not len(trace.footprints.radius):
         return None
@@ -34,7 +34,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     is_points = len(shapes.vertices) == len(shapes.part_start) - 1
     centres = shapes.vertices if is_points else extents(shapes)[0]
     places = np.column_stack([centres, shapes.bottom])
-    # (N, T, 3): the centre of each object, and its bottom
+    # (N, T, 3): x and y of each object's centre, and its bottom
     places = np.where((rows >= 0)[:, :, None], places[np.maximum(rows, 0)], np.nan)
     places[:, :, 2][np.isnan(places[:, :, 2])] = 0.0
     moves = np.diff(places, axis=1)
@@ -42,7 +42,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     around = np.zeros_like(steps)
     around[:, 1:] = steps[:, :-1]
     around[:, :-1] = np.fmax(around[:, :-1], steps[:, 1:])
-    # a body falls by half of this in one frame
+    # twice the fall of a body from rest within one frame
     fall = _GRAVITY * (np.diff(trace.times_ns) / 1e9) ** 2
     with np.errstate(invalid="ignore"):
         is_jump = (steps > _SUDDEN * around) & (steps > fall)
@@ -65,7 +65,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
 
 
 def order_remarks(objects: Iterable[BoundObject], columns: Columns) -> Iterator[str]:
-    """Yield remarks on quaternions without names that are upright only in the other order."""
+    """Yield remarks on unnamed quaternions that stand upright only in the other order."""
     for bound_object in objects:
         places = bound_object.quaternion
         if (

@@ -1,6 +1,7 @@
-"""Episodes of data sets as sources: the columns of an episode and a mapping in; a block of samples out.
+"""Episodes of data sets as sources: columns of an episode and a mapping in; a block of samples out.
 
-All frames of an episode, and of several short ones, become samples at once, by arrays.
+All frames of an episode become samples together, by operations on arrays. Several short episodes are read
+together.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ from spatial_replay.trace.trace import Trace, class_order, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 Report: TypeAlias = Callable[[str, int, str], None]
-"""Receives each object without a valid footprint: its name, its frame, and the text after its name."""
+"""Receiver of invalid footprints: name of the object, frame number, and the rest of the sentence."""
 
 
 class ReadEpisode(NamedTuple):
     """An episode in memory.
 
     Attributes:
-        faults: about frames that are lost, and objects without a valid footprint.
+        faults: sentences on lost frames and invalid footprints.
     """
 
     columns: EpisodeColumns
@@ -58,9 +59,9 @@ class EpisodeSource(Source):
     """An episode of a data set, with a mapping from its features to objects.
 
     Attributes:
-        number: of the episode.
-        mapped_by: None for a data set that names its bodies.
-        episode: what was read before; None to read it from the data set.
+        number: number of the episode.
+        mapped_by: its mapping; None for a data set that names its bodies.
+        episode: content that was read in advance; None to read it from the data set.
     """
 
     data_set: DataSet
@@ -81,7 +82,7 @@ class EpisodeSource(Source):
 
     @property
     def axes(self) -> Axes:
-        """Axes of the features; samples are always y-up."""
+        """Axes of the features; samples always have y up."""
         return OUR_AXES if self.mapped_by is None else self.mapped_by.axes
 
     @property
@@ -100,7 +101,7 @@ class EpisodeSource(Source):
         return gap_ns(self.reading.max_gap) or mapped_ns
 
     def columns(self) -> EpisodeColumns:
-        """Return the episode as arrays: the features of the mapping, the bodies, the label.
+        """Return the episode as arrays: features of the mapping, bodies, and label.
 
         Raises:
             UsageError: the mapping does not fit the data set.
@@ -113,7 +114,7 @@ class EpisodeSource(Source):
 
     @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """See `Source.iter_blocks`; also raises LogError for an episode that is not judged."""
+        """See `Source.iter_blocks`; also raises LogError for an episode that cannot have a verdict."""
         columns, trace, faults = self.episode or self._read()
         if not len(trace):
             raise LogError(f"{self.name} has no frame")
@@ -136,7 +137,7 @@ class EpisodeSource(Source):
         yield Block(trace, remarks=tuple(remarks))
 
     def _point_remarks(self, columns: EpisodeColumns) -> Iterator[str]:
-        """Yield a remark on bodies of which neither the data set nor the mapping says the shape."""
+        """Yield a remark on bodies without a shape in the data set and in the mapping."""
         shapes = {} if self.mapped_by is None else self.mapped_by.shapes
         names = [body.name for body in columns.bodies if body.shapes is None and body.name not in shapes]
         if names:
@@ -147,11 +148,11 @@ class EpisodeSource(Source):
             )
 
     def _read(self) -> ReadEpisode:
-        """Read the episode, in which each frame is a sample.
+        """Read the episode as a trace with one sample per frame.
 
         Raises:
-            UsageError: the mapping does not fit the numbers, or names a body again.
-            LogError: the files of the data set lack a feature, or the episode is not judged.
+            UsageError: the mapping does not fit the numbers, or one of its objects has the name of a body.
+            LogError: the files of the data set lack a feature, or the episode cannot have a verdict.
         """
         columns, faults = self.columns(), FaultList()
         if columns.unjudged:
@@ -166,7 +167,7 @@ class EpisodeSource(Source):
         """Return the observations and signals of T frames.
 
         Raises:
-            UsageError: the mapping does not fit the numbers, or names a body again.
+            UsageError: the mapping does not fit the numbers, or one of its objects has the name of a body.
             LogError: the files of the data set lack a feature.
         """
         mapping, count = self.mapped_by, len(columns.times_ns)
@@ -178,7 +179,7 @@ class EpisodeSource(Source):
                 " model; leave it out"
             )
         class_of = {bound_object.name: bound_object.class_name for bound_object in features.objects}
-        # features contain NaN and infinity; they make objects unknown, without warnings
+        # NaN and infinity in features are no reason for NumPy's warnings: they make objects unknown
         with np.errstate(all="ignore"):
             detections = {
                 bound_object.name: bound_object.detections(
@@ -221,10 +222,10 @@ class EpisodeSource(Source):
         count: int,
         report: Report,
     ) -> tuple[list[str], ObservationRows]:
-        """Return all names and, for one after the other, the observations of all frames.
+        """Return the names of objects, and their observations in all frames, object by object.
 
-        Objects are checked together, since each check costs as much for few as for many. Frames without a
-        valid footprint are faults.
+        Objects are checked together, because a check of few rows costs as much as one of many. Frames
+        without a valid footprint are faults.
         """
         names, parts = list(rows_by_name), list(rows_by_name.values())
         for has_height in (False, True):
@@ -254,10 +255,10 @@ class _Frames(NamedTuple):
     """The observations and signals of T frames.
 
     Attributes:
-        names: of N objects.
-        rows: (N * T,), those of one object after those of the other.
-        signals: each (T,).
-        class_of: the class of each object, by name.
+        names: names of N objects.
+        rows: (N * T,) observations, object by object.
+        signals: numbers (T,) of each signal, by name.
+        class_of: class of each object, by name.
     """
 
     names: Sequence[str]
@@ -297,13 +298,13 @@ class _Frames(NamedTuple):
 
 
 _MOST_FRAMES: Final = 2**15
-"""Frames that are read together: they bound its memory."""
+"""Frames at most that are read together, which bounds the memory."""
 
 
 def read_together(sources: Sequence[Source]) -> list[Source]:
-    """Return the same sources, of which episodes of one data set with one mapping are read, all at once.
+    """Return the same sources after reading episodes of one data set with one mapping together.
 
-    An episode that cannot be read stays as it is: its own reader raises the error.
+    An episode that cannot be read stays unread, so that iterating over its blocks raises the error.
     """
     read: list[Source] = []
     for is_episode, group in groupby(sources, lambda source: isinstance(source, EpisodeSource)):
@@ -319,11 +320,11 @@ def read_together(sources: Sequence[Source]) -> list[Source]:
 
 
 def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
-    """Yield the episodes of one data set with one mapping, read together as far as they are alike."""
+    """Yield episodes of one data set with one mapping; those with features of equal shapes are read."""
     columns_by_place: dict[int, EpisodeColumns] = {}
     frames = 0
     for place, source in enumerate(sources if sources[0].mapped_by is not None else ()):
-        # any error: one episode must not end the reading of the others
+        # any error, because one episode must not end the reading of the others
         with suppress(Exception):
             columns = source.columns()
             frames += len(columns.times_ns)
@@ -346,14 +347,14 @@ def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
 
 
 def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
-    """Return the numbers a frame of each feature; None for columns that are not joined with others."""
+    """Return the shape of a frame of each feature; None for columns that cannot be joined with others."""
     if columns.bodies or any(len(values) != len(columns.times_ns) for values in columns.features.values()):
         return None
     return tuple(sorted((name, values.shape[1:]) for name, values in columns.features.items()))
 
 
 def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:
-    """Return episodes whose features have the same shapes."""
+    """Read episodes whose features have equal shapes, together."""
     starts = [0, *accumulate(len(columns.times_ns) for _, columns in parts)]
     features = {
         name: np.concatenate([columns.features[name] for _, columns in parts])
@@ -390,7 +391,7 @@ def _bind(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
 
 
 def _rows_of_body(body: Body, axes: Axes) -> ObservationRows:
-    """Return the footprints of a body that a data set names, as they are."""
+    """Return the observations of a body that a data set names, with its own shapes or as a point."""
     count = len(body.positions)
     is_valid: Booleans = np.asarray(np.isfinite(body.positions).all(axis=1))
     yaw: Floats = np.full(count, np.nan)

@@ -1,4 +1,4 @@
-"""Facts of how each mapped topic was read: its evidence in, frozen values for readers out."""
+"""Facts of each mapped topic: its evidence in, frozen values for users out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from spatial_replay.trace.facts import Distribution, TopicFacts
 
 
 def facts_of(evidence: TopicEvidence) -> TopicFacts:
-    """Return the facts of a topic whose messages have all been measured."""
+    """Return the facts of a topic after all of its messages have been measured."""
     arrivals, motions, planned = evidence.arrivals, evidence.motions, evidence.planned
     extractor = evidence.reader.extractor
     classes = {evidence.classes.by_code[code] for code in evidence.class_codes}

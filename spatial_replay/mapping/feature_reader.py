@@ -34,13 +34,18 @@ from spatial_replay.text import listing, nearest_hint, number_text, plural
 _SLICE: Final = re.compile(r"(.*)\[(?:(-?\d{1,9})|(-?\d{1,9})?:(-?\d{1,9})?)\]", re.DOTALL)
 _NAME_ENDS: Final = re.compile(r"[./]")
 _LENGTH_ERROR: Final = 0.01
-"""By how much the length of a quaternion may differ from 1."""
+"""Largest error of a quaternion's length."""
 
 Columns: TypeAlias = Mapping[str, Floats]
 
 
 class NumberPlace(NamedTuple):
-    """One number of a feature: of the row of each frame."""
+    """Place of a number in the rows of a feature.
+
+    Attributes:
+        number: column of the number.
+        name: its name, for errors.
+    """
 
     feature: str
     number: int
@@ -52,9 +57,9 @@ class BoundObject:
     """An object of a mapping's entry, with the places of its numbers.
 
     Attributes:
-        key: of the entry, for errors.
-        places: of each column of `binding`.
-        quaternion: the places of its orientation, x, y, z and w; () without one.
+        key: key of the entry, for errors.
+        places: place of each column of `binding`.
+        quaternion: places of x, y, z and w of its orientation; () without one.
     """
 
     name: str
@@ -66,10 +71,10 @@ class BoundObject:
     quaternion: tuple[NumberPlace, ...] = ()
 
     def detections(self, columns: Columns, times: int, mapping_name: str, episode: str) -> Detections:
-        """Return the object in each of T frames; its name and class are codes of 0.
+        """Return the object in each of T frames; its name and class have the code 0.
 
         Raises:
-            UsageError: the four numbers of its orientation are no quaternion.
+            UsageError: the four numbers of its orientation are not a quaternion.
             LogError: the files of the data set lack a feature.
         """
         numbers = np.empty((times, self.binding.width))
@@ -80,13 +85,13 @@ class BoundObject:
         if self.quaternion:
             quaternions = numbers[:, list(self.binding.orientation)]
             self._check_quaternions(quaternions, mapping_name, episode)
-            # an object with a shape of no direction would be in place, and without an orientation
+            # otherwise a disc would keep its place, and only lose its orientation
             numbers[~np.isfinite(quaternions).all(axis=1)] = nan
         return detections_of(self.layout, self.binding, numbers)
 
     def _check_quaternions(self, quaternions: Floats, mapping_name: str, episode: str) -> None:
         length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
-        # one of zeros was never set, and a number that is not finite makes the object unknown
+        # zeros mean an orientation that was not set; NaN and infinity make the object unknown
         is_off = np.isfinite(length) & (length > 0) & (np.abs(length - 1) > _LENGTH_ERROR)
         if not is_off.any():
             return
@@ -110,7 +115,7 @@ class BoundSignal(NamedTuple):
     invalid: tuple[float, ...]
 
     def values(self, columns: Columns, times: int, episode: str) -> Floats:
-        """Return its value in each of T frames (T,)."""
+        """Return the signal's value in each of T frames (T,)."""
         values = column_of(columns, self.place, times, episode)
         if self.invalid:
             return np.where(np.isin(values, with_single_precision(self.invalid)), nan, values)
@@ -132,7 +137,7 @@ class FeatureReading:
 
     @cached_property
     def features(self) -> tuple[str, ...]:
-        """The features that it reads."""
+        """Names of the features to read."""
         places = [place for bound_object in self.objects for place in bound_object.places]
         places += [signal.place for signal in self.signals]
         return tuple(dict.fromkeys(place.feature for place in places))
@@ -237,7 +242,7 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
 
 
 def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> Detections:
-    """Return one object in T frames, from its numbers (T, W)."""
+    """Return the detections of one object in T frames, from its numbers (T, W)."""
     count = len(numbers)
     poses, no_codes = poses_from_numbers(layout, binding, numbers), np.zeros(count, np.int64)
     detections = Detections(
@@ -254,7 +259,7 @@ def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> D
 
 
 def join_objects(objects: Sequence[Detections]) -> Detections:
-    """Join detections of several objects, each in all frames; either all have a height or none."""
+    """Join detections of several objects, each in all frames; heights exist for all objects or for none."""
     if len(objects) == 1:
         return objects[0]
     solids, counts = (
@@ -284,10 +289,10 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
 
 
 def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
-    """Return a body that a data set names, in T frames, with the footprint of a mapping.
+    """Return the detections of a body that a data set names, in T frames, with a shape of the mapping.
 
     Raises:
-        UsageError: the shape has sizes that only a feature could give.
+        UsageError: a size of the shape is a field, which a body does not have.
     """
     measures = (*shape.sizes, *(shape.height or ()))
     if shape.outline or any(isinstance(measure, str) for measure in measures):
@@ -306,10 +311,12 @@ def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
 
 
 def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) -> Floats:
-    """Return the numbers at a place in each of T frames (T,); NaN where the last state has no action.
+    """Return the numbers at a place in each of T frames (T,); NaN in the last frame for actions.
+
+    Data sets have one action less than states, because no action follows the last state.
 
     Raises:
-        LogError: the files of the data set lack the feature, or have fewer numbers of it.
+        LogError: the files of the data set lack the feature, or have another number of rows or columns.
     """
     values = columns.get(place.feature)
     if values is None:
@@ -327,7 +334,7 @@ def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) ->
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Finds the places of an entry: in its feature, or in another one that they name."""
+    """Resolver of the places in an entry, which may name places of other features."""
 
     data_set: DataSet
     feature: Feature
@@ -336,10 +343,10 @@ class _Places:
     def several(
         self, key: str, texts: str | tuple[str, ...], counts: tuple[int, ...]
     ) -> tuple[NumberPlace, ...]:
-        """Return the places that texts name.
+        """Return the places in some texts.
 
         Raises:
-            UsageError: there are none, or another number of them than one of `counts`.
+            UsageError: a text names no place, or the number of places is not in `counts`.
         """
         parts = (texts,) if isinstance(texts, str) else texts
         places = tuple(place for text in parts for place in self._places(key, text))
@@ -352,10 +359,10 @@ class _Places:
         return places
 
     def single(self, key: str, text: str) -> NumberPlace:
-        """Return the only place that a text names.
+        """Return the single place in a text.
 
         Raises:
-            UsageError: there is none, or several.
+            UsageError: the text names no place, or several.
         """
         (place,) = self.several(key, text, (1,))
         return place

@@ -1,6 +1,6 @@
 """Suggest a mapping for a data set: names of features and numbers of some frames in; YAML with comments out.
 
-Names say where a position is. Numbers decide the order of a quaternion, and whether it is one.
+Names of features and places identify positions. Numbers identify unit quaternions and their order.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _NO_OBJECTS: Final = re.compile(
     r"(.*[./])?(actions?\b.*|rewards?|timestamps?|time|truncat\w*|terminat\w*|is_success|success|done)"
     r"|next\..*|(frame_|episode_|task_|subtask_)?index|observation\.images?\b.*"
 )
-"""Features without objects: actions, rewards, labels, times, numbers of rows, pictures."""
+"""Features without objects: actions, rewards, labels, times, row numbers, images."""
 _STATES_OF_BODIES: Final = ("states/", "env_states/")
-"""Groups of the bodies that a data set names."""
+"""Prefixes of features whose bodies the data set names itself."""
 _JOINTS: Final = re.compile(
     r"joint|shoulder|elbow|wrist|waist|forearm|upperarm|hip|knee|ankle|finger|thumb|gripper|torso|neck"
     r"|\bhead_(pan|tilt)|qvel|velocity|effort|torque|current",
     re.IGNORECASE,
 )
-"""Names of numbers that are a robot's joints, not a place."""
+"""Names of numbers that belong to a robot's joints instead of a position."""
 _NO_POINT: Final = re.compile(
     r"vel|acc|force|torque|twist|delta|linear|angular|rot|rpy|euler|axis|joint|image|_to_", re.IGNORECASE
 )
@@ -45,24 +45,25 @@ _PART: Final = re.compile(
 _POINT: Final = re.compile(r"(?P<stem>.*?)_?(?P<what>pos|position|xyz|xpos|goal)", re.IGNORECASE)
 _POSE: Final = re.compile(r"(?P<stem>.*?)_?pose", re.IGNORECASE)
 HANDS: Final = re.compile(r"eef|\bee\b|tcp|hand|grip|tool|robot|flange", re.IGNORECASE)
-"""Names of parts of robots, which need not stand upright."""
+"""Names of robot parts, which need not stand upright."""
 _LENGTH_ERROR: Final = 0.01
+"""Largest error of a quaternion's length."""
 _EXACT: Final = 1e-4
-"""A quaternion of a simulator is so close to length 1."""
+"""Largest error of the length of a simulator's quaternion."""
 _IN_PLANE: Final = ("[0:2]", "x", "y")
 _MOST_SIGNALS: Final = 20
 _MOST_EPISODES: Final = 8
-"""Episodes whose numbers are looked at."""
+"""Episodes at most whose numbers are read."""
 
 
 class Suggestion(NamedTuple):
     """An object in a feature.
 
     Attributes:
-        position, orientation: places, or one text for all; () for none.
-        order: of the numbers of the orientation.
-        signals: other numbers of the feature.
-        remark: what a reader has to check or decide.
+        position, orientation: one place per number, or one text for all numbers; () without one.
+        order: order of a quaternion's numbers, "xyzw" or "wxyz"; "" if undecided.
+        signals: places of other numbers of the feature.
+        remark: note on a point that the user has to check or decide.
     """
 
     feature: str
@@ -80,7 +81,10 @@ class Suggestion(NamedTuple):
 
 
 def mappable_features(data_set: DataSet) -> list[Feature]:
-    """Return the features that may hold objects, by name: no actions, rewards, labels, times or pictures."""
+    """Return the features that may hold objects, sorted by name.
+
+    Names exclude actions, rewards, labels, times and images.
+    """
     label = None if data_set.label is None else data_set.label.field
     return sorted(
         feature
@@ -93,7 +97,7 @@ def mappable_features(data_set: DataSet) -> list[Feature]:
 
 
 def why_poseless(data_set: DataSet) -> str:
-    """Return why no mapping can find objects in a data set; "" if one may."""
+    """Return the reason why no mapping can find objects in a data set; "" without one."""
     features = mappable_features(data_set)
     joints = [feature for feature in features if _holds_joints(feature)]
     if data_set.names_bodies or len(joints) < len(features):
@@ -148,12 +152,12 @@ def suggest_feature_mapping(data_set: DataSet) -> str:
 
 
 def places_text(feature: Feature) -> str:
-    """Return the names of a feature's places, or how many numbers it has."""
+    """Return the names of a feature's places, or the count of its numbers."""
     return " ".join(feature.places) or f"{plural(feature.width, 'number')} without names"
 
 
 def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) -> list[Suggestion]:
-    """Return the objects that names of features and of their places point to.
+    """Return the objects that the names of features and places suggest.
 
     Args:
         columns: numbers (T, W) of some frames by feature.
@@ -168,7 +172,7 @@ def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) 
         else:
             objects = _whole_feature(feature, features, columns)
         for suggestion in objects:
-            # an observation and a state may have the same object
+            # an observation and a state may hold the same object
             suggestions.setdefault(suggestion.name, suggestion)
     return list(suggestions.values())
 
@@ -176,7 +180,7 @@ def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) 
 def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, Floats], list[Body]]:
     """Return the numbers of some episodes by feature, and the bodies of the first one."""
     names = [feature.name for feature in features]
-    # times do not matter here
+    # any rate will do, because only the numbers are read
     reading = AS_STORED._replace(fps=data_set.fps or 1.0)
     rows: dict[str, list[Floats]] = {name: [] for name in names}
     bodies: list[Body] = []
@@ -184,7 +188,7 @@ def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, 
         try:
             columns = data_set.columns(episode.number, reading, names)
         except UsageError:
-            # the mapping has to say something first, such as an order
+            # the data set cannot be read without keys of a mapping, such as `order`
             break
         bodies += columns.bodies if number == 0 else ()
         for name, values in columns.features.items():
@@ -195,7 +199,7 @@ def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, 
 def _without_bodies(
     suggestions: Sequence[Suggestion], columns: Mapping[str, Floats], bodies: Sequence[Body]
 ) -> tuple[list[Suggestion], dict[str, str]]:
-    """Return the suggestions that are not bodies of the data set, and the bodies that the others are."""
+    """Return the suggestions that are not bodies of the data set; by feature, the bodies of the others."""
     twins: dict[str, str] = {}
     for suggestion in suggestions:
         for body in bodies:
@@ -209,7 +213,7 @@ def _without_bodies(
 
 
 def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
-    """Yield the objects whose coordinates have names, such as `puck_x`."""
+    """Yield objects whose coordinates have names, such as `puck_x`."""
     points: dict[str, dict[str, str]] = {}
     turns: dict[str, dict[str, str]] = {}
     for place in feature.places:
@@ -240,7 +244,7 @@ def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Sugg
 def _whole_feature(
     feature: Feature, features: Sequence[Feature], columns: Mapping[str, Floats]
 ) -> Iterator[Suggestion]:
-    """Yield the object of a feature that is called a position or a pose, such as `obj_pos`."""
+    """Yield the object of a feature with the name of a position or a pose, such as `obj_pos`."""
     parent, last = (["", *re.split(r"[./]", feature.name)])[-2:]
     point, pose = _POINT.fullmatch(last), _POSE.fullmatch(last)
     values = columns.get(feature.name)
@@ -258,7 +262,10 @@ def _whole_feature(
 
 
 def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
-    """Yield the bodies that move freely in a state of MuJoCo: a place and a unit quaternion (w x y z)."""
+    """Yield the bodies with a free joint in a state of MuJoCo.
+
+    A free joint has seven numbers: a position and a unit quaternion (w x y z).
+    """
     if values is None or not len(values):
         return
     width = values.shape[1]
@@ -284,7 +291,7 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
 def _with_orientation(
     suggestion: Suggestion, places: tuple[str, ...], quaternions: Floats | None, order: str = ""
 ) -> Suggestion:
-    """Return a suggestion with an orientation, or with a remark that says why it has none."""
+    """Return a suggestion with an orientation, or with a remark why it has none."""
     text = places[0] if len(places) == 1 else f"[{', '.join(places)}]"
     undecided = f"orientation: {text} needs `order: wxyz` or `order: xyzw`; the numbers do not show which"
     if quaternions is None:
