@@ -1,13 +1,13 @@
 """Assemble samples: the messages of one log in, traces out.
 
-A message runs through these stages:
+A message passes these stages:
 
 - assemble: raw messages of all topics → `PendingMessages` of each topic, transforms in a `FrameTree`
 - topic_reader: pending messages of one topic → `TopicColumns`: signals, and objects by bound field paths
 - detections: objects → `Detections`: poses and solids in columns
 - tracker: detections → observations in the fixed frame, `Events` over time, and a `Trace` of samples
 
-Messages wait in the first stage until none that is earlier can arrive.
+Messages wait in the first stage until no earlier message can arrive.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
+"""Messages before the first trace; few, so that the first sample is early. Later steps double."""
 _LONGEST_STEP: Final = 8_192
-"""Messages between two traces: few at first, so that the first sample comes out early."""
+"""Messages between two traces at most."""
 
 _STEP_BYTES: Final = 2**23
-"""Bytes of messages between two traces, if that is fewer messages."""
+"""Size of messages between two traces at most, bytes."""
 
 _MOST_STEPS = 100_000
-"""Samples between two messages; more are not a pause, but a clock that jumped."""
+"""Samples between two messages at most; more show a jump of the clock instead of a pause."""
 
 _ANOTHER_CLOCK_NS: Final = 366 * 86_400 * 10**9
-"""No clock jumps back so far: one counts from a start, such as that of a simulation, and one from 1970."""
+"""Jump back that shows two clocks, such as simulated time from 0 and time since 1970, nanoseconds."""
 
 _MOST_AT_ONCE = 1_000_000
-"""Samples between the messages of one step: all are in memory at once."""
+"""Samples at most between the messages of one step, all of which are in memory together."""
 
 
 class _Assembling:
-    """Assembles samples from messages, of a log or of a system that runs.
+    """Assembler of samples from the messages of a log or of a running system.
 
     Args:
-        name: of the log, for errors and remarks.
-        decoder: returns the decoder of a topic.
-        start_ns, end_ns: only samples from `start_ns` up to, not including, `end_ns` come out. Messages
-            before and after the window may be added, and count.
-        on_time_jump: whether a log whose time jumps back by more than the plan's `late_ns` is refused, or
-            ends there.
+        name: name of the log, for errors and remarks.
+        decoder: function from a topic to its decoder.
+        start_ns, end_ns: window of the samples, without its end. Messages outside the window may be added and
+            affect the samples.
+        on_time_jump: effect of a jump back by more than the plan's `late_ns`: an error or the end of the log.
     """
 
     _is_live = False
@@ -89,7 +89,7 @@ class _Assembling:
         self._on_time_jump = on_time_jump
         self._faults = FaultKinds() if self._is_live else FaultList()
         for topic, reason in plan.lost:
-            # some reasons start with the topic already
+            # some reasons begin with the topic
             what = reason.removeprefix(f"topic {topic!r}: ")
             self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {what}")
         self._remarks = Remarks(name, plan.mapping)
@@ -130,11 +130,11 @@ class _Assembling:
         self._recorded = 0
         self._channel_by_topic: dict[str, int] = {}
         self.jump: Sentence | None = None
-        """Where time jumped back so far that the log is taken to end there."""
+        """Jump of time that ended the log; None without one."""
 
     @property
     def is_finished(self) -> bool:
-        """Whether no further message counts: after a jump that splits the log, or past the window."""
+        """Whether later messages are ignored: after a jump that ended the log, or after the window."""
         return self.jump is not None or self._settled_ns >= self._window_ns[1] - 1
 
     def _add_transforms(self, reader: TopicReader, clock_ns: int | None, log_ns: int, message: Any) -> None:
@@ -147,10 +147,10 @@ class _Assembling:
             self._add_fault(reader.name, log_ns, f"its transforms cannot be read: {error}")
 
     def finish(self) -> Trace:
-        """End the log; return the remaining samples.
+        """End the log and return the remaining samples.
 
         Raises:
-            UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
+            UsageError: the mapping fits no message of a topic, or the log lacks the fixed frame.
         """
         trace = self._settle(max(self._newest_ns, self._latest_ns), is_last=True)
         if not self._is_live:
@@ -161,7 +161,7 @@ class _Assembling:
             self._remarks.add(text)
         for text in self._tree.remarks():
             self._remarks.add(text)
-        # of a system that runs, there is no log to cut
+        # a running system has no log that the user could cut
         if self.jump is not None and not self._is_live:
             what_follows = ": the log is taken to end there; cut it to evaluate what comes after"
             self._remarks.add(Sentence(self.jump, what_follows))
@@ -195,7 +195,7 @@ class _Assembling:
         return trace
 
     def _check_fixed_frame(self) -> None:
-        """Raise UsageError if a whole log has frames, but not the fixed one."""
+        """Raise UsageError if a whole log has frames, but lacks the fixed frame."""
         mapping = self._plan.mapping
         is_whole = not self._is_live and self._window_ns == (0, FOREVER) and self.jump is None
         if mapping.fixed_frame is None or not is_whole or self._plan.lost:
@@ -214,31 +214,30 @@ class _Assembling:
             )
 
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return what was lost since the last call, each with its place."""
+        """Return the losses since the last call, each with its place."""
         return self._faults.take(last=last or self._settled_ns == LATEST_NS)
 
     def find_doubts(self) -> tuple[Doubt, ...]:
-        """Return the assumptions that the messages so far contradict, and the mapping does not accept."""
+        """Return the assumptions that messages so far contradict and the mapping does not accept."""
         doubts = contradictions(self._tracker.evidence, self._plan.mapping)
         return tuple(doubt for doubt in doubts if isinstance(doubt, Doubt) and not doubt.is_accepted)
 
     def take_doubts(self) -> tuple[Doubt, ...]:
-        """Return the assumptions that the log contradicts; none before `finish`."""
+        """Return the assumptions that the log contradicts; () before `finish`."""
         doubts, self._doubts = tuple(self._doubts), []
         return doubts
 
     @property
     def facts(self) -> tuple[TopicFacts, ...]:
-        """How each mapped topic was read, once all of it is."""
+        """Facts of each mapped topic; complete after `finish`."""
         return tuple(map(facts_of, self._tracker.evidence.values()))
 
     def take_remarks(self) -> tuple[str, ...]:
-        """Return counts of stale objects and missing transforms; none before `finish`, when they are
-        complete."""
+        """Return remarks on stale objects, missing transforms and pauses; () before `finish`."""
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
     def _add_step(self, arrived: MessageColumns) -> None:
-        """Distribute messages: transforms to the frame tree, all others to the readers of their topics."""
+        """Pass messages with transforms to the frame tree, and others to the readers of their topics."""
         topics = arrived.topics
         numbers = map(self._number_of_topic.get, topics, repeat(-1))
         number_of_message = np.fromiter(numbers, np.int64, len(arrived))
@@ -258,10 +257,10 @@ class _Assembling:
             self._put(batch.before(end), arrived)
 
     def _of_publisher(self, planned: PlannedTopic, places: Integers, arrived: MessageColumns) -> Integers:
-        """Return the places of messages whose publisher the mapping takes.
+        """Return the places of messages from the publisher that the mapping selects.
 
         Raises:
-            UsageError: the topic has no such publisher.
+            UsageError: the topic lacks this publisher.
         """
         number = None if planned.mapping is None else planned.mapping.publisher
         if number is None:
@@ -278,7 +277,10 @@ class _Assembling:
         return of_publisher
 
     def _stamp(self, reader: TopicReader, places: Integers, arrived: MessageColumns) -> _Stamped:
-        """Return the messages of one topic with their times on its clock, decoded if the clock needs that."""
+        """Return the messages of one topic with their times on its clock.
+
+        They are decoded if the reader `decodes_on_arrival`, as for stamps and transforms.
+        """
         contents: list[Any] = [arrived.payloads[place] for place in places.tolist()]
         clock = reader.planned.clock
         times_ns = (arrived.publish_time_ns if clock == "publish" else arrived.log_time_ns)[places]
@@ -296,10 +298,10 @@ class _Assembling:
         return _Stamped(reader, places, times_ns, contents)
 
     def _advance_time(self, stamped: list[_Stamped], arrived: MessageColumns) -> int:
-        """Update how far the log has come; return the number of messages before a jump that splits it.
+        """Update the newest time of the log; return the number of messages before a jump that ends the log.
 
         Raises:
-            LogError: time jumps back, and jumps do not split the log.
+            LogError: time jumps back, and a jump does not end the log.
         """
         moving = [batch for batch in stamped if batch.reader.advances_time]
         none = np.empty(0, np.int64)
@@ -356,28 +358,30 @@ class _Assembling:
     def _counting(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
     ) -> tuple[Integers, Booleans]:
-        """Return from when on messages count, and which of them count at all."""
-        # samples up to here are out already: a late message counts from now on
+        """Return the times from which messages are valid, and whether each message is used."""
+        # a late message is valid after the samples that are final
         return np.maximum(times_ns, self._settled_ns + 1), np.ones(len(times_ns), np.bool_)
 
     def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
-        """Return the samples up to a time; messages before it that come later count from then on.
+        """Return the final samples up to a time.
+
+        A message from before that time which arrives later is valid only after it.
 
         Args:
-            is_last: whether the log ends here, so that nothing waits.
+            is_last: whether the log ends here, so that no message waits.
 
         Raises:
-            LogError, UsageError: as `Assembler.add`.
+            LogError, UsageError: see `Assembler.add`.
         """
         newest_ns = max(self._newest_ns, self._latest_ns)
-        # while a system runs, messages from before its newest one may still come
+        # in a running system, messages older than the newest one may still arrive
         known_ns = upto_ns if self._is_live or is_last else newest_ns - self._plan.late_ns
         upto_ns = self._silences.limit(upto_ns, known_ns, is_last=is_last)
         if upto_ns <= self._settled_ns:
             return Trace.empty()
         start_ns, end_ns = self._window_ns
         start_ns = max(start_ns, self._settled_ns + 1)
-        # logs contain NaN and infinity; they make objects unknown, without warnings
+        # NaN and infinity in logs are no reason for NumPy's warnings: they make objects unknown
         with np.errstate(all="ignore"):
             sampled_ns, others_ns = self._tracker.advance(upto_ns)
             others_ns = self._silences.sampled_in(others_ns)
@@ -387,7 +391,7 @@ class _Assembling:
             trace = self._tracker.trace(times_ns, newest_ns)
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
-        # looking through all transforms takes longer than a sample
+        # rarely, because a search through all transforms takes longer than a sample
         if upto_ns - self._forgot_ns > DISORDER_NS:
             self._tree.forget_before(upto_ns - HISTORY_NS)
             self._forgot_ns = upto_ns
@@ -403,7 +407,7 @@ class _Assembling:
         log_ns, publish_ns, sequence = (np.array(column, np.int64) for column in numbers)
         place = self._recorded + np.arange(len(messages))
         self._recorded += len(messages)
-        # a topic keeps its number, since another one is another publisher
+        # a topic keeps its channel number between calls, because a new number would be another publisher
         codes = self._channel_by_topic
         channels = {
             codes.setdefault(topic, len(codes)): Channel(topic, "", None) for topic in dict.fromkeys(topics)
@@ -416,13 +420,13 @@ class _Assembling:
 
 
 class Assembler(_Assembling):
-    """Assembles the samples of one log from its messages; for the other arguments see `_Assembling`.
+    """Assembler of the samples of one log; for the other arguments see `_Assembling`.
 
-    Add thousands of messages at once, because it works on columns. The samples do not depend on how the
-    messages are divided.
+    Add thousands of messages per call, because it works on columns. The samples do not depend on the division
+    into calls.
 
     Args:
-        goes_on: says whether the log has messages after the last one that is added; without it, it has none.
+        goes_on: returns whether the log has messages after the last one that is added; by default, no.
     """
 
     _step, _count, _bytes = _FIRST_STEP, 0, 0
@@ -439,20 +443,20 @@ class Assembler(_Assembling):
         self._silences.goes_on = goes_on
 
     def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
-        """Note the times of the first messages of the log, where reading begins after them.
+        """Note the times of the log's first messages, for a window that begins after them.
 
         Args:
-            sampled_ns: of the sampled topic, if that one is not read.
-            others_ns: of the topics that are sampled before it begins.
+            sampled_ns: time of the first message of the sampled topic; None if that message will be added.
+            others_ns: time of the first message of the fallback topics.
         """
         self._silences.know_start(sampled_ns, others_ns)
 
     def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
-        """Add messages in the order of the log; return the samples that are final now.
+        """Add messages in the order of the log; return the samples that are now final.
 
         Raises:
             LogError: time jumps back too far, and `on_time_jump` is "error".
-            UsageError: the mapping does not fit what the messages hold.
+            UsageError: the mapping does not fit the messages.
         """
         columns = messages if isinstance(messages, MessageColumns) else self._columns(messages)
         traces: list[Trace] = []
@@ -473,7 +477,7 @@ class Assembler(_Assembling):
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
     def know_static(self, messages: Iterable[Message]) -> None:
-        """Take the static transforms of the whole log, before any message is added."""
+        """Add the static transforms of the whole log, before any other message is added."""
         self._knows_static = True
         for topic, log_ns, publish_ns, _, payload in messages:
             reader = self._readers[topic]
@@ -484,12 +488,12 @@ class Assembler(_Assembling):
                 self._add_transforms(reader, times_ns[reader.planned.clock], log_ns, contents[0])
 
     def move_faults(self, target: FaultList) -> None:
-        """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
+        """Move all faults to another list, with the count of faults beyond the limit of the list."""
         self._faults.move_to(target)
 
 
 class _Stamped(NamedTuple):
-    """Messages of one topic: their places among all that arrived, their times and contents."""
+    """Messages of one topic: places among all arrived messages, times and contents."""
 
     reader: TopicReader
     places: Integers
@@ -503,10 +507,10 @@ class _Stamped(NamedTuple):
 
 
 class _SampleTimes:
-    """Decides when samples are taken: at messages, or at multiples of a step.
+    """Times of samples: at messages, or at multiples of a step.
 
     Args:
-        start_ns: the start of the window; multiples of a step are counted from there.
+        start_ns: start of the window, before which there is no sample.
     """
 
     def __init__(self, plan: ReadingPlan, name: str, start_ns: int) -> None:
@@ -521,13 +525,13 @@ class _SampleTimes:
         """Return the distinct times of the next samples.
 
         Args:
-            times_ns: of the new messages: those of the sampled topic or, for multiples of a step, those of
-                all topics with objects or signals.
-            upto_ns: how far the log is known.
+            times_ns: times of the new messages of the sampled topic or, for multiples of a step, of all
+                topics with objects or signals.
+            upto_ns: time up to which samples are decided.
 
         Raises:
-            LogError: a gap in the log holds far too many samples.
-            UsageError: the step is far too short for the rate of the messages.
+            LogError: a gap in the log would hold too many samples.
+            UsageError: the step is too short for the rate of the messages.
         """
         if self._step_ns is None:
             times = times_ns if len(times_ns) == 1 else np.unique(times_ns)
@@ -539,7 +543,7 @@ class _SampleTimes:
         return times
 
     def note(self, time_ns: int) -> bool:
-        """Count a sample taken besides; return whether it comes after the first and the last."""
+        """Note a sample at another time; return whether it comes after the last sample, if there is one."""
         comes_after = 0 <= self._last_ns < time_ns
         if comes_after:
             self._last_ns = time_ns
@@ -572,15 +576,15 @@ class _SampleTimes:
 
 
 class _Silences:
-    """Decides where other topics are sampled: where the sampled topic is silent for longer than its limit.
+    """Silences of the sampled topic that are longer than a limit, in which fallback topics are sampled.
 
-    The limit of a silence depends on the two messages before it alone, and is at most the plan's
-    `longest_silence_ns`. So a log, a window of it and a running system decide alike.
+    The limit depends only on the two messages before the silence, and is at most the plan's
+    `longest_silence_ns`. So the decision is the same for a log, a window of it and a running system.
 
     Attributes:
-        first_ns: time of the first message of the sampled topic; None without any.
-        before_ns: time of the first sample before that; None without any.
-        goes_on: says whether the log has messages after those that are read.
+        first_ns: time of the first message of the sampled topic; None without one.
+        before_ns: time of the first sample before that message; None without one.
+        goes_on: returns whether the log has messages after those that are read.
     """
 
     def __init__(
@@ -591,9 +595,9 @@ class _Silences:
         self._sampled = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
         self._others = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
         self._others_begin_ns: int | None = None
-        # messages of the sampled topic, from the last two before the next samples on
+        # times of the sampled topic, from the last two messages before the next samples on
         self._past_ns = self._times_ns = np.empty(0, np.int64)
-        # whether the others are sampled after each of these and, in the last place, before the first
+        # whether fallback topics are sampled after each of these and, as the last element, before the first
         self._is_filled = np.zeros(1, np.bool_)
         self._unread_ns: int | None = None
         self._first_pause_ns: tuple[int, int | None] | None = None
@@ -603,7 +607,7 @@ class _Silences:
         self.goes_on: Callable[[], bool] = lambda: False
 
     def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
-        """Note the times of the first messages of the log, where reading begins after them."""
+        """Note the times of the log's first messages; see `Assembler.know_start`."""
         self._others_begin_ns = others_ns
         if sampled_ns is not None:
             self.first_ns = self._unread_ns = sampled_ns
@@ -613,9 +617,9 @@ class _Silences:
         """Return the time up to which samples are decided.
 
         Args:
-            upto_ns: time up to which samples are asked for.
-            known_ns: time up to which all messages have come.
-            is_last: whether none comes any more.
+            upto_ns: requested time.
+            known_ns: time up to which all messages have arrived.
+            is_last: whether no further message will arrive.
         """
         if self._sampled is None or not self._others:
             return upto_ns
@@ -634,7 +638,7 @@ class _Silences:
         elif self._others_begin_ns is not None and not is_filled[-1]:
             upto_ns = min(upto_ns, self._others_begin_ns - 1)
         self._times_ns, self._is_filled = times_ns, is_filled
-        # those of before stay, also where fewer samples are asked for than there are
+        # past messages stay past, even if this request ends before them
         past_ns = max(upto_ns, int(self._past_ns.max(initial=-1)))
         self._past_ns = times_ns[times_ns <= past_ns][-2:]
         if len(times_ns) and self.first_ns is None:
@@ -642,13 +646,13 @@ class _Silences:
         return upto_ns
 
     def _silences(self, times_ns: Integers, known_ns: int, *, is_last: bool) -> Booleans:
-        """Return whether the sampled topic is silent for too long after each message; last, before all."""
+        """Return whether the silence after each message is too long; the last element is before the first."""
         limits_ns = np.full(len(times_ns), self._most_ns)
         limits_ns[1:] = np.clip(LONG_PAUSE * np.diff(times_ns), self._least_ns, self._most_ns)
-        # without a message up to `known_ns`, the next one comes later
+        # if no message has arrived up to `known_ns`, the next one is later
         next_ns = np.append(times_ns, known_ns if is_last else known_ns + 1)
         if is_last and len(times_ns):
-            # a log is judged up to its end, as far as that is no usual interval
+            # after the last message, a silence beyond the usual intervals is sampled to the end of the log
             interval_ns = int(np.diff(times_ns)[-1]) if len(times_ns) > 1 else self._least_ns
             limits_ns[-1] = min(self._least_ns, LONG_PAUSE * interval_ns)
         is_late = False
@@ -658,7 +662,7 @@ class _Silences:
         return np.append(next_ns[1:] - times_ns > limits_ns, is_late)
 
     def sampled_in(self, others_ns: Integers) -> Integers:
-        """Return the times of other topics that are sampled, of those up to the `limit`."""
+        """Return the times of fallback topics that are sampled, from times up to the `limit`."""
         place = np.searchsorted(self._times_ns, others_ns, "right") - 1
         is_sampled = self._is_filled[place]
         start_ns, end_ns = self._window_ns
@@ -668,7 +672,7 @@ class _Silences:
         return sampled_ns
 
     def _note(self, others_ns: Integers, place: Integers) -> None:
-        """Note samples at other topics, with the place of the message of the sampled topic before each."""
+        """Note samples at fallback topics, with the index of the sampled topic's message before each."""
         before_ns = others_ns[place < 0]
         if len(before_ns) and self.before_ns is None:
             self.before_ns = int(before_ns.min())
@@ -682,7 +686,7 @@ class _Silences:
             self._first_pause_ns = self._first_pause_ns[0], int(later_ns[0]) if len(later_ns) else None
 
     def remarks(self, sampled: str, others: str) -> Iterator[str]:
-        """Yield remarks on samples at other topics, after the last of them."""
+        """Yield remarks on samples at fallback topics, after the last sample."""
         subject = f"samples are taken at {sampled}, which "
         if self.before_ns is not None and self.first_ns is None:
             yield f"samples are taken at {others}, since {sampled} has no message"
@@ -709,10 +713,10 @@ class _Silences:
 
 
 _MOMENT_S: Final = 0.001
-"""How long messages of the same time may come one after the other, if all come in the order of time."""
+"""Time in which messages of one time arrive, if all messages arrive in the order of time, seconds."""
 
 _MOST_HELD: Final = 4_096
-"""Observations that may wait for transforms at once; beyond that, none does."""
+"""Observations at most that wait for transforms; further ones do not wait."""
 
 
 _TRIAL = """
@@ -728,7 +732,7 @@ sample: {topic: /boxes}
 
 
 def rehearse() -> None:
-    """Assemble a few samples of messages made up, so that no real one waits for code to be compiled."""
+    """Assemble a few samples of invented messages, so that the first real ones need no compilation."""
     ring = [[0, 0], [2, 0], [2, 2], [1, 1]]
     contents: dict[str, Any] = {
         "/boxes": {
@@ -753,9 +757,10 @@ class _Held(NamedTuple):
     """An observation that waits for the transforms of its frame.
 
     Attributes:
-        time_ns: of its message, on the clock of the samples.
-        at_ns: the time of the transforms: its stamp, or the time of its message.
-        until_s: when it has waited for long enough.
+        time_ns: time of its message on the clock of the samples.
+        at_ns: time of the transforms: its stamp, or the time of its message.
+        by_stamp: whether `at_ns` is a stamp.
+        until_s: deadline, seconds.
     """
 
     topic: str
@@ -767,20 +772,21 @@ class _Held(NamedTuple):
 
 
 class LiveAssembler(_Assembling):
-    """Assembles the samples of a running system; callers pass the time of their clock, `now_s`, in seconds.
+    """Assembler of the samples of a running system.
 
-    A sample is final when each topic has come as far as its time, or `max_delay_s` after the first message of
-    that time or a later one. So the samples are those of a log of the same messages, however topics
-    interleave within that delay.
+    Callers pass the time of their clock, `now_s`, in seconds. A sample is final when every topic has reached
+    its time. At the latest it is final `max_delay_s` after the first message of that time or a later time. So
+    the samples are equal to those of a log of the same messages, for any interleaving of topics within that
+    delay.
 
     Args:
-        in_order: whether the server gives a message its log time when it sends it, so that messages of all
-            topics arrive in the order of time.
+        in_order: whether the server stamps messages when it sends them, so that messages of all topics arrive
+            in the order of log time.
 
     Attributes:
-        late: messages that came after the samples of their time.
-        overdue: observations whose transforms did not come in time, so that they are unknown.
-        overdue_frame: the topic and the frame of the last of them.
+        late: number of messages that arrived after the samples of their time.
+        overdue: number of observations whose transforms did not arrive in time, so that they are unknown.
+        overdue_frame: topic and frame of the last overdue observation.
     """
 
     _is_live = True
@@ -800,7 +806,7 @@ class LiveAssembler(_Assembling):
         self._is_in_order = in_order and plan.by_log_time
         moving = (planned.name for planned in plan.planned if planned.is_transforms and not planned.is_static)
         self._moving = frozenset(moving)
-        # a log has the static transforms of all its time
+        # static transforms are valid at all times, so no sample waits for their topics
         self._in_step = [
             planned.name
             for planned in plan.planned
@@ -824,18 +830,18 @@ class LiveAssembler(_Assembling):
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The topics that samples depend on, but those that are sent once and stay."""
+        """Topics that samples depend on, without topics that are sent once and stay valid."""
         passing = (
             planned.topic for planned in self._plan.planned if not (planned.is_lasting or planned.is_latched)
         )
         return tuple(dict.fromkeys(passing))
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
-        """Add messages as they came; return the samples that are final now.
+        """Add messages in order of arrival; return the samples that are now final.
 
         Raises:
-            LogError: time jumps so far ahead that steps between samples cannot be counted.
-            UsageError: the mapping does not fit what the messages hold.
+            LogError: time jumps so far ahead that there would be too many samples between two messages.
+            UsageError: the mapping does not fit the messages.
         """
         self._now_s = now_s
         self._lost.difference_update(self._names_of({message.topic for message in messages}))
@@ -849,20 +855,20 @@ class LiveAssembler(_Assembling):
         return self._settle(self._upto_ns(now_s))
 
     def _names_of(self, topics: Collection[str]) -> set[str]:
-        """Return the names by which topics of the log are read."""
+        """Return the names of planned topics for topics of the log."""
         return {planned.name for planned in self._plan.planned if planned.topic in topics}
 
     def arrived_s(self, time_ns: int) -> float:
-        """Return when the first message of the time of a sample, or a later one, arrived; inf if unknown.
+        """Return the arrival time of the first message at or after the time of a sample; inf if unknown.
 
-        Ask for samples in the order of time.
+        Calls have to be in the order of samples, because earlier arrivals are dropped.
         """
         while self._arrivals and self._arrivals[0][1] < time_ns:
             self._arrivals.popleft()
         return self._arrivals[0][0] if self._arrivals else inf
 
     def due_s(self) -> float | None:
-        """Return when to `add` again, even without messages; None if nothing waits."""
+        """Return the time of the next call of `add`, even without messages; None if nothing waits."""
         times = [waiting.until_s for waiting in self._held]
         is_settled = self._settled_ns >= self._newest_ns
         if self._silent and self._silent[-1][1] > self._patient_ns and not is_settled:
@@ -870,15 +876,15 @@ class LiveAssembler(_Assembling):
         return min(times, default=None)
 
     def flush(self) -> Trace:
-        """Return the samples that wait, since no message comes for them any more."""
+        """Return the samples that still wait for messages."""
         self._held = []
         return self._settle(self._newest_ns, is_last=True)
 
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
-        """Return the samples so far and one right after them, in which what some topics reported is unknown.
+        """Make the reports of lost topics unknown; return the samples so far and one right after them.
 
-        Nothing of what they reported holds on: not while a connection is lost, nor after silence. It stays
-        unknown until they report it again. Messages of other topics wait as before.
+        A topic is lost with its connection, or after a silence. Its objects and signals stay unknown until it
+        reports them again. Messages of other topics wait as before.
         """
         newly_lost = self._names_of(topics) - self._lost
         if not newly_lost:
@@ -906,7 +912,7 @@ class LiveAssembler(_Assembling):
         is_late = times_ns <= self._settled_ns
         if not is_late.any():
             return times_ns, ~is_late
-        # the next sample shows it, as in a log, unless a later message of the topic replaces it
+        # as in a log, the next sample shows it, unless a later message of the topic has replaced it
         counts = ~is_late | (times_ns > reader.pending.taken_ns) | reader.repeats_times
         for time_ns, log_ns, is_shown in zip(
             times_ns[is_late].tolist(), log_times_ns[is_late].tolist(), counts[is_late].tolist(), strict=True
@@ -927,7 +933,7 @@ class LiveAssembler(_Assembling):
         newest_ns = np.maximum.accumulate(np.append(self._latest_of[name], times_ns))
         self._latest_of[name] = int(newest_ns[-1])
         back_ns = newest_ns[:-1] - times_ns
-        # what steps back farther comes too late in any case
+        # a message that steps back farther is too late anyway
         back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
         self._back_ns[name] = max(self._back_ns[name], int(back_ns.max(initial=-1)) + 1)
         if name in self._moving:
@@ -945,9 +951,9 @@ class LiveAssembler(_Assembling):
             try:
                 chunk = reader.extractor.read([message], np.zeros(1, np.int64), is_early=True)
             except MISFITS:
-                # reported when it is read for its objects
+                # the fault is reported when the objects are read
                 continue
-            # a sample waits for the frame that a marker moves with
+            # markers locked to a moving frame need its transform in every sample
             self._follows_frames = self._follows_frames or any(chunk.locked)
             stamps = chunk.stamps or [0] * len(chunk.name)
             for frame, stamp_ns in dict.fromkeys(zip(chunk.frames or (), stamps, strict=False)):
@@ -957,9 +963,9 @@ class LiveAssembler(_Assembling):
                     self._are_transforms_new = True
 
     def _upto_ns(self, now_s: float) -> int:
-        """Return the time up to which nothing is waited for any more."""
+        """Return the time up to which samples are final."""
         newest_ns = self._newest_ns
-        # messages of a topic that has stepped back before may do so again
+        # a topic that has stepped back in time may step back as far again
         reached = (self._latest_of[topic] - self._back_ns[topic] for topic in self._in_step)
         upto_ns = min(reached, default=newest_ns)
         if self._is_in_order:
@@ -971,7 +977,7 @@ class LiveAssembler(_Assembling):
         return min([upto_ns, *(waiting.time_ns - 1 for waiting in self._held)])
 
     def _release(self, now_s: float) -> None:
-        """Let go of the observations that can be placed, and of those that have waited for long enough."""
+        """Release observations whose transforms have arrived, and observations after their deadline."""
         if self._held and self._are_transforms_new:
             self._are_transforms_new = False
             self._held = [
@@ -984,7 +990,7 @@ class LiveAssembler(_Assembling):
             self.overdue_frame = late[-1].topic, late[-1].frame
 
     def _placeable(self) -> list[bool]:
-        """Return whether the transforms of each observation that waits have come."""
+        """Return for each waiting observation whether its transforms have arrived."""
         fixed, tree = self._plan.mapping.fixed_frame or "", self._tree
         are_placeable = [False] * len(self._held)
         reached_ns = min((self._latest_of[topic] for topic in self._moving), default=-1)
@@ -1000,7 +1006,7 @@ class LiveAssembler(_Assembling):
             log_ns = time_ns if self._plan.by_log_time else None
             is_found = tree.between(fixed, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
             if by_stamp:
-                # the next transform shows whether the clock has stepped back before such a stamp
+                # a stamp far behind the newest one may follow a reset clock: the next transform shows it
                 is_found = is_found & ((at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns))
             for place, is_known in zip(places, is_found.tolist(), strict=True):
                 are_placeable[place] = is_known

@@ -1,7 +1,6 @@
-"""External logs as sources: a log and a mapping in; blocks of samples, with the raw messages behind them,
-out.
+"""External logs as sources: a log and a mapping in; blocks of samples with their raw messages out.
 
-The raw messages and their definitions go into copies of the log, so that viewers show both.
+Copies of the log contain the raw messages and their definitions, so that viewers show them next to results.
 """
 
 from __future__ import annotations
@@ -42,10 +41,10 @@ from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
 _WAITING_BYTES = 2**26
-"""Raw messages that wait for their samples; beyond that, all are passed on."""
+"""Size limit of raw messages that wait for their samples, bytes; above it, all are passed on."""
 
 _MOST_UNREAD = 20
-"""Topics that cannot be decoded and are listed one by one."""
+"""Topics at most that are listed one by one as undecodable."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,8 @@ class MappedSource(FileSource):
     """An external log, with a mapping from its messages to objects.
 
     Attributes:
-        keep: messages that its blocks hold for a copy, byte for byte: "mapped" for topics that the mapping
-            reads, "all", or patterns of topics such as "/camera/*". Several add up.
+        keep: topics whose messages its blocks hold unchanged, for copies of the log: "mapped" for topics that
+            the mapping reads, "all", or patterns such as "/camera/*". Several add up.
     """
 
     _: KW_ONLY
@@ -71,7 +70,7 @@ class MappedSource(FileSource):
 
     @property
     def axes(self) -> Axes:
-        """Axes of the messages; samples are always y-up."""
+        """Axes of the messages; samples always have y up."""
         return self.mapping.axes
 
     @property
@@ -81,16 +80,16 @@ class MappedSource(FileSource):
 
     @property
     def begin_ns(self) -> int | None:
-        """When the first message was logged, if a log elsewhere says so."""
+        """Log time of the first message of a remote log; None for local logs, and if it is unknown."""
         return open_messages(self.path).start_ns if isinstance(self.path, RemoteFile) else None
 
     @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
+        """See `Source.iter_blocks`; from an indexed log, only messages for the window are read.
 
-        Blocks hold the messages that `keep` names, raw.
+        Blocks hold raw messages of the topics in `keep`.
         """
-        # no window if it covers everything: only a full read checks the counts that a log declares
+        # None for a window that covers everything, because only a full read checks the declared counts
         start_ns = start_ns or None
         end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
         reader = open_messages(self.path)
@@ -130,7 +129,7 @@ class MappedSource(FileSource):
             blocks.remarks.append(f"{self.name}: it is {what}")
         static = list(dict.fromkeys(topic.topic for topic in plan.planned if topic.is_static))
         if static:
-            # they count from before a window, and the first of a frame before it was recorded, too
+            # static transforms hold after their time, and the first one of a frame also before its time
             assembler.know_static(open_messages(self.path).iter_messages(static))
         if start_ns is not None and plan.by_log_time and plan.sampled_topic is not None:
             sampled_ns = first_ns([plan.sampled_topic])
@@ -144,7 +143,7 @@ class MappedSource(FileSource):
         if not as_recorded and plan.late_ns < LATEST_NS:
             columns = without_jumps(columns, self.name, mapped, plan.late_ns)
         for piece in in_pieces(columns):
-            # what is only copied neither makes samples nor moves their time
+            # messages that are only copied make no samples and do not advance their time
             evaluated = piece if read == mapped else piece.of_topics(mapped)
             yield from blocks.of(assembler.add(evaluated), piece)
             if assembler.is_finished:
@@ -155,7 +154,7 @@ class MappedSource(FileSource):
             raise LogError(f"{self.name} holds no sample: {reason}")
 
     def _with_type(self, topic: Topic) -> Topic:
-        """Return a topic; one of ROS that the log says nothing about has the type that the mapping names."""
+        """Return a topic; a ROS topic without a type in the log gets the type from the mapping."""
         names = (entry.type for entry in self.mapping.topics if entry.topic == topic.name and entry.type)
         name = next(names, None)
         if topic.type or name is None or topic.encoding not in ("ros1", "cdr"):
@@ -194,14 +193,14 @@ class MappedSource(FileSource):
 
     @cached_property
     def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
-        """Attachments and metadata, read once: a log without an index is scanned for them."""
+        """Attachments and metadata, read once, because a log without an index has to be scanned for them."""
         reader = open_messages(self.path)
         return reader.attachments(), reader.metadata()
 
 
 @dataclass(slots=True)
 class _Blocks:
-    """Makes blocks of samples and messages, with all faults so far."""
+    """Builder of blocks from samples and messages, with the faults since the last block."""
 
     assembler: Assembler
     reader: MessageReader
@@ -214,7 +213,7 @@ class _Blocks:
     first_fault: str | None = None
 
     def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
-        """Yield a block, or nothing while there is nothing to yield."""
+        """Yield a block if it would not be empty."""
         messages = messages.within(self.start_ns, FOREVER if self.end_ns is None else self.end_ns)
         for fault in trace.faults:
             self.faults.add(fault)
@@ -234,14 +233,14 @@ class _Blocks:
 
 
 class _CopiedMessages:
-    """Holds raw messages until the samples made of them are ready, and returns them in the order of time."""
+    """Buffer that holds raw messages until their samples are ready, and returns them in order of time."""
 
     def __init__(self, channels: Mapping[int, Channel], trees: _TreeLog) -> None:
-        """Hold nothing yet.
+        """Create an empty buffer.
 
         Args:
-            channels: as the log has them, by the numbers of its columns.
-            trees: makes further messages.
+            channels: channels of the log, by their numbers in its columns.
+            trees: source of additional messages, the ticks of behaviour trees.
         """
         self.topics = frozenset(channel.topic for channel in channels.values())
         self.trees = trees
@@ -253,9 +252,9 @@ class _CopiedMessages:
         self._waiting_bytes = 0
 
     def passed_on(self, messages: MessageColumns, trace: Trace, *, last: bool = False) -> Messages:
-        """Hold messages; return those up to the last of some new samples, or with `last` all.
+        """Add messages; return the held messages up to the last new sample, or with `last` all of them.
 
-        Beyond a number of bytes all are returned, because log times and header stamps may be far apart.
+        Above a size limit all are returned, because log times and header stamps may be far apart.
         """
         messages = messages.of_topics(self.topics | self.trees.topics)
         self._waiting.append(messages)
@@ -271,7 +270,7 @@ class _CopiedMessages:
         evaluated, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
-        # a topic may have a channel of ours, too
+        # by channel, because a topic may also have a channel of ours
         copied = select(evaluated, np.flatnonzero(np.isin(evaluated.channel, self._numbers)))
         ticks = self.trees.ticks(evaluated)
         raw = copied.raw(self._channels)
@@ -279,7 +278,7 @@ class _CopiedMessages:
 
 
 class _TreeLog:
-    """Makes ticks of the logs of Nav2's behaviour trees, on the clock of the mapping."""
+    """Converter from logs of Nav2's behaviour trees to ticks, on the clock of the mapping."""
 
     def __init__(self, reader: MessageReader, topics: Iterable[Topic], clock: Clock) -> None:
         logs = [topic for topic in topics if topic.type == NAV2_LOG and topic.unreadable is None]
@@ -293,7 +292,7 @@ class _TreeLog:
         self._count = 0
 
     def ticks(self, messages: MessageColumns) -> Messages:
-        """Return a tick for each message of a tree's log."""
+        """Return one tick per message of a tree's log."""
         rows = []
         logs = select(messages, np.flatnonzero(np.isin(messages.channel, list(self._channels))))
         for message in replace(logs, channels=self._channels).messages():
@@ -311,7 +310,7 @@ class _TreeLog:
         return Messages.from_rows({0: TREE_CHANNEL}, rows)
 
     def _tick(self) -> TreeTick:
-        """Return the newest nodes; of several trees, each has a root with the name of its topic."""
+        """Return the newest nodes; each of several trees gets a root with the name of its topic."""
         if len(self.topics) == 1:
             return TreeTick(None, *self._nodes.values())
         nodes: list[TreeNode] = []
@@ -325,24 +324,24 @@ class _TreeLog:
 def _first_ns(
     open_reader: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
 ) -> int | None:
-    """Return when the first message of some topics was logged, from a time on; None without any."""
+    """Return the log time of the first message of some topics, at or after a time; None without one."""
     named = [topic for topic in topics if topic is not None]
     messages = open_reader().iter_messages(named, log_ns) if named else ()
     return next((message.log_time_ns for message in messages), None)
 
 
 def _foreign_channels(reader: MessageReader, topics: Collection[str]) -> Mapping[int, Channel]:
-    """Return the channels of some topics, without those that a replay writes from the samples."""
+    """Return the channels of some topics, without channels that a replay writes from the samples."""
     channels = reader.channels(topics)
     ours = [number for number, channel in channels.items() if has_our_type(channel)]
-    # in a log that we did not write, others may have used our topics with our types
+    # only in logs that we wrote; in other logs, channels with our types are foreign messages
     if ours and METADATA in dict(reader.metadata()):
         return {number: channel for number, channel in channels.items() if number not in ours}
     return channels
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
-    """Return remarks on topics that are not mapped and could not be, with their numbers of messages."""
+    """Return remarks on unmapped topics that cannot be decoded, with their message counts."""
     sent = [topic for topic in topics if topic.count != 0 and topic.name not in plan.topics]
     unread = [topic for topic in sent if topic.unreadable]
     remarks = []
@@ -364,7 +363,7 @@ def _columns(
     *,
     as_recorded: bool,
 ) -> Columns:
-    """Iterate over the messages of some topics that the samples of a window depend on, and those in it."""
+    """Iterate over the messages of some topics in a window, and over other messages that affect it."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
         return reader.iter_columns(topics, as_recorded=as_recorded)
     last = None if end_ns is None else end_ns + plan.margin_ns

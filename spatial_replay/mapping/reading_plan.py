@@ -1,7 +1,7 @@
-"""Plan what to read of a log: compare a mapping with the topics of a log.
+"""Plan the reading of a log: compare a mapping with the topics of the log.
 
-`ReadingPlan.of` finds the faults of a mapping that only a log shows, which topics are read for what, and how
-far beyond a window messages count.
+`ReadingPlan.of` finds faults of a mapping that depend on the log. It decides which topics are read, for which
+purpose, and how far outside a window.
 """
 
 from __future__ import annotations
@@ -35,25 +35,28 @@ from spatial_replay.text import nearest_hint, plural
 from spatial_replay.trace.trace import LONG_PAUSE
 
 _LONGEST_SILENCE_NS: Final = 10 * 10**9
-"""A longer silence of the sampled topic is a pause, however rarely it came before."""
+"""Silence of the sampled topic that is always a pause, even if its messages are rare, nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedTopic:
-    """How one topic is read, or one list of objects in its messages.
+    """Plan for one topic, or for one list of objects in its messages.
 
     Attributes:
-        name: of the topic, with the place of its entry if the mapping has several: `/scene`, `/scene[1]`.
-        topic: of the log.
-        mapping: its entry; None for topics that are read for transforms or times only.
-        layout: where its objects are; None for a topic without objects.
-        max_age_ns: how long an observation or a signal stays valid.
-        between_ns: its objects are unknown between transforms that are farther apart.
-        silence_ns: after so long a silence it has ended, also where its last message stays valid.
-        is_transforms: whether its transforms place frames; `is_static`: at all times.
-        is_lasting: whether a message counts however old it is.
-        is_latched: whether it may have been sent long before it was recorded.
-        is_protobuf_json: whether its messages are of Foxglove and JSON, as protobuf writes it or not.
+        name: topic, with the index of its entry if the mapping has several: `/scene`, `/scene[1]`.
+        topic: topic of the log.
+        mapping: entry of the mapping; None for topics that are read for transforms or times only.
+        layout: places of object fields; None for a topic without objects.
+        max_age_ns: validity of an observation or a signal, nanoseconds.
+        between_ns: longest time between two transforms that are interpolated, nanoseconds; objects are
+            unknown within a longer one.
+        silence_ns: silence after which the topic has ended, even if its last message stays valid,
+            nanoseconds.
+        is_transforms: whether its messages are transforms between frames.
+        is_static: whether these transforms hold at all times.
+        is_lasting: whether a message stays valid forever.
+        is_latched: whether a message may have been sent long before it was recorded.
+        is_protobuf_json: whether its messages are JSON of a Foxglove type, which protobuf may have written.
     """
 
     name: str
@@ -81,20 +84,20 @@ class ReadingPlan:
     """Selection of messages for a mapping that fits the log.
 
     Attributes:
-        topics: every topic to read: those mapped, and those with transforms if frames are needed.
-        by_log_time: whether the times of samples are log times. If not, the messages of a window are known
-            only when all have been decoded.
-        late_ns: how far messages may be out of order; it is also how long samples wait for late messages.
-        wait_ns: how long they wait for messages that change them.
-        margin_ns: how far beyond the end of a window messages still count.
-        planned: how each topic is read, in the order of `topics`.
-        lost: topics with transforms that cannot be decoded, with the reason.
+        topics: topics to read: mapped topics, and topics of transforms if frames are needed.
+        by_log_time: whether times of samples are log times. Otherwise the messages of a window are known only
+            after all messages have been decoded.
+        late_ns: largest disorder of messages, nanoseconds; samples wait as long for late messages.
+        wait_ns: time that samples wait for messages that affect them, nanoseconds.
+        margin_ns: time after the end of a window in which messages still affect it, nanoseconds.
+        planned: plan for each topic, in the order of `topics`.
+        lost: topics of transforms that cannot be decoded, with the reason.
         absent: optional topics that the log lacks.
-        sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
-        fallback_topics: the topics that are sampled where that one is silent.
-        silence_ns: that topic is silent for at least so long before these are sampled.
-        longest_silence_ns: if it is silent for longer than that, they are, however rarely it came before.
-        remarks: what is doubtful about the choice of that topic.
+        sampled_topic: topic with a sample at each message; None for samples at multiples of a step.
+        fallback_topics: topics that are sampled while the sampled topic is silent.
+        silence_ns: least silence of the sampled topic before fallback topics are sampled, nanoseconds.
+        longest_silence_ns: silence after which fallback topics are always sampled, nanoseconds.
+        remarks: doubts about the choice of the sampled topic.
     """
 
     mapping: LogMapping
@@ -176,8 +179,10 @@ class ReadingPlan:
         )
 
     def lookback_ns(self, topic: str) -> int | None:
-        """Return how long before a window messages of a topic count; None for all, as of static
-        transforms."""
+        """Return the time before a window in which messages of a topic affect it, nanoseconds.
+
+        None means all messages, as for static transforms.
+        """
         lookbacks_ns = [self._lookback_ns(planned) for planned in self.planned if planned.topic == topic]
         return None if None in lookbacks_ns else max(filter(None, lookbacks_ns), default=0)
 
@@ -189,11 +194,11 @@ class ReadingPlan:
         ]
         lookback_ns = planned.max_age_ns if planned.mapping is not None else 0
         if planned.name == self.sampled_topic:
-            # its last message before a pause, and the one before that
+            # a pause is recognised by the two messages before it
             pauses_ns = self.longest_silence_ns + self.longest_silence_ns // LONG_PAUSE
             lookback_ns = max(lookback_ns, pauses_ns)
         if planned.is_transforms and not planned.is_static:
-            # an observation of the window may be that old, and is placed by a transform of its time
+            # an observation that old may be valid in the window, and needs a transform of its own time
             lookback_ns = max(lookback_ns, HISTORY_NS + max(ages_ns, default=0))
             if any(topic.is_lasting and topic.layout is not None for topic in self.planned):
                 return None
@@ -201,7 +206,7 @@ class ReadingPlan:
         return None if planned.is_lasting or lookback_ns >= FOREVER_NS else lookback_ns
 
     def first_read_ns(self, start_ns: int) -> int:
-        """Return from which log time on messages count in a window that starts at a time."""
+        """Return the log time from which messages affect a window that starts at `start_ns`."""
         lookbacks = [self.lookback_ns(topic) for topic in self.topics]
         return max(0, start_ns - max((lookback for lookback in lookbacks if lookback is not None), default=0))
 
@@ -255,9 +260,9 @@ def _topics_in_words(by_name: Mapping[str, Topic]) -> str:
 
 
 def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
-    """Return the topic that is sampled by default: of those with objects, if any, the one with most messages.
+    """Return the topic that is sampled by default: the topic with objects that has most messages.
 
-    Where a log does not say how many there are, the first one counts.
+    Without objects, all topics are candidates. If the log does not give counts, the first candidate is taken.
     """
     present = [entry for entry in mapping.topics if entry.topic in by_name]
     names = [entry.topic for entry in present if entry.reads_objects] or [entry.topic for entry in present]
@@ -266,7 +271,10 @@ def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
 
 
 def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> frozenset[str]:
-    """Return the topics that are sampled where the sampled one is silent: those that keep coming."""
+    """Return the topics that are sampled while the sampled topic is silent.
+
+    Topics of static transforms, of markers and latched topics are excluded, because they are sent rarely.
+    """
     mapped = [
         topic
         for topic in planned
@@ -278,12 +286,13 @@ def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> fr
 
 
 _MANY_TIMES = 10
+"""Ratio of message counts from which sampling is called slow."""
 
 
 def _slow_sampling(
     sampled: str | None, mapped: Sequence[Topic], by_name: Mapping[str, Topic]
 ) -> tuple[str, ...]:
-    """Return a remark if a mapped topic has many times the messages of the one that is sampled."""
+    """Return a remark if a mapped topic has many times the messages of the sampled topic."""
     most = max(mapped, key=lambda topic: topic.count or 0)
     count = None if sampled is None else by_name[sampled].count
     if count is None or most.count is None or most.count < _MANY_TIMES * max(count, 1):
@@ -298,7 +307,7 @@ def _slow_sampling(
 def doubts_of(
     topics: Iterable[Topic], *, has_frames: bool = False, has_stamps: bool = False
 ) -> Iterator[str]:
-    """Yield what is doubtful about a mapping without a fixed frame, or with `clock: log`."""
+    """Yield doubts about a mapping without a fixed frame, or with `clock: log`."""
     topics = tuple(topics)
     transforms = [topic.name for topic in topics if short_type(topic.type) in TRANSFORM_TYPES]
     moving = [name for name in transforms if not name.endswith("tf_static")]
@@ -352,4 +361,4 @@ def _plan_of_topic(
 
 
 _GEOMETRIES = frozenset({"geometry", "coordinates"})
-"""Fields of GeoJSON, whose corners are longitudes and latitudes (RFC 7946)."""
+"""Fields of GeoJSON, whose corners are longitude and latitude, in this order (RFC 7946)."""

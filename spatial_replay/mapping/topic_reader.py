@@ -1,9 +1,8 @@
 """Read one topic: raw messages in, columns of detections and signals out.
 
-`Extractor` reads the objects of decoded messages.
-A message passes three steps: it is decoded, its signals are read, its objects are read. Each step may fail
-for single messages. One boolean mask per batch says which messages are still good; a step skips the others,
-reports those that fail, and clears their flags.
+A message passes three steps: it is decoded, its signals are read, its objects are read (by `Extractor`). Each
+step may fail for single messages. One boolean mask per batch marks the good messages. A step skips the
+others, reports its failures, and clears their flags.
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ _SOLIDS_OF = {"marker": solids_of_marker, "scene": solids_of_entity, "primitive"
 
 
 class _Objects(NamedTuple):
-    """Objects in columns: their decoded values, the index of each one's message, the code of its name."""
+    """Objects in columns: decoded values, indices of their messages, codes of their names."""
 
     values: list[Any]
     message: list[int]
@@ -104,13 +103,14 @@ class _Objects(NamedTuple):
 
 
 class Extractor:
-    """Reads the objects of one topic.
+    """Reader of the objects of one topic.
 
-    The field paths of the layout are bound to the first object; all others are read with the bound paths.
+    The field paths of the layout are bound to the first object. All other objects are read with the bound
+    paths.
 
     Args:
         names, classes: codes that all topics share.
-        needs_frame: whether there is a fixed frame, so that frames matter.
+        needs_frame: whether the mapping has a fixed frame, so that frames of objects are read.
     """
 
     def __init__(
@@ -118,25 +118,25 @@ class Extractor:
     ) -> None:
         self.noted_frames: set[str] = set()
         self.unseen: tuple[str, ...] = ()
-        """With zeros left out, the paths of the position while no object had any of them."""
+        """With `missing: 0`, the paths of the position until an object has one of them."""
         if mapping.has_zeros_left_out and mapping.position is not None:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
-        """Outlines with too few corners, whose objects are unknown."""
+        """Number of outlines with too few corners, whose objects are unknown."""
         self.stamp_faults: list[str] = []
-        """Why fields that look like stamps are no times."""
+        """Reasons why fields with names of stamps are not times."""
         self.unset: Counter[str] = Counter()
-        """Objects that do not set a field of protobuf, by its path."""
+        """Number of objects in which a protobuf field is not set, by its path."""
         self._scene_stamps_ns: dict[int, int] = {}
-        """Timestamps of the entities of a scene by the codes of their names, until they are deleted."""
+        """Timestamps of existing scene entities, by the codes of their names."""
         self.boxes, self.leftward, self.downward = 0, 0, 0
-        """Bounds, and those whose second corner lies left of, and below in numbers, the first."""
+        """Number of bounds, and of those whose second corner has a lesser x, or y, than the first."""
         self.corner_low, self.corner_high = np.full((2, 2), np.inf), np.full((2, 2), -np.inf)
-        """The least and the greatest coordinates of first and second corners."""
+        """Least and greatest coordinates of first and second corners."""
         self.differences = 0
-        """Messages that say of themselves that they list changes only."""
+        """Number of messages marked as a list of changes by their field `is_diff`."""
         self.turned, self.unturned = 0, 0
-        """Poses with an orientation, and those whose quaternion is zeros."""
+        """Number of poses with a quaternion, and of those whose quaternion is zeros."""
         self.layout = layout
         self._names, self._classes = names, classes
         self._first_classes: dict[int, int] = {}
@@ -151,31 +151,31 @@ class Extractor:
 
     @property
     def binding(self) -> Binding | None:
-        """The getters of its fields; None before the first object."""
+        """Getters of the object's fields; None before the first object."""
         return self._binding
 
     @property
     def is_bound(self) -> bool:
-        """Whether an object was read, so that every path is known to lead somewhere."""
+        """Whether an object was read, so that all paths are known to resolve."""
         return self._binding is not None
 
     @property
     def is_timed(self) -> bool:
-        """Whether stamps were found."""
+        """Whether messages have stamps."""
         return self._time is not None
 
     @property
     def lacks_stamp(self) -> bool:
-        """Whether a message was read that has no stamp where there could be one."""
+        """Whether a message with an object was read, and had no stamp."""
         return self._is_time_bound and self._time is None
 
     def stamp(self, message: object) -> int | None:
-        """Return the stamp of a message, or that of its first object; None if it has none.
+        """Return the stamp of a message, or the stamp of its first object; None without one.
 
-        A message without objects has its own stamp, if its type has one: it says that there are none.
+        The stamp of a message without objects is the time from which there are no objects.
 
         Raises:
-            FieldError: there is no stamp where the layout says.
+            FieldError: the path of the stamp does not resolve.
         """
         first = next(iter(self._elements(message)), None)
         if first is None:
@@ -198,12 +198,12 @@ class Extractor:
         """Extract the objects of some messages.
 
         Args:
-            places: (N,) the place of each message in its batch.
-            is_early: whether they are read again later, in the order of their times.
+            places: (N,) indices of the messages in their batch.
+            is_early: whether the messages will be read again, in the order of their times.
 
         Raises:
             FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message differs
-                from the others; FieldError says how.
+                from the others. Only a FieldError describes the difference.
         """
         values, index, order = self._flatten(messages)
         if messages and "is_diff" in field_names(messages[0]):
@@ -230,7 +230,7 @@ class Extractor:
             if any(leads_somewhere(path, element) for path in paths for element in objects.values):
                 self.unseen = ()
         if not is_early:
-            # a message that fails is read again, alone
+            # set last, because a failing message is read again, alone
             self._scene_stamps_ns = scene_stamps_ns
         return chunk
 
@@ -245,13 +245,13 @@ class Extractor:
         )
 
     def _with_one_class(self, detections: Detections) -> Detections:
-        """Return objects that keep their first class, or have their class in their name."""
+        """Return detections in which objects keep their first class, or have their class in their name."""
         names, classes = detections.name.tolist(), detections.class_code.tolist()
         if self.layout.class_changes == "first":
             first = self._first_classes
             classes = [first.setdefault(name, code) for name, code in zip(names, classes, strict=True)]
             return replace(detections, class_code=np.array(classes, np.int64))
-        # by the class alone, so that a window has the names of the whole log
+        # the name depends only on the class, so that it is the same in a window and in the whole log
         names = [self._name_of_class(name, code) for name, code in zip(names, classes, strict=True)]
         return replace(detections, name=np.array(names, np.int64))
 
@@ -294,7 +294,7 @@ class Extractor:
             if self.layout.invalid:
                 chunk.numbers[np.isin(chunk.numbers, with_single_precision(self.layout.invalid))] = nan
             if self.layout.origin is not None:
-                # such as degrees times 10,000,000; sizes beside them are in metres
+                # positions may be degrees times 10,000,000, while sizes are metres
                 chunk.numbers[:, list(binding.position[:2])] *= self.layout.scale
             if binding.orientation:
                 is_turned = chunk.numbers[:, list(binding.orientation)].any(axis=1)
@@ -312,7 +312,7 @@ class Extractor:
         self.cornerless += cornerless
 
     def _forget_unset(self, binding: Binding, numbers: Floats, objects: Sequence[object]) -> None:
-        """Replace defaults that stand for protobuf fields which were not set."""
+        """Replace the defaults of protobuf fields that were not set by NaN."""
         for column, path, default in binding.unset:
             for row in np.flatnonzero(numbers[:, column] == default).tolist():
                 if not is_set(path, objects[row]):
@@ -320,7 +320,7 @@ class Extractor:
                     self.unset[path.text] += 1
 
     def _count_corners(self, lists: Sequence[Any]) -> None:
-        """Count the boxes of a chunk, and how their second corners lie."""
+        """Count the boxes of a chunk by the direction from their first to their second corner."""
         counts, points = points_from_lists([corners for corners in lists if len(corners)])
         first = (np.cumsum(counts) - counts)[counts == 2]
         along = points[first + 1] - points[first] if len(first) else points[:0]
@@ -332,11 +332,11 @@ class Extractor:
             self.corner_high[corner] = np.fmax(self.corner_high[corner], np.fmax.reduce(points[number, :2]))
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
-        """Return all objects, the index of each one's message, and its index, or key, in that message."""
+        """Return all objects, the indices of their messages, and their indices, or keys, in their lists."""
         if self._path is None:
             return list(messages), list(range(len(messages))), [0] * len(messages)
         if self._list is None and messages:
-            # step by step once, because the errors of the fast getter name no fields
+            # the first message is read step by step, because the errors of the fast getter name no fields
             list(iter_elements(self._path, messages[0]))
             self._list = list_getter(self._path, messages[0]) or self._elements
         lists = list(map(self._list, messages)) if self._list is not None else []
@@ -352,9 +352,11 @@ class Extractor:
     def _deleted_entities(
         self, messages: Sequence[object], entities: _Objects
     ) -> tuple[list[tuple[int, int]], dict[int, int]]:
-        """Return (message, name) of each deletion in a foxglove.SceneUpdate, and the stamps that remain.
+        """Return (message, name) of each deletion in a foxglove.SceneUpdate, and the remaining stamps.
 
-        The entities of a message are added after its deletions.
+        A deletion concerns only earlier entities, see
+        https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion. The entities of a message are added
+        after its deletions.
         """
         deleted: list[tuple[int, int]] = []
         stamps_ns = dict(self._scene_stamps_ns)
@@ -382,7 +384,7 @@ class Extractor:
             self._is_time_bound = True
 
     def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
-        """Return the frame of each object; None if all are in the fixed frame."""
+        """Return the frame of each object; None without a fixed frame, or if all are in the fixed frame."""
         if self.layout.frame_name is not None:
             self.noted_frames.add(self.layout.frame_name)
             return [self.layout.frame_name] * len(objects.values) if self._needs_frame else None
@@ -401,7 +403,7 @@ class Extractor:
     def _fill_stamps(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
     ) -> None:
-        """Read the stamps of objects where frames matter; elsewhere only the first, to compare clocks."""
+        """Read the stamps of objects for a fixed frame; otherwise only the first stamp, to compare clocks."""
         if self._time is None:
             return
         from_message = self._time.path.from_message
@@ -414,7 +416,7 @@ class Extractor:
             chunk.stamps = [stamps[index] for index in objects.message]
             if binding.own_stamp is not None:
                 own_stamps = binding.own_stamp.nanoseconds(objects.values)
-                # a stamp of 0 was never set
+                # a stamp of 0 means a stamp that was not set
                 chunk.stamps = [stamp or outer for stamp, outer in zip(own_stamps, chunk.stamps, strict=True)]
             chunk.noted_stamps = list(zip(chunk.places.tolist(), stamps, strict=True))
         else:
@@ -424,11 +426,11 @@ class Extractor:
 
 
 def _stamp_of_scene(entity: Any) -> int:
-    """Return the timestamp of an entity or a deletion; 0 for none."""
+    """Return the timestamp of an entity or a deletion; 0 without one."""
     if isinstance(entity, dict):
         return ns_from_json(entity.get("timestamp"))
     stamp = entity.timestamp
-    # protobuf or ROS
+    # a protobuf Timestamp, or a ROS 2 time
     return int(
         stamp.seconds * 10**9 + stamp.nanos
         if hasattr(stamp, "seconds")
@@ -437,7 +439,7 @@ def _stamp_of_scene(entity: Any) -> int:
 
 
 def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int, int]]]:
-    """Return the markers that are shown, and (message, name) of those that are deleted."""
+    """Return the added markers, and (message, name) of each deleted marker."""
     deleted: list[tuple[int, int]] = []
     if not objects.values:
         return objects, deleted
@@ -454,33 +456,35 @@ def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int,
 
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
-"""Raised by reading fields of a message that is not as the mapping says."""
+"""Errors of fields in a message that does not fit the mapping."""
 
 ReportFault: TypeAlias = Callable[[str, int, str], None]
-"""Takes the topic and the log time of a message that is lost, and the reason."""
+"""Receiver of lost messages: topic, log time, and reason."""
 
 _NO_STAMP = (
     "the clock is header, but its messages have no stamp; give `stamp`, or `clock: log` for this topic"
 )
 
 _PATIENCE = 100
-"""Messages of a topic that may misfit before the first that fits; beyond that the mapping is wrong."""
+"""Messages of a topic that may misfit before the first that fits; more show a wrong mapping."""
 
 _MOST_UNNAMED, _LONGEST_UNNAMED = 8, 40
+"""Limits of remarks on texts without a number: texts, and characters of a text."""
 
 _CHUNK = 256
+"""Messages at most that are decoded together; few, so that their contents are freed soon."""
 _CHUNK_BYTES = 2**14
-"""Messages decoded at once: few, so that their contents are freed before they pile up."""
+"""Usual size of messages that are decoded together, bytes."""
 
 
 class TopicColumns(NamedTuple):
     """Columns read from N messages of a topic, of which M are good.
 
     Attributes:
-        good: (N,) which messages could be read.
-        detections: the objects of the M good messages, or None for a topic without objects.
-        signals: (M, S) the value of each signal in each good message.
-        stamps: (K, 2) the places of some messages among the N, and their stamps.
+        good: (N,) whether a message could be read.
+        detections: objects of the M good messages; None for a topic without objects.
+        signals: (M, S) value of each signal in each good message.
+        stamps: (K, 2) indices of some of the N messages, and their stamps.
     """
 
     good: Booleans
@@ -490,12 +494,12 @@ class TopicColumns(NamedTuple):
 
 
 class TopicReader:
-    """Decodes the messages of one topic and reads stamps, objects and signals.
+    """Reader of one topic, which decodes messages and reads stamps, objects and signals.
 
     Args:
         names, classes: codes that all topics share.
-        decodes_early: whether messages whose objects have frames are decoded when they arrive.
-        report: receives each message that is lost.
+        decodes_early: whether messages whose objects have frames are decoded on arrival.
+        report: receiver of lost messages.
     """
 
     def __init__(
@@ -523,7 +527,7 @@ class TopicReader:
         self.transforms = TransformReader() if planned.is_transforms else None
         self.extractor: Extractor | None = None
         self.unstamped = 0
-        """Messages without a stamp, or with one of 0, which have no time on the clock `header`."""
+        """Number of messages without a stamp, or with stamp 0, which have no time on the clock `header`."""
         self._is_stamped = False
         if planned.layout is not None and planned.mapping is not None:
             self.extractor = Extractor(
@@ -547,51 +551,52 @@ class TopicReader:
         self._signal_fields = () if planned.mapping is None else planned.mapping.signals
         self._signals: list[Get] | None = None
         self.unnamed: dict[str, dict[str, None]] = {}
-        """Some texts of signals, by signal, for which the mapping has no number."""
+        """Examples of texts for which the mapping has no number, by signal."""
         self._misfits: dict[str, tuple[int, str]] = {}
 
     @property
     def is_mapped(self) -> bool:
-        """Whether its messages hold objects or signals of the mapping."""
+        """Whether the mapping has an entry of this topic."""
         return self.planned.mapping is not None
 
     @property
     def repeats_times(self) -> bool:
-        """Whether several messages may have one time, as each has objects of its own."""
+        """Whether several messages of the same time are all valid, because each has other objects."""
         if self.extractor is None or self.planned.layout is None:
             return self.transforms is not None
         return not (self.planned.layout.complete or self.extractor.namer.is_constant)
 
     @property
     def advances_time(self) -> bool:
-        """Whether its times show how far the log has come.
+        """Whether its times advance the time of the log.
 
-        Log times do. Stamps of transforms and of latched messages may lie in the future or the past.
+        Log times do. Stamps of transforms and of latched messages do not, because they may lie in the future
+        or the past.
         """
         if self.planned.clock == "log":
             return True
         return not self.planned.is_latched and (self.transforms is None or self.extractor is not None)
 
     def decode(self, payloads: Sequence[bytes], log_times_ns: Sequence[int], good: Booleans) -> list[Any]:
-        """Decode the good messages; None for the others and for those that turn out to be bad."""
+        """Decode the good messages; None for other messages, and for messages that cannot be decoded."""
         return self._read_each(self._decode, payloads, log_times_ns, good)
 
     def stamps(self, messages: Sequence[Any], log_times_ns: Sequence[int], good: Booleans) -> Integers:
-        """Return the stamp (N,) of each message; those without one are not good.
+        """Return the stamp (N,) of each message; messages without one are not good.
 
         Raises:
-            UsageError: there are no stamps where the mapping says.
+            UsageError: the path of the stamp does not resolve.
         """
 
         def read(message: object) -> int | None:
             time_ns = self._stamp(message)
             if time_ns is not None and not 0 <= time_ns <= LATEST_NS:
                 raise ContentError(f"its stamp {time_ns} ns lies outside the times of a log")
-            # a stamp of 0 was never set, but by simulators, before they have a time
+            # a stamp of 0 was not set; simulators send it before they have a time
             return time_ns or (0 if self.planned.is_static else None)
 
         times = self._read_each(read, messages, log_times_ns, good)
-        # a list without objects and without a header has no stamp
+        # None occurs for an empty list in a message without a header
         has_stamp = np.array([time_ns is not None for time_ns in times], np.bool_)
         self.unstamped += int(np.count_nonzero(good & ~has_stamp))
         good &= has_stamp
@@ -609,7 +614,7 @@ class TopicReader:
         """Read objects and signals.
 
         Args:
-            contents: payloads, or decoded messages where the reader `decodes_on_arrival`.
+            contents: payloads, or decoded messages if the reader `decodes_on_arrival`.
 
         Raises:
             UsageError: the mapping fits none of many messages.
@@ -621,7 +626,7 @@ class TopicReader:
         size = _chunk_size(contents)
         for begin in range(0, len(contents), size):
             messages, at = contents[begin : begin + size], times[begin : begin + size]
-            # a view: flags that are cleared here are cleared in the whole
+            # a view, so that flags cleared in it are cleared in `good`
             part = good[begin : begin + size]
             if not self.decodes_on_arrival:
                 messages = self.decode(messages, at, part)
@@ -639,10 +644,10 @@ class TopicReader:
         )
 
     def finish(self) -> None:
-        """Check that the mapping fitted some message, after the last one.
+        """Check after the last message that the mapping fitted at least one.
 
         Raises:
-            UsageError: there were messages, and the mapping fitted none.
+            UsageError: there were messages, but the mapping fitted none.
         """
         if self.unstamped and not self._is_stamped and self.is_mapped:
             raise self._misfit_error(_NO_STAMP)
@@ -661,7 +666,7 @@ class TopicReader:
     def _read_each(
         self, read: Callable[[Any], Any], items: Sequence[Any], log_times_ns: Sequence[int], good: Booleans
     ) -> list[Any]:
-        """Apply `read` to the good items; report those that fail, and clear their flags."""
+        """Apply `read` to the good items; report the failures and clear their flags."""
         results: list[Any] = [None] * len(items)
         for place in np.flatnonzero(good).tolist():
             try:
@@ -682,10 +687,10 @@ class TopicReader:
         log_times_ns: Sequence[int],
         good: Booleans,
     ) -> list[DetectionChunk]:
-        """Read the objects of the good messages, all at once if they are alike.
+        """Read the objects of the good messages, together if all of them have the same form.
 
         Args:
-            first: the place of the first message in its batch.
+            first: index of the first message in its batch.
         """
         places = np.flatnonzero(good)
         try:
@@ -693,14 +698,14 @@ class TopicReader:
         except MISFITS:
             pass
 
-        # one of them has another form: only reading each on its own shows which
+        # one message has another form; reading each message alone shows which one
         def read(numbered: tuple[int, object]) -> DetectionChunk:
             place, message = numbered
             was_bound = extractor.is_bound
             try:
                 return extractor.read([message], np.array([place]))
             except ContentError:
-                # bad values say nothing against the mapping
+                # a bad value is no evidence against the mapping
                 raise
             except MISFITS as error:
                 if not was_bound:
@@ -728,7 +733,7 @@ class TopicReader:
             number = get
 
             def get(message: object) -> object:
-                # as in JSON, whose enums are texts; a number without a name stays one
+                # the name of an enum, as in ProtoJSON; a number without a name stays a number
                 code = number(message)
                 return names.get(code, str(code) if numbers and code is not None else code)
 
@@ -768,7 +773,7 @@ class TopicReader:
                 self._time = bind_time(stamps, message, message)
                 self._is_time_bound = True
         except FieldError as error:
-            # before the first stamp, the mapping is wrong; afterwards, this message is
+            # before the first stamp the mapping is at fault, after it this message
             if self._is_time_bound or (self.extractor is not None and self.extractor.is_timed):
                 raise
             raise self._misfit_error(f"the clock is header, but {error}") from None
@@ -777,10 +782,10 @@ class TopicReader:
         return self._time.nanoseconds([message])[0]
 
     def _count_misfit(self, what: str, error: Exception) -> None:
-        """Count a message that the mapping does not fit, before there was one that it fits.
+        """Count a misfitting message before the first that fits.
 
         Raises:
-            UsageError: there were many.
+            UsageError: there were many misfitting messages.
         """
         count, first = self._misfits.get(what, (0, ""))
         reason = str(error) if isinstance(error, FieldError) else f"its messages are not as expected: {error}"
@@ -793,12 +798,12 @@ class TopicReader:
 
 
 def with_single_precision(numbers: Sequence[float]) -> list[float]:
-    """Return numbers, and what is left of them in a field of type float32."""
+    """Return numbers, and the same numbers rounded to float32, which fields may have."""
     return [*numbers, *np.array(numbers, np.float32).astype(np.float64).tolist()]
 
 
 def _getter_of_set_values(path: FieldPath, example: object) -> Get:
-    """Return the getter of a path, which returns None where a protobuf sender did not set the field."""
+    """Return the getter of a path; it returns None if a protobuf sender did not set the field."""
     get = getter(path, example)
     if not may_be_unset(path, example):
         return get
@@ -810,16 +815,16 @@ def _getter_of_set_values(path: FieldPath, example: object) -> Get:
 
 
 def unit_of_stamp(stamp: int, log_time_ns: int) -> str:
-    """Return the unit in which a stamp is within an hour of when its message was recorded, else ns."""
+    """Return the unit in which a stamp is within an hour of the recording of its message, otherwise ns."""
     near = (unit for unit, ns in UNITS_NS.items() if abs(stamp * ns - log_time_ns) < 3600 * 10**9)
     return next(near, "ns")
 
 
 class ClockStep(NamedTuple):
-    """Where the times of a topic step back in the order of recording.
+    """A step back of a topic's times in the order of recording.
 
     Attributes:
-        is_sorted: whether the messages are sorted by time there, since none says that it follows another.
+        is_sorted: whether its messages are sorted by time, because sequence numbers do not order them.
     """
 
     from_ns: int
@@ -831,8 +836,8 @@ class PendingMessages:
     """Messages of one topic that wait until no earlier message can arrive.
 
     Attributes:
-        first_step: where times step back the first time.
-        taken_ns: the latest time of a message that no longer waits.
+        first_step: first step back of the times; None without one.
+        taken_ns: latest time of the messages that were taken.
     """
 
     def __init__(self, *, has_own_clock: bool) -> None:
@@ -847,29 +852,29 @@ class PendingMessages:
 
     @property
     def first_ns(self) -> int | None:
-        """The time of the first message that waits."""
+        """Time of the earliest waiting message; None without one."""
         return min((int(times_ns.min()) for times_ns, *_ in self._columns if len(times_ns)), default=None)
 
     @property
     def times_ns(self) -> Integers:
-        """The times of the messages that wait, in the order of arrival."""
+        """Times of the waiting messages, in the order of arrival."""
         return np.concatenate([np.empty(0, np.int64), *(times_ns for times_ns, *_ in self._columns)])
 
     def add(self, columns: tuple[Integers, Integers, Integers, Integers], contents: list[Any]) -> None:
         """Add messages in the order of arrival.
 
         Args:
-            columns: times, sequences, log times, and numbers that increase in the order of recording.
+            columns: times, sequence numbers, log times, and numbers that increase in the order of recording.
             contents: payloads, or decoded messages.
         """
         self._columns.append(columns)
         self._contents += contents
 
     def take(self, upto_ns: int) -> tuple[Integers, Integers, list[Any]]:
-        """Remove the messages up to a time, and return their times, log times and contents.
+        """Remove the messages up to a time; return their times, log times and contents.
 
-        They are ordered by time, then sequence, then arrival. A message that was recorded after a step of the
-        clock, and would be sorted among those before, counts right after them.
+        The order is by time, then sequence number, then arrival. A message recorded after a step back of the
+        clock gets a time right after the messages before the step.
         """
         none = np.empty(0, np.int64)
         columns = zip((none, none, none, none), *self._columns, strict=True)
@@ -890,14 +895,14 @@ class PendingMessages:
     def _without_steps(
         self, times_ns: Integers, sequences: Integers, recorded: Integers, upto_ns: int
     ) -> Integers:
-        """Return times that do not step back, if the sequence of the log's clock goes on where they do."""
+        """Return times without steps back, if sequence numbers of the log increase across the steps."""
         order = np.argsort(recorded, kind="stable")
         times = times_ns[order]
         back = np.flatnonzero(times[1:] < times[:-1] - LEAST_STEP_NS)
-        # the log's sequence says nothing of the sender's clock
+        # sequence numbers of the log do not order messages on the clock of the sender
         is_sorted = self._has_own_clock or not (np.diff(sequences[order]) > 0).all()
         if is_sorted and len(back):
-            # all that was recorded before a message has arrived when it is taken
+            # only steps of messages that are taken now: all messages recorded before them have arrived
             back = back[times[back + 1] <= upto_ns]
             back = back[np.argsort(times[back + 1], kind="stable")]
         if not len(back):
@@ -906,7 +911,7 @@ class PendingMessages:
         self.first_step = self.first_step or ClockStep(int(times[at]), int(times[at + 1]), is_sorted)
         if is_sorted:
             return times_ns
-        # strictly increasing: what was recorded later counts later
+        # strictly increasing, so that a message recorded later is valid later
         number = np.arange(len(times))
         moved = np.empty_like(times)
         moved[order] = np.maximum.accumulate(times - number) + number
@@ -914,7 +919,7 @@ class PendingMessages:
 
 
 def _number(value: object) -> float:
-    """Return the value of a signal, and the `text_number` of a text."""
+    """Return the value of a signal; NaN for None, and the `text_number` of a text."""
     try:
         return float("nan") if value is None else float(value)  # type: ignore[arg-type]
     except ValueError:
@@ -922,7 +927,7 @@ def _number(value: object) -> float:
 
 
 def _skip(payload: bytes) -> None:
-    """Decode nothing: only the times of the topic are used."""
+    """Decode nothing, for a topic of which only the times are used."""
 
 
 def _chunk_size(contents: Sequence[Any]) -> int:
