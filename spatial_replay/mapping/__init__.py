@@ -1,1 +1,1 @@
-"""Mapping files: from the messages of external logs to objects and signals."""
+"""Mapping files, which turn messages of external logs into objects and signals."""

@@ -1,7 +1,7 @@
 """Bind a layout to the first object of a topic: field paths in, compiled getters out.
 
-A layout names alternatives; the first object decides which of them its topic has, and for times, whether they
-are two fields or a number. Names and classes of objects become codes.
+A layout lists alternative paths. The first object decides which alternative its topic has, and whether a time
+is two fields or a number. Names and classes of objects become codes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ BY_PLACE = "only the places in the list distinguish objects without an id: objec
 _LONGEST_NAME = 500
 _UUID_BYTES = 16
 _MOST_IN_NAME = 16
-"""Elements of a list that one name is made of, such as the ids of a bundle of tags."""
+"""Elements of a list at most that form one name, such as the ids of a bundle of tags."""
 
 
 class Codes(dict[Any, int]):
@@ -73,7 +73,7 @@ class Codes(dict[Any, int]):
 
 
 class Namer:
-    """Names objects by a template, with codes that several namers share.
+    """Namer of objects by a template, with codes that several namers share.
 
     Args:
         only, without: patterns of names to keep and to leave out.
@@ -91,7 +91,7 @@ class Namer:
         self._code_by_value: dict[Any, int] = {}
         self._get: Callable[[Any, int | str, Any], Any] | None = None
         self.is_by_place = False
-        """Whether nothing but their places in a list distinguished some objects."""
+        """Whether some objects were distinguished only by their indices in a list."""
         self._has_ids = False
         self._is_prepared = False
 
@@ -102,7 +102,7 @@ class Namer:
 
     @property
     def needs_messages(self) -> bool:
-        """Whether names depend on fields of the messages, and not of the objects alone."""
+        """Whether names depend on fields of the messages, outside the objects."""
         parts = (path for part in self._template.parts if not isinstance(part, str) for path in part)
         return any(path.from_message for path in parts)
 
@@ -115,8 +115,8 @@ class Namer:
         """Return the code of each object's name.
 
         Args:
-            indices: the index of each object in its list, or its key.
-            messages: the message of each, if the namer `needs_messages`.
+            indices: index or key of each object in its list.
+            messages: message of each object, if the namer `needs_messages`.
 
         Raises:
             FieldError: a field of the template is missing, or the name is empty or too long.
@@ -125,7 +125,7 @@ class Namer:
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
             return [self._codes[_check_name(name or self._topic)]] * len(objects)
         if objects and not self._is_prepared:
-            # step by step once, because the errors of the fast getter name no fields
+            # the first object is read step by step, because the errors of the fast getter name no fields
             message = messages[0] if messages else None
             self._name(objects[0], indices[0], message)
             self._prepare(objects[0], indices[0], message)
@@ -145,7 +145,7 @@ class Namer:
         return codes
 
     def select(self, codes: Sequence[int]) -> list[bool]:
-        """Return whether to keep the objects with these codes of names."""
+        """Return for each code of a name whether the patterns keep it."""
         for code in set(codes).difference(self._is_wanted):
             name = self._codes.by_code[code]
             is_named = not self._only or any(fnmatchcase(name, pattern) for pattern in self._only)
@@ -154,7 +154,7 @@ class Namer:
         return [self._is_wanted[code] for code in codes]
 
     def _prepare(self, example: object, index: int | str, message: object) -> None:
-        """Find a fast way: most templates have one field, so that a name is known by its value."""
+        """Compile a getter if the template has one field, so that names can be cached by its value."""
         self._is_prepared = True
         fields = [part for part in self._template.parts if not isinstance(part, str)]
         built_in = {INDEX, TOPIC}.difference(field_names(example))
@@ -228,7 +228,7 @@ def _first_value(gets: Sequence[Get], element: object) -> Any:
             continue
         if isinstance(value, Zero):
             return None
-        # lists and messages cannot be keys of a dictionary
+        # as text, because lists and messages cannot be keys of a dictionary
         return value if isinstance(value, str | int | float | bool) else str(value)
     return None
 
@@ -236,7 +236,7 @@ def _first_value(gets: Sequence[Get], element: object) -> Any:
 def _class_name(layout: MessageLayout, value: object, names: Table[object, str]) -> str | None:
     if value is None or value == "":
         return None
-    # JSON can spell lone surrogates, which UTF-8 cannot write
+    # JSON can contain lone surrogates as escapes, which UTF-8 cannot encode
     number = str(value).encode("utf-8", "replace").decode()
     text = names.get(value, number)
     for key in (number, text):
@@ -266,7 +266,7 @@ def _text(value: object, path: FieldPath) -> str:
 
 
 def _is_uuid(value: object) -> bool:
-    """Return whether a value is 16 bytes, as texts or lists of small numbers hold them, too."""
+    """Return whether a value is a sequence of 16 bytes; a text is not."""
     if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != _UUID_BYTES:
         return False
     try:
@@ -301,24 +301,27 @@ _TIME_FIELDS = (
 class Binding:
     """Getters for the columns of objects.
 
-    A column is an index into the tuple that `numbers` returns. All numbers of an object are read with one
-    call, because that is several times faster than a call for each.
+    A column is an index into the tuple that `numbers` returns. One call reads all numbers of an object,
+    because that is several times faster than one call per number.
 
     Attributes:
-        numbers: reads every number of an object; None if there are none.
+        style: access to fields.
+        width: number of columns.
+        numbers: getter of all numbers of an object; None without numbers.
         position: columns of x, y and maybe z; () for polygons and solids, which have their own coordinates.
-        orientation: columns of x, y, z, w; () for none.
-        yaw: a column, or None.
-        sizes: columns of length, width and maybe height, if the message has them.
-        shape_sizes, height: from the mapping, each a number (float) or a column (int).
-        uncertainty: a number, a column, or None.
-        has_rings: whether `polygon` returns what holds rings, instead of corners.
-        class_names: the names of the numbers of a protobuf enum.
-        unset: columns of numbers that a protobuf sender may not set, with their paths and defaults.
-        frame: reads the frame's name, and whether from the message instead of the object; None for the fixed
-            frame.
-        outer_frame: reads the frame of the message, for objects whose own is empty.
-        own_stamp: reads the stamp of an object in a message that has another one.
+        orientation: columns of x, y, z, w; () without one.
+        yaw: column, or None.
+        sizes: columns of length, width and maybe height; () if the message has none.
+        shape_sizes, height: measures of the mapping, each a number (float) or a column (int).
+        uncertainty: number (float), column (int), or None.
+        polygon: getter of corners or rings; None without an outline.
+        has_rings: whether `polygon` returns the holder of rings instead of corners.
+        class_names: names by number of a protobuf enum.
+        unset: (column, path, default) of numbers that a protobuf sender may leave unset.
+        frame: getter of a frame's name, and whether it reads the message instead of the object; None for the
+            fixed frame.
+        outer_frame: getter of the message's frame, for objects with an empty frame.
+        own_stamp: getter of an object's stamp, if the message has another stamp.
     """
 
     style: Style
@@ -345,7 +348,7 @@ class Binding:
 
 @dataclass(frozen=True, slots=True)
 class TimeGetter:
-    """Reads a time: a pair of seconds and nanoseconds, or one number of `unit_ns`, or a text of either."""
+    """Getter of a time: a pair of seconds and nanoseconds, a number in `unit_ns`, or a text."""
 
     path: FieldPath
     get: Get
@@ -353,11 +356,11 @@ class TimeGetter:
     unit_ns: int
 
     def nanoseconds(self, values: Sequence[object]) -> list[int]:
-        """Return the times in the messages or objects that `path` starts from.
+        """Return the times in the messages or objects at which `path` starts.
 
         Raises:
-            FieldError: one lies outside the times of a log.
-                TypeError, ValueError, OverflowError: one is not a time.
+            FieldError: a time lies outside the times of a log.
+            TypeError, ValueError, OverflowError: a value is not a time.
         """
         times = map(self.get, values)
         if not self.is_pair:
@@ -379,7 +382,7 @@ class TimeGetter:
                 f"{self.path.text}: its nanoseconds, {rest.max()}, are not below one second, so the stamp is"
                 " invalid; `clock: log` takes the time of recording"
             )
-        # before the product, which would overflow
+        # checked before the product below, which would overflow
         if len(seconds) and max(np.abs(seconds).max(), np.abs(rest).max()) >= LATEST_NS // _SECOND_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
         return [int(time) for time in (seconds * _SECOND_NS + rest).tolist()]
@@ -397,10 +400,10 @@ _SECONDS = re.compile(r"([+-]?\d{1,19}(?:\.\d{1,18})?)(s?)", re.ASCII)
 
 
 def ns_from_text(text: str, unit_ns: int) -> int:
-    """Return the time of an RFC 3339 text, or of a number in units or, as `1.5s`, in seconds.
+    """Return the nanoseconds of a text: an RFC 3339 time, a number in units, or seconds such as `1.5s`.
 
     Raises:
-        ContentError: the text is neither.
+        ContentError: the text is none of these.
     """
     if number := _SECONDS.fullmatch(text):
         return int(Decimal(number[1]) * (_SECOND_NS if number[2] else unit_ns))
@@ -418,10 +421,12 @@ def ns_from_text(text: str, unit_ns: int) -> int:
 
 
 def ns_from_json(value: Any) -> int:
-    """Return a duration as JSON has it: seconds and nanoseconds, or a text such as `1.5s`; 0 without one.
+    """Return the nanoseconds of a time or duration in JSON; 0 without one.
+
+    The value is an object with seconds and nanoseconds, a text such as `1.5s`, or a number of nanoseconds.
 
     Raises:
-        ContentError, TypeError, ValueError: it is none.
+        ContentError, TypeError, ValueError: the value is none of these.
     """
     if isinstance(value, dict):
         seconds, rest = (
@@ -433,7 +438,10 @@ def ns_from_json(value: Any) -> int:
 
 
 def _is_numeral(value: object) -> bool:
-    """Return whether a text is a number, as JSON of protobuf has whole numbers of 64 bits and NaN."""
+    """Return whether a value is a text of a number.
+
+    ProtoJSON writes 64-bit integers and NaN as texts (https://protobuf.dev/programming-guides/json/).
+    """
     try:
         return isinstance(value, str) and float(value) is not None
     except ValueError:
@@ -441,7 +449,7 @@ def _is_numeral(value: object) -> bool:
 
 
 class _Columns:
-    """Distinct paths of numbers, each with a column."""
+    """Distinct paths of numbers; the index of a path is its column."""
 
     def __init__(self, example: object) -> None:
         self.example = example
@@ -463,7 +471,7 @@ class _Columns:
         return tuple(self.add(FieldPath.of(path)) for path in paths)
 
     def point(self, path: FieldPath, names: str) -> tuple[int, ...]:
-        """Return the columns of a point's coordinates, at least two."""
+        """Return the columns of two or more coordinates of a point."""
         value = walk(path, self.example)
         present = tuple(names) if isinstance(value, Sparse) else field_names(value)
         if all(name in present for name in names[:2]):
@@ -480,13 +488,13 @@ class _Columns:
 
 
 def bind(layout: MessageLayout, example: object, message: object, *, needs_frame: bool) -> Binding:
-    """Bind a layout to the fields that an object has.
+    """Bind a layout to the fields of an object.
 
     Args:
-        example: the first object; it stands in `message`.
+        example: first object of the topic, which is part of `message`.
 
     Raises:
-        FieldError: a path leads nowhere; the message lists the existing fields.
+        FieldError: a path does not resolve; the text lists the existing fields.
     """
     style = style_of(example)
     if isinstance(example, Sparse):
@@ -507,7 +515,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     polygon, has_rings = _polygon(layout, columns)
     class_paths = [FieldPath.of(path) for path in layout.class_field]
     if len(class_paths) == 1:
-        # alternatives may all be missing, a single path of the mapping must not
+        # a single path comes from the mapping and must exist; all alternatives of a type may be missing
         walk(class_paths[0], example)
     frame = _frame(layout.frame, example, message, needs_frame)
     outer_frames = [path for path in layout.frame if FieldPath.of(path).from_message]
@@ -538,14 +546,14 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         unset=tuple(
             (column, path, _default(path, example))
             for column, path in enumerate(paths)
-            # an orientation that is not set is one of zeros, and heights are needed by few
+            # an unset quaternion is zeros, which mean no rotation; few specifications need z, so it stays 0
             if column not in (*orientation, *position[2:]) and may_be_unset(path, example)
         ),
     )
 
 
 def _default(path: FieldPath, example: object) -> float:
-    """Return the number at a path of a protobuf message in which nothing is set; 0 below a list."""
+    """Return the number at a path of an empty protobuf message; 0 if the path crosses a list."""
     try:
         return float(walk(path, type(example)()))  # type: ignore[arg-type]
     except FieldError:
@@ -553,7 +561,7 @@ def _default(path: FieldPath, example: object) -> float:
 
 
 def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
-    """Return the names of the numbers of the first path that leads to a protobuf enum."""
+    """Return the names by number of the first path that resolves to a protobuf enum; {} without one."""
     for path in paths:
         with suppress(FieldError):
             if names := enum_names(path, example):
@@ -562,7 +570,7 @@ def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
 
 
 def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout:
-    """Return a layout without alternatives of which nothing is there, which would all be 0."""
+    """Return a layout without alternatives that are missing in a sparse object, which would read as 0."""
 
     def is_there(paths: Alternatives | str) -> bool:
         alternatives = (paths,) if isinstance(paths, str) else paths
@@ -573,7 +581,7 @@ def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout
 
     return replace(
         layout,
-        # where nothing looks like a position, that is said
+        # one alternative stays, so that an object without a position is an error
         position=present(layout.position) or layout.position[:1],
         orientation=present(layout.orientation),
         yaw=present(layout.yaw),
@@ -598,7 +606,7 @@ def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
 
 
 class OrderError(FieldError):
-    """Four numbers of a quaternion whose order the mapping does not say."""
+    """A quaternion of four numbers without an order in the mapping, or of named fields with one."""
 
 
 def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
@@ -624,7 +632,7 @@ def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
 
 
 def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolved]) -> _Resolved | None:
-    """Resolve the first alternative that exists; a single one must exist.
+    """Resolve the first existing alternative; None if none of several exists.
 
     Raises:
         FieldError: the only alternative does not exist.
@@ -692,10 +700,10 @@ def _frame(
 def bind_time(
     stamps: Sequence[Stamp], example: object, message: object, faults: list[str] | None = None
 ) -> TimeGetter | None:
-    """Bind the first stamp that exists and is a time; None if none does.
+    """Bind the first existing stamp that is a time; None if none of several is.
 
     Args:
-        faults: gets why those that exist are no times, if there are several.
+        faults: list to which reasons are added why existing fields are not times.
 
     Raises:
         FieldError: the only stamp does not exist, or is not a time.
@@ -719,7 +727,7 @@ def _time_getter(stamp: Stamp, path: FieldPath, root: object) -> TimeGetter:
     """Return the getter of a stamp.
 
     Raises:
-        FieldError: the path leads to no time.
+        FieldError: the value at the path is not a time.
     """
     value = walk(path, root)
     if stamp.nanoseconds:

@@ -1,7 +1,7 @@
 """Detections in columns: chunks of decoded objects in; poses, solids and names as arrays out.
 
-Coordinates are those of the messages; `tracker` brings them into the fixed frame. Footprints are projections
-of solids along z, with intervals of heights.
+Coordinates are those of the messages; `tracker` transforms them into the fixed frame. Footprints are
+projections of solids along z, with height intervals.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from spatial_replay.mapping.transforms import (
 BOX, DISC, CYLINDER, SPHERE, POLYGON, HULL = range(6)
 """Kinds of solids with their three sizes. Box: length, width, height (NaN if flat). Disc: diameter. Cylinder:
 diameters along x and y, height. Sphere: diameters along x, y and z. A polygon has corners in order, a hull
-points in any order. Cylinders that are tilted or not round, and spheres that are not round, count as their
-bounding boxes."""
+points in any order. A cylinder that is tilted or not round is replaced by its bounding box, as is a sphere
+that is not round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +50,13 @@ class Solids:
     """P solids that make up R objects.
 
     Attributes:
-        owner: (P,) int64, increasing: the object that a solid belongs to.
+        owner: (P,) int64, increasing: the object of each solid.
         kind: (P,) int8.
-        position: (P, 3), rotation: (P, 3, 3): frame_from_solid.
-        size: (P, 3).
-        point_start: (P + 1,) int64 into `points` (V, 3), which are in the solid's frame.
+        position: (P, 3), translation of frame_from_solid.
+        rotation: (P, 3, 3), rotation of frame_from_solid.
+        size: (P, 3), see the kinds.
+        point_start: (P + 1,) int64, starts of the solids in `points`, then the end of the last.
+        points: (V, 3), in the solid's frame.
     """
 
     owner: Integers
@@ -82,10 +84,10 @@ class Solids:
 
 
 def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
-    """Return the footprints (R,) of objects; an object has no height if one of its solids has none.
+    """Return the footprints (R,) of objects; an object has no height if a solid of it has none.
 
     Args:
-        count: R.
+        count: number of objects, R.
     """
     solids = _with_boxes(solids)
     kind, size = solids.kind, solids.size
@@ -125,7 +127,7 @@ _IS_ROUND = np.array([False, True, True, True, False, False])
 
 
 def _with_boxes(solids: Solids) -> Solids:
-    """Replace the cylinders and spheres that count as their bounding boxes."""
+    """Replace cylinders that are tilted or not round, and spheres that are not round, by boxes."""
     kind, size = solids.kind, solids.size
     doubtful = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
     kind, size = kind[doubtful], size[doubtful]
@@ -138,7 +140,7 @@ def _with_boxes(solids: Solids) -> Solids:
 
 
 def _rectangles(solids: Solids, pieces: Integers) -> Floats:
-    """Return the corners (K, 4, 2), seen from above, of boxes that are flat or upright."""
+    """Return the corners (K, 4, 2) of flat or upright boxes, seen from above."""
     along = solids.rotation[pieces, :2, 0] * (solids.size[pieces, 0, None] / 2)
     across = solids.rotation[pieces, :2, 1] * (solids.size[pieces, 1, None] / 2)
     centre = solids.position[pieces, :2]
@@ -149,9 +151,9 @@ def _rectangles(solids: Solids, pieces: Integers) -> Floats:
 def _hexagons(solids: Solids, pieces: Integers) -> Floats:
     """Return the outlines (K, 6, 2) of tilted boxes, seen from above.
 
-    The projection of a box is the Minkowski sum of its three projected axes. With the axes turned into the
-    upper half plane and ordered by angle, the outline runs from the lowest corner along each of them, and
-    back.
+    The projection of a box is the Minkowski sum of its three projected axes, a zonogon. The axes are flipped
+    into the upper half plane and ordered by angle. The outline starts at the lowest corner, runs along each
+    axis in this order, and then back along each axis in the same order.
     """
     axes = np.swapaxes(solids.rotation[pieces, :2, :] * (solids.size[pieces, None, :] / 2), 1, 2)
     down = (axes[..., 1] < 0) | ((axes[..., 1] == 0) & (axes[..., 0] < 0))
@@ -177,7 +179,7 @@ def _fill_polygons(vertices: Floats, start: Integers, solids: Solids, pieces: In
 
 
 def _ring(solids: Solids, piece: int) -> Floats:
-    """Return the convex hull, seen from above, of a solid's points; one NaN if some are not finite."""
+    """Return the convex hull of a solid's points, seen from above; one NaN if a point is not finite."""
     points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]
     placed = points @ solids.rotation[piece].T + solids.position[piece]
     if not np.isfinite(placed).all():
@@ -187,13 +189,13 @@ def _ring(solids: Solids, piece: int) -> Floats:
 
 
 def _height_intervals(solids: Solids, count: int) -> tuple[Floats, Floats]:
-    """Return the bottom and the top (R,) of objects; NaN if one of their solids is flat."""
+    """Return the bottom and the top (R,) of objects; NaN if a solid of the object is flat."""
     is_flat_box = (solids.kind == BOX) & np.isnan(solids.size[:, 2])
     has_height = (solids.kind != DISC) & (solids.kind != POLYGON) & ~is_flat_box
     if not has_height.any():
         return np.full(count, np.nan), np.full(count, np.nan)
     up = solids.rotation[:, 2, :]
-    # half the extent along z of a box in any orientation
+    # half the extent along z of a rotated box: the sum of its projected half axes
     half = np.einsum("ij,ij->i", np.abs(up), np.nan_to_num(solids.size)) / 2
     half = np.where(solids.kind == SPHERE, solids.size[:, 0] / 2, half)
     half = np.where(has_height, half, np.nan)
@@ -205,7 +207,7 @@ def _height_intervals(solids: Solids, count: int) -> tuple[Floats, Floats]:
     if len(lowest) == count:
         return lowest, highest
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
-    # NaN prevails: one solid without a height leaves the object without
+    # minimum and maximum keep NaN, so that one solid without a height makes the object one without
     np.minimum.at(bottom, solids.owner, lowest)
     np.maximum.at(top, solids.owner, highest)
     return bottom, top
@@ -215,13 +217,15 @@ Numbers: TypeAlias = tuple[float, ...]
 GetField: TypeAlias = Callable[[Any, str], Any]
 
 MARKER_ADD, MARKER_DELETE, MARKER_DELETE_ALL = 0, 2, 3
+"""Actions of https://docs.ros.org/en/jazzy/p/visualization_msgs/interfaces/msg/Marker.html."""
 DELETE_ALL_ENTITIES = (1, "ALL")
+"""Forms of ALL in https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion-type."""
 
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 class Solid(NamedTuple):
-    """One solid in the frame of its message; its numbers mean the same as in `Solids`."""
+    """One solid in the frame of its message; for its numbers see `Solids`."""
 
     kind: int
     position: Numbers
@@ -231,12 +235,13 @@ class Solid(NamedTuple):
 
 
 def lenient_getter(style: Style) -> GetField:
-    """Return a function to read a field; in JSON objects, where fields may be missing, it returns None."""
+    """Return a getter of a field by name; for a missing field of a JSON object it returns None."""
     return getattr if style == "attributes" else lambda value, name: value.get(name)
 
 
 def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
-    """Return the solids of a visualization_msgs/Marker; none for arrows, lines and texts."""
+    """Return the solids of a visualization_msgs/Marker; [] for arrows, lines and texts."""
+    # 1 CUBE, 2 SPHERE, 3 CYLINDER, 6 CUBE_LIST, 7 SPHERE_LIST, 11 TRIANGLE_LIST
     kind, scale = get(marker, "type"), _vector(get(marker, "scale"), get)
     position, quaternion = _pose(get(marker, "pose"), get)
     single = {1: BOX, 2: SPHERE, 3: CYLINDER}.get(kind)
@@ -244,7 +249,7 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
         return [Solid(single, position, quaternion, scale)]
     points = [_vector(point, get) for point in get(marker, "points") or ()]
     if kind in (6, 7):
-        # elements of a list marker; the point, in the marker's frame, is added when solids are put in columns
+        # elements of a list marker; `_listed_solids` adds the point, which is in the marker's frame
         element = BOX if kind == 6 else SPHERE
         return [Solid(element, position, quaternion, scale, (point,)) for point in points]
     if kind == 11 and len(points) >= 3:
@@ -254,13 +259,13 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
 
 
 def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
-    """Return the solids of a foxglove.SceneEntity; its lines, arrows, texts and models are left out."""
+    """Return the solids of a foxglove.SceneEntity, without its lines, arrows, texts and models."""
     solids: list[Solid] = []
     for name, kind in (("cubes", BOX), ("spheres", SPHERE), ("cylinders", CYLINDER)):
         for primitive in get(entity, name) or ():
             size = _vector(get(primitive, "size"), get)
             if kind == CYLINDER:
-                # both are 0 where a protobuf sender sets neither
+                # both scales are 0 if a protobuf sender leaves them unset, which means 1
                 scale = (
                     max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale"))) or 1.0
                 )
@@ -279,7 +284,9 @@ def _triangles(pose: tuple[Numbers, Numbers], corners: Sequence[Numbers]) -> lis
 
 
 def solids_of_perceived_object(perceived_object: Any, get: GetField) -> list[Solid]:
-    """Return the solid of a derived_object_msgs/Object: its shape, else its polygon, else its position."""
+    """Return the solid of a derived_object_msgs/Object: its shape, otherwise its polygon, or its position."""
+    # 1 BOX, 2 SPHERE, 3 CYLINDER and 4 CONE: radii and height, not diameters, as in
+    # https://github.com/ros2/common_interfaces/blob/humble/shape_msgs/msg/SolidPrimitive.msg
     pose = _pose(get(perceived_object, "pose"), get)
     shape = get(perceived_object, "shape")
     kind = get(shape, "type")
@@ -317,7 +324,7 @@ def _or_one(value: Any) -> float:
 
 
 EVERY_OBJECT = -1
-"""Instead of the code of a name: all objects of the topic."""
+"""Code for all objects of a topic, instead of the code of a name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,7 +333,7 @@ class Poses:
 
     Attributes:
         position: (R, 3).
-        rotation: (R, 3, 3) frame_from_object.
+        rotation: (R, 3, 3), frame_from_object.
         yaw: (R,) radians; NaN for objects without an orientation.
     """
 
@@ -346,20 +353,20 @@ class Detections:
     """R objects in M messages of a topic.
 
     Attributes:
-        message: (R,) int64, increasing: the message of each object.
-        name, class_code: (R,) int64.
-        frames: the name of the frame of each, or None if all are in the fixed frame.
-        stamp_ns: (R,) int64, or None if messages have no stamps.
-        poses: (R,) poses.
-        solids: the solids that the objects consist of.
-        height: (R, 2) above the origin of each; None for the heights of the solids.
+        message: (R,) int64, increasing: index of each object's message.
+        name, class_code: (R,) int64 codes.
+        frames: name of each object's frame; None if all objects are in the fixed frame.
+        stamp_ns: (R,) int64; None if messages have no stamps.
+        poses: poses of the objects.
+        solids: solids of the objects.
+        height: (R, 2) bottom and top above each object's origin; None for the heights of the solids.
         uncertainty: (R,) radius.
-        covariance: (R, 3, 3) of the position with the number of deviations applied, or None.
-        lifetime_ns: (R,), 0 for no limit; None if no object has a limit.
-        is_locked: (R,) whether an object stays in its frame, which may move; None if none does.
+        covariance: (R, 3, 3) covariance of each position, times the squared number of deviations, or None.
+        lifetime_ns: (R,), 0 for no limit; None if the topic has no lifetimes.
+        is_locked: (R,) whether an object moves with its frame; None if no object does.
         deleted: (message, code of the name or `EVERY_OBJECT`) of each deletion.
-        skipped: the number of objects without a solid.
-        numbers: (R, W) every number that the binding reads, as messages have them; None without a binding.
+        skipped: number of objects without a solid.
+        numbers: (R, W) all numbers that the binding reads, unchanged; None without a binding.
     """
 
     message: Integers
@@ -379,7 +386,7 @@ class Detections:
     numbers: Floats | None = None
 
     def scale(self, factor: float) -> Detections:
-        """Return the same objects with lengths times a factor."""
+        """Return the same objects with all lengths multiplied by a factor."""
         solids, poses = self.solids, self.poses
         return replace(
             self,
@@ -396,7 +403,7 @@ class Detections:
         )
 
     def repeat(self, index: int, count: int) -> Detections:
-        """Return one of the objects `count` times, each in a message of its own, without frame and stamp."""
+        """Return `count` copies of one object, each in a separate message, without frame and stamp."""
         rows = np.full(count, index, np.int64)
         poses = self.poses
         return Detections(
@@ -413,15 +420,16 @@ class Detections:
 
 @dataclass(slots=True)
 class DetectionChunk:
-    """Objects of a few messages, not yet in columns; further attributes as of `Detections`.
+    """Objects of a few messages, partly as lists; for other attributes see `Detections`.
 
     Attributes:
-        places: the place of each message in its batch.
+        places: index of each message in its batch.
         deleted, message: messages as indices into `places`.
-        numbers: (R, W) every number that the binding reads from an object.
-        noted_stamps: places of messages in their batch, and their stamps: one of many where no frames matter.
-        outline_counts: of polygons: (R,) how many make up an object.
-        corner_counts, corners: the counts of each of these, and all corners (V, 3).
+        numbers: (R, W) all numbers that the binding reads from an object.
+        noted_stamps: (index in the batch, stamp) of messages; only of the first if frames are not read.
+        outline_counts: (R,) number of polygons of each object.
+        corner_counts: number of corners of each polygon.
+        corners: (V, 3) corners of all polygons.
     """
 
     places: Integers
@@ -449,7 +457,7 @@ def detections_from_chunks(
     """Join the chunks of a batch into columns.
 
     Args:
-        good: (N,) which messages of the batch were read; the result counts these only.
+        good: (N,) whether a message of the batch was read; the result numbers only the good messages.
     """
     number = np.cumsum(good) - 1
     deleted = [
@@ -512,7 +520,7 @@ def _join_columns(columns: Iterable[Sequence[int]]) -> Integers:
 
 
 def poses_from_numbers(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
-    """Return the poses in the numbers (R, W); objects without an orientation have the frame's axes."""
+    """Return the poses in the numbers (R, W); objects without an orientation have the axes of their frame."""
     count = len(numbers)
     position = np.zeros((count, 3))
     if layout.origin is not None:
@@ -530,15 +538,16 @@ def poses_from_numbers(layout: MessageLayout, binding: Binding, numbers: Floats)
 
 
 _EQUATOR_M, _ECCENTRICITY_SQUARED = 6_378_137.0, 6.694379990141316e-3
-"""The ellipsoid of WGS 84."""
+"""Ellipsoid of WGS 84: semi-major axis, metres, and squared first eccentricity."""
 
 
 def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
-    """Return metres east and north of an origin, in the plane that touches the ellipsoid there, (R, 2).
+    """Return metres east and north of an origin (R, 2), in the plane tangent to the ellipsoid at the origin.
 
     Args:
-        fixes: latitude and longitude in degrees and, maybe, a status, (R, 2 or 3); below 0 there is no fix.
-        origin: latitude and longitude.
+        fixes: (R, 2 or 3) latitude and longitude in degrees, and maybe a status; a negative status means no
+            fix, as in sensor_msgs/NavSatStatus.
+        origin: latitude and longitude in degrees.
     """
 
     def to_earth_frame(degrees: Floats) -> Floats:
@@ -555,13 +564,14 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     )
     offsets = to_earth_frame(fixes) - to_earth_frame(np.array([origin]))
     metres: Floats = offsets @ np.stack([east, north], axis=1)
+    # longitudes may run to 360 degrees
     is_off = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
     metres[np.flatnonzero(is_off)] = np.nan
     return metres
 
 
 def heights_from_numbers(binding: Binding, numbers: Floats) -> Floats | None:
-    """Return the bottom and the top (R, 2) of objects above their origins; None without heights."""
+    """Return bottom and top (R, 2) of objects above their origins; None if the binding has no height."""
     if not binding.height:
         return None
     count = len(numbers)
@@ -580,12 +590,12 @@ def radii_from_numbers(binding: Binding, numbers: Floats, count: int) -> Floats:
 
 
 def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> Floats | None:
-    """Return the covariances (R, 3, 3) of positions, times the square of the number of deviations."""
+    """Return the covariances (R, 3, 3) of positions, times the squared number of deviations."""
     if binding.covariance is None or layout.uncertainty is None:
         return None
     rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)
     size = {4: 2, 9: 3, 36: 6}[rows.shape[1]]
-    # of 6 x 6, the position comes first, as in geometry_msgs
+    # a 6 x 6 covariance begins with the position, as in geometry_msgs/PoseWithCovariance
     used = min(size, 3)
     matrices = np.zeros((len(objects), 3, 3))
     matrices[:, :used, :used] = rows.reshape(-1, size, size)[:, :used, :used]
@@ -593,7 +603,7 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
 
 
 def _listed_solids(solid_lists: list[list[Solid]]) -> tuple[Solids, Poses]:
-    """Return the solids of objects with at least one each, and the pose of each object's first solid."""
+    """Return the solids of objects, at least one per object, and the pose of each object's first solid."""
     counts = np.array([len(solids) for solids in solid_lists], np.int64)
     solids = list(chain.from_iterable(solid_lists))
     position = _array([solid.position for solid in solids], 3)
@@ -613,7 +623,7 @@ def _listed_solids(solid_lists: list[list[Solid]]) -> tuple[Solids, Poses]:
 
 
 def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
-    """Return one solid each: the shape of the mapping or of the message; a point without either."""
+    """Return one solid per object: the shape of the mapping, or of the message, or a point."""
     shape = layout.shape
     position = poses.position if shape is None else _origins_of_shape(shape, poses)
     count = len(position)
@@ -633,14 +643,14 @@ def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbe
         if shape.points:
             corners = np.array([(x, y, 0.0) for x, y in shape.points])
             counts, points = np.full(count, len(corners)), np.tile(corners, (count, 1))
-    # NaN makes the object unknown, as a negative size should
+    # NaN instead of a negative size, so that the object is unknown
     size[:, :2] = np.where(size[:, :2] < 0, np.nan, size[:, :2])
     owner, kinds = np.arange(count), np.full(count, kind, np.int8)
     return Solids(owner, kinds, position, poses.rotation, size, starts_from_counts(counts), points)
 
 
 def _origins_of_shape(shape: ShapeMapping, poses: Poses) -> Floats:
-    """Return where the origins (R, 3) of a shape are, with its offset from those of objects."""
+    """Return the origins (R, 3) of a shape: the origins of objects plus the rotated offset."""
     if shape.offset == (0.0, 0.0):
         return poses.position
     return np.asarray(poses.position + poses.rotation[:, :, :2] @ np.array(shape.offset))
@@ -649,11 +659,13 @@ def _origins_of_shape(shape: ShapeMapping, poses: Poses) -> Floats:
 def _polygons(
     outline_counts: Integers, counts: Integers, points: Floats, frames: tuple[Floats, Floats] | None
 ) -> Solids:
-    """Return polygons with corners in the frame of their message, or in the objects' own.
+    """Return polygons with corners in the frame of their message, or in the frames of their objects.
 
     Args:
-        outline_counts: (R,) how many of the polygons make up an object.
-        frames: positions (R, 3), rotations (R, 3, 3) of the objects' own frames; None for that of messages.
+        outline_counts: (R,) number of polygons of each object.
+        counts: number of corners of each polygon.
+        frames: positions (R, 3) and rotations (R, 3, 3) of the objects' frames; None for corners in the frame
+            of their message.
     """
     count = len(counts)
     owner, kind = np.repeat(np.arange(len(outline_counts)), outline_counts), np.full(count, POLYGON, np.int8)

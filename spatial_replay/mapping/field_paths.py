@@ -5,14 +5,18 @@
     key       =  name | "'" any characters but ' { } | "'"
     template  =  { text | "{" path { "|" path } "}" }
 
-A key in quotes has dots, spaces or letters beyond ASCII: `'pose.x'`. A number below 0 counts from the end.
-`[*]` also takes the values of a JSON object or of a protobuf map. `[best]` is the element with the highest
-score. `[index]`, in names, is the element at the place, or key, that the object has in its own list.
-`tracks[id=7]` is the last element of `tracks` whose field `id` is 7; `position[name=elbow]` is the element of
-`position` where the list `name` beside it has `elbow`. Without such an element the value is unknown.
-Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and explains errors;
-`getter` compiles it to nested calls. A path comes from a file, so nothing in it is evaluated: it reaches
-only fields that the message declares.
+A key in quotes may have dots, spaces and letters beyond ASCII: `'pose.x'`. A number below 0 counts from the
+end. `[*]` selects the elements of a list, or the values of a JSON object or a protobuf map. `[best]` selects
+the element with the highest score. `[index]`, in names, selects the element at the index, or key, of the
+object in its own list.
+
+`tracks[id=7]` is the last element of `tracks` whose field `id` is 7. `position[name=elbow]` is the element of
+`position` at the index of `elbow` in the neighbouring list `name`. Without such an element the value is
+unknown.
+
+Messages are decoded ROS, protobuf or JSON messages. `walk` follows a path step by step and explains errors.
+`getter` compiles it to nested calls. A path comes from a file, so no part of it is evaluated as code: it
+reaches only fields that the message declares.
 """
 
 from __future__ import annotations
@@ -33,12 +37,12 @@ Style: TypeAlias = Literal["attributes", "keys"]
 
 
 def style_of(value: object) -> Style:
-    """Return how to access the fields of a message: by key for JSON objects, else by attribute."""
+    """Return the access to the fields of a message: by key for JSON objects, otherwise by attribute."""
     return "keys" if isinstance(value, dict) else "attributes"
 
 
 def field_names(value: object) -> tuple[str, ...]:
-    """Return the names of the fields of a message or a part of it; none for numbers, texts and lists."""
+    """Return the field names of a message or a part of it; () for numbers, texts and lists."""
     if isinstance(value, dict):
         return tuple(name for name in value if isinstance(name, str))
     if isinstance(value, Mapping):
@@ -67,12 +71,12 @@ _FREE = "google.protobuf.Struct"
 
 
 def _is_free(value: object) -> bool:
-    """Return whether a value is a protobuf message whose fields each sender chooses."""
+    """Return whether a value is a `google.protobuf.Struct`, in which each sender chooses the fields."""
     return getattr(getattr(value, "DESCRIPTOR", None), "full_name", "") == _FREE
 
 
 def _plain(value: Any) -> Any:
-    """Return the values of a `google.protobuf.Struct` as those of JSON, and all others as they are."""
+    """Return a `google.protobuf.Struct` and its parts as JSON values, and other values unchanged."""
     descriptor = getattr(value, "DESCRIPTOR", None)
     kind = "" if descriptor is None else descriptor.full_name
     if kind == _FREE:
@@ -86,14 +90,14 @@ def _plain(value: Any) -> Any:
 
 
 class Sparse(dict[str, Any]):
-    """A JSON object that leaves out fields which are 0, as proto3 writes it."""
+    """A JSON object in which missing fields are 0, as proto3 writes it."""
 
     def __missing__(self, key: str) -> Zero:
         return ZERO
 
 
 class Zero(Sparse):
-    """A field that was left out: a number, or a message or a list without anything in it."""
+    """A missing field: a number 0, an empty message or an empty list."""
 
     def __float__(self) -> float:
         return 0.0
@@ -109,7 +113,7 @@ def sparse(value: object) -> object:
     """Return a decoded message with its JSON objects as `Sparse`.
 
     Raises:
-        ContentError: it is nested too deeply.
+        ContentError: the message is nested too deeply.
     """
     try:
         return _sparse(value)
@@ -124,15 +128,16 @@ def _sparse(value: object) -> object:
 
 
 def from_protobuf_json(value: object, objects: str) -> object:
-    """Return a JSON message that protobuf may have written, with its fields as in the definition.
+    """Return a JSON message, possibly written by protobuf, with the fields of its definition.
 
-    `frameId` is `frame_id`, too, coordinates that are left out are 0, and an empty list of objects is there.
+    ProtoJSON renames fields and leaves out defaults (https://protobuf.dev/programming-guides/json/). So
+    `frameId` is added as `frame_id`, missing coordinates as 0, and a missing list of objects as an empty one.
 
     Args:
-        objects: the path of the list of objects, such as `entities[*]`; "" for none.
+        objects: path of the list of objects, such as `entities[*]`; "" without one.
 
     Raises:
-        ContentError: it is nested too deeply.
+        ContentError: the message is nested too deeply.
     """
     try:
         message = _message_from_json(value)
@@ -148,7 +153,7 @@ _POINT = MappingProxyType({"x": 0.0, "y": 0.0, "z": 0.0})
 
 def _message_from_json(value: object) -> object:
     if isinstance(value, list):
-        # long lists of numbers are as they are
+        # a list of numbers stays as it is, because it may be long
         return list(map(_message_from_json, value)) if value and isinstance(value[0], dict | list) else value
     if not isinstance(value, dict):
         return value
@@ -156,7 +161,7 @@ def _message_from_json(value: object) -> object:
         return {**_POINT, **value}
     fields = {key: _message_from_json(part) for key, part in value.items()}
     if "position" in fields:
-        # an orientation that is not set is a quaternion of zeros in protobuf's own encoding
+        # a missing orientation becomes a quaternion of zeros, as in protobuf's binary encoding
         fields.setdefault("orientation", {**_POINT, "w": 0.0})
     return {_snake_case(key): part for key, part in fields.items()} | fields
 
@@ -204,11 +209,11 @@ _PATH = re.compile(PATTERN, re.ASCII)
 
 
 class FieldError(Exception):
-    """A path that leads nowhere in a message; the text lists the existing fields."""
+    """A path that does not resolve in a message; the text lists the existing fields."""
 
 
 class ContentError(FieldError):
-    """A field that exists, but has an unusable value."""
+    """An existing field with an unusable value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,17 +223,17 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Keyed:
-    """The step `field[path=key]`: the element of a list by a field of its own, or by a list beside it."""
+    """The step `field[path=key]`: an element of a list, by a field of the element or by a list of names."""
 
     field: str
     path: FieldPath
     key: str
 
     def read(self, value: Any) -> object:
-        """Return the element; None, for an unknown number, where there is none.
+        """Return the element; None, which makes a number unknown, without such an element.
 
         Raises:
-            FieldError: elements lack the field.
+            FieldError: the elements lack the field.
         """
         elements = get_field(value, self.field)
         names = self.names(value)
@@ -240,7 +245,7 @@ class Keyed:
         return matching[-1] if matching else None
 
     def names(self, value: object) -> list[str] | None:
-        """Return the names in the list beside the field; None without such a list."""
+        """Return the names in the neighbouring list; None without one."""
         beside = self.path.text
         names = get_field(value, beside) if beside in field_names(value) else None
         return list(map(_word, names)) if is_list(names) else None
@@ -252,13 +257,13 @@ def _word(value: object) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Best:
-    """The step `[best]`: the element of a list with the highest score; the first of equals."""
+    """The step `[best]`: the first element of a list with the highest score."""
 
     def read(self, value: Any) -> object:
         """Return the element.
 
         Raises:
-            IndexError: there is none.
+            IndexError: the list is empty.
         """
         return value[0] if len(value) < 2 else max(value, key=_score)
 
@@ -267,7 +272,7 @@ _SCORES = ("score", "probability", "confidence")
 
 
 def _score(value: object) -> float:
-    """Return the score in a result or in its hypothesis; the least number without one."""
+    """Return the score of a result or of its hypothesis; -inf without one."""
     names = field_names(value)
     if "hypothesis" in names:
         return _score(get_field(value, "hypothesis"))
@@ -278,7 +283,7 @@ def _score(value: object) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The step `[index]`: the element at the place, or the key, that an object has in its own list."""
+    """The step `[index]`: the element at the index, or the key, of an object in its own list."""
 
 
 Step: TypeAlias = str | int | Each | Keyed | Best | Place
@@ -289,9 +294,9 @@ class FieldPath:
     """A field path.
 
     Attributes:
-        text: as written.
-        steps: names, indices, and `Each`.
-        from_message: whether it starts at the message, not at the object.
+        text: the path in the mapping.
+        steps: names, indices and other steps.
+        from_message: whether it starts at the message instead of the object.
     """
 
     text: str
@@ -336,15 +341,15 @@ def walk(
     """Return the value at a path without `[*]`.
 
     Args:
-        index: the place or the key of an object in its list, for `[index]`.
-        is_strict: whether fields that a sparse message leaves out are missing, and not 0.
-        may_lack_keys: whether a key that a protobuf map or Struct lacks is unknown, and no error.
+        index: index or key of the object in its list, for `[index]`.
+        is_strict: whether missing fields of a sparse message are errors instead of 0.
+        may_lack_keys: whether a missing key of a protobuf map or Struct is unknown instead of an error.
 
     Raises:
-        FieldError: the path leads nowhere; the text says where it ends and which fields exist there.
+        FieldError: the path does not resolve; the text names the failing step and the existing fields.
     """
     for step in path.steps:
-        # a Struct is read as a dictionary
+        # a Struct is handled as a dictionary
         has_free_keys = may_lack_keys and (isinstance(value, Mapping) or _is_free(value))
         if has_free_keys and str(step) not in field_names(value):
             return None
@@ -372,7 +377,7 @@ def _element_at_place(path: FieldPath, value: object, index: int | str | None) -
 
 
 def leads_somewhere(path: FieldPath, value: object) -> bool:
-    """Return whether a path without `[*]` leads to something that is there, from a value."""
+    """Return whether a path without `[*]` resolves in a value; missing fields count as missing, not as 0."""
     try:
         walk(path, value, is_strict=True)
     except FieldError:
@@ -434,7 +439,7 @@ def is_list(value: object) -> TypeGuard[Sequence[object]]:
 
 
 def enum_names(path: FieldPath, message: object) -> dict[object, str]:
-    """Return the names of the numbers of a protobuf enum at a path; none for anything else."""
+    """Return the names by number of a protobuf enum at a path; {} for other fields."""
     if not path.steps:
         return {}
     owner = walk(FieldPath(path.text, path.steps[:-1]), message)
@@ -444,7 +449,7 @@ def enum_names(path: FieldPath, message: object) -> dict[object, str]:
 
 
 def is_set(path: FieldPath, value: object) -> bool:
-    """Return whether a sender set the protobuf fields on a path, as far as their definition says."""
+    """Return whether a sender set the protobuf fields on a path; fields without presence count as set."""
     for step in path.steps:
         if isinstance(step, str) and not isinstance(value, Mapping):
             field = _definition_of(value, step)
@@ -455,7 +460,7 @@ def is_set(path: FieldPath, value: object) -> bool:
 
 
 def may_be_unset(path: FieldPath, example: object) -> bool:
-    """Return whether `is_set` can be false for messages like an example."""
+    """Return whether `is_set` may be false for messages of the example's type."""
     for step in path.steps:
         field = _definition_of(example, step) if isinstance(step, str) else None
         if field is not None and field.has_presence:
@@ -472,10 +477,11 @@ def _definition_of(value: object, name: str) -> Any:
 def getter(path: FieldPath, example: object) -> Get:
     """Compile a path without `[*]` to a function from a message to the value at the path.
 
-    The function is fast, but its errors (AttributeError, LookupError, TypeError) say little; `walk` explains.
+    The function is fast, but its errors (AttributeError, LookupError, TypeError) do not name the fields.
+    `walk` explains them.
 
     Args:
-        example: a message like those that the function is for.
+        example: message of the type that the function reads.
     """
     if _has_free_keys(path, example):
         return lambda value: walk(path, value, may_lack_keys=True)
@@ -505,7 +511,7 @@ def getter(path: FieldPath, example: object) -> Get:
 
 
 def _has_free_keys(path: FieldPath, value: object) -> bool:
-    """Return whether a path crosses a protobuf map or a Struct, whose keys are no attributes."""
+    """Return whether a path crosses a protobuf map or a Struct, whose keys are not attributes."""
     if style_of(value) == "keys":
         return False
     for step in path.steps:
@@ -533,10 +539,10 @@ def tuple_getter(paths: Sequence[FieldPath], example: object) -> Callable[[Any],
 
 
 def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
-    """Iterate over the elements at a path with `[*]`, in order; over the one value at a path without.
+    """Iterate over the elements at a path with `[*]`, in order, or over the single value at another path.
 
     Raises:
-        FieldError: the path leads nowhere.
+        FieldError: the path does not resolve.
     """
     values: list[object] = [message]
     for step in path.steps:
@@ -556,12 +562,12 @@ def elements_of(value: Any) -> Sequence[object]:
 
 
 def keys_of(value: Mapping[Any, object]) -> list[Any]:
-    """Return the keys of the objects in a JSON object, which may have numbers and texts, too, or in a map."""
+    """Return the keys of a protobuf map, or the keys of a JSON object whose values are objects."""
     return [key for key, part in value.items() if not isinstance(value, dict) or isinstance(part, dict)]
 
 
 def list_getter(path: FieldPath, example: object) -> Get | None:
-    """Compile the common form `a.b[*]` to a function that returns the list; None for other forms."""
+    """Compile a path of the form `a.b[*]` to a function that returns the list; None for other forms."""
     *before, last = path.steps
     if isinstance(last, Each) and not any(isinstance(step, Each) for step in before):
         return getter(FieldPath(path.text, tuple(before)), example)
@@ -569,13 +575,13 @@ def list_getter(path: FieldPath, example: object) -> Get | None:
 
 
 def below(path: FieldPath, step: str | int) -> FieldPath:
-    """Return the path with one more step."""
+    """Return the path extended by a step."""
     text = f"{path.text}[{step}]" if isinstance(step, int) else f"{path.text}.{step}"
     return FieldPath(text, (*path.steps, step), path.from_message)
 
 
 def is_number(value: object) -> bool:
-    """Return whether a field holds a number, or null, which JSON writes for a missing number."""
+    """Return whether a field holds a number, or null, which stands for a missing number in JSON."""
     if isinstance(value, str | bytes) or value is None or field_names(value):
         return value is None
     try:
@@ -604,9 +610,9 @@ class NameTemplate:
     """A template for the names of objects: literal text and fields in turn.
 
     Attributes:
-        parts: texts, and tuples of alternative fields: the first that exists and is not empty counts. Unless
-            a field has that name, `index` is the object's index in its list, or its key in a JSON object,
-            and `topic` its topic.
+        parts: texts, and tuples of alternative fields, of which the first existing one with a value is used.
+            If no field has that name, `index` is the object's index in its list, or its key in a JSON
+            object, and `topic` is its topic.
     """
 
     text: str
@@ -635,7 +641,7 @@ class NameTemplate:
 
 
 def name_from_topic(topic: str) -> str:
-    """Return the name of an object after its topic: `/turtle1/pose` → turtle1, `/pose` → pose."""
+    """Return an object's name from its topic: `/turtle1/pose` → turtle1, `/pose` → pose."""
     words = [word for word in topic.split("/") if word]
     if len(words) > 1 and words[-1].lower() in _DROPPED_ENDS:
         words.pop()

@@ -1,7 +1,8 @@
 """Load mapping files: YAML in, a `LogMapping` or a list of all errors out.
 
-The text is checked in two steps: against the published JSON Schema, whose violations are put into plain
-words, and for contradictions that a schema cannot express. The first half is the content as values.
+The text is checked in two steps: against the published JSON Schema, and for contradictions that a schema
+cannot express. Violations of the schema become plain sentences. The first half of the module defines the
+values of a mapping.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from spatial_replay.text import nearest_hint
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 Clock: TypeAlias = Literal["log", "publish", "header"]
-"""Which time of a message counts: when it was recorded, when it was sent, or the stamp inside it."""
+"""Time of a message: of recording ("log"), of sending ("publish"), or its stamp ("header")."""
 
 DEFAULT_MAX_AGE_NS = 10**9
 FOREVER_NS = 2**63 - 1
-"""The `max_age` of observations that stay valid forever."""
+"""`max_age` of observations that stay valid forever, nanoseconds."""
 
 NO_TOPIC = "no topic was chosen: name one with objects or signals"
 """Error of a mapping without topics."""
@@ -46,7 +47,7 @@ NO_FRAME = "no frame was chosen: name the one that coordinates are brought into"
 """Error of a mapping with an open fixed frame."""
 
 Measure: TypeAlias = float | str
-"""A number, or the field path of one."""
+"""A number, or the path of a field that holds it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +55,12 @@ class ShapeMapping:
     """A footprint in an object's own frame.
 
     Attributes:
-        kind: "box" (sizes: length along x, width along y, optionally height along z), "disc" (sizes: radius)
-            or "polygon" (its corners as points, or as outline the path of them).
-        offset: its centre (x, y) in the object's own frame, in footprint units.
-        height: its bottom and top above the object's own origin.
+        kind: "box", "disc" or "polygon".
+        sizes: length along x, width along y and maybe height along z of a box; radius of a disc.
+        points: fixed corners of a polygon.
+        outline: path of the corners of a polygon; "" without one.
+        offset: centre (x, y) in the object's own frame, in footprint units.
+        height: bottom and top above the object's origin.
     """
 
     kind: Literal["box", "disc", "polygon"]
@@ -70,10 +73,11 @@ class ShapeMapping:
 
 @dataclass(frozen=True, slots=True)
 class ClassMapping:
-    """Maps a field to a class: `table[str(value)]`, or `other` for values that are not in the table.
+    """Mapping from a field to a class: `table[str(value)]`, or `other` for values outside the table.
 
     Attributes:
-        changes: whether an object that changes its class keeps the first, or becomes another object.
+        has_other: whether `other` is given; otherwise values outside the table are classes themselves.
+        changes: effect of a change of class: only a remark, a second object ("split"), or none ("first").
     """
 
     field: str
@@ -85,10 +89,10 @@ class ClassMapping:
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """A radius: a number, the field of one, or `sigmas` standard deviations of a covariance.
+    """Radius of uncertainty: a number, a field, or `sigmas` standard deviations of a covariance.
 
     Attributes:
-        measure: the number or the field path; "" for the covariance of a built-in type.
+        measure: number or field path; "" for the covariance of a built-in type.
     """
 
     measure: Measure
@@ -98,10 +102,10 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True)
 class SignalMapping:
-    """A signal: the path of its field, and its unit for readers.
+    """A signal: the path of its field, and its unit.
 
     Attributes:
-        unit: or the names of its numbers, see `names_from_unit`.
+        unit: unit, or names of its numbers as a JSON object (see `names_from_unit`).
     """
 
     name: str
@@ -111,10 +115,11 @@ class SignalMapping:
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """The field of a time: a ROS or protobuf time, or a number of `unit_ns`.
+    """Field of a stamp: a ROS or protobuf time, or a number of units.
 
     Attributes:
-        nanoseconds: the field of the nanoseconds, if `field` has the seconds alone.
+        unit_ns: unit of a number, nanoseconds.
+        nanoseconds: path of the nanoseconds if `field` holds only the seconds; "" otherwise.
     """
 
     field: str
@@ -124,12 +129,12 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True)
 class Angle:
-    """The field of an angle; `zero + scale` times it is the yaw in radians.
+    """Field of an angle; the yaw in radians is zero + scale * angle.
 
     Attributes:
-        scale: below 0 for angles that count clockwise.
-        zero: the yaw at 0, in radians.
-        is_plain: whether the mapping says nothing of zero and direction.
+        scale: radians per unit of the field; negative if angles count clockwise.
+        zero: yaw at angle 0, in radians.
+        is_plain: whether the mapping gives neither zero nor direction.
     """
 
     field: str
@@ -140,26 +145,26 @@ class Angle:
 
 @dataclass(frozen=True, slots=True)
 class TopicMapping:
-    """How one topic is read; None leaves the default of the message type.
+    """Entry of one topic; None selects the default of the message type.
 
     Attributes:
+        reads_objects: whether the topic has objects; false for topics with signals only.
         objects: path of the list of objects; "" for a message that is one object.
-        complete: whether a message lists all objects that exist, so that those it leaves out have left.
+        complete: whether a message lists all existing objects, so that objects missing from it have left.
         position: path of a point, or paths of x, y and maybe z.
-        orientation: path of a quaternion, or the paths of its x, y, z and w.
-        order: of the four numbers of a quaternion in a list.
-        yaw: path of an angle.
+        orientation: path of a quaternion, or paths of its x, y, z and w.
+        order: order of the four numbers of a quaternion in a list.
+        yaw: field of an angle.
         bounds: path of two opposite corners of a box along the axes, or paths of their four numbers.
         bounds_have_size: whether the last two numbers are width and height instead of a corner.
         only, without: patterns of names to keep, and to leave out.
-        max_age_ns: how long an observation stays valid.
-        clock: the clock of this topic, if not that of the mapping.
+        max_age_ns: validity of an observation, nanoseconds.
+        clock: clock of this topic; None for the clock of the mapping.
         scale: units of the log per unit of this topic's positions, sizes, heights and uncertainties.
-        invalid: numbers that say that a value is not available.
+        invalid: numbers that stand for a missing value.
         has_zeros_left_out: whether fields that JSON messages lack are 0.
-        reads_objects: false for topics that are read for their signals only.
         optional: whether a log may lack the topic.
-        publisher: the number, from 1 on, of the only publisher whose messages count.
+        publisher: number, from 1, of the only publisher whose messages are read; None for all.
     """
 
     topic: str
@@ -196,10 +201,11 @@ class TopicMapping:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """When samples are taken: at each message of a topic, or at multiples of a step.
+    """Sampling: a sample at each message of a topic, or at each multiple of a step.
 
     Attributes:
-        topic: None, without a step, for the most frequent topic with objects.
+        topic: sampled topic; None without a step for the most frequent topic with objects.
+        step_ns: step, nanoseconds; None for samples at messages.
     """
 
     topic: str | None = None
@@ -211,18 +217,18 @@ class LogMapping:
     """A valid mapping.
 
     Attributes:
-        name: of the file.
-        sha256: of its content, independent of layout and comments.
-        fixed_frame: the frame that coordinates are transformed into; None leaves them as they are.
-        topics: in the file's order.
-        max_gap_ns: what lies in a longer pause of a topic is unknown.
+        name: name of the file.
+        sha256: hash of its content, independent of layout and comments.
+        fixed_frame: frame into which coordinates are transformed; None for coordinates as they are.
+        topics: entries of topics, in the file's order.
+        max_gap_ns: longest pause, nanoseconds; in a longer pause of a topic its objects are unknown.
         trims_ends: whether samples before a needed topic begins, and after it ends, are left out.
-        axes: those of the fixed frame, or of the messages without one.
-        origin: latitude and longitude in degrees where the fixes of satellite receivers have (0, 0).
-        accept: names of assumptions that may be contradicted.
+        axes: axes of the fixed frame, or of the messages if there is no fixed frame.
+        origin: latitude and longitude in degrees of the point (0, 0) for satellite fixes.
+        accept: names of assumptions that the log may contradict.
         features: entries of a data set's features, in the file's order; their `topic` is the feature.
-        episodes: how a data set is read.
-        shapes: by their names, for bodies that a data set names itself.
+        episodes: options for reading a data set.
+        shapes: shapes by name, for bodies that a data set names itself.
     """
 
     name: str
@@ -243,14 +249,14 @@ class LogMapping:
 
     @property
     def identity(self) -> str:
-        """A hash of its content, and of the models and meshes that it names."""
+        """Hash of its content, and of the models and meshes that it references."""
         model, assets = self.episodes.model, self.episodes.assets
         if model is None and assets is None:
             return self.sha256
         try:
             return f"{self.sha256} {identity_of_model(model, assets)}"
         except (LogError, OSError) as error:
-            # reading an episode says so
+            # reading an episode raises this error again
             return f"{self.sha256} {error}"
 
 
@@ -282,7 +288,7 @@ def age_ns(text: str) -> int:
 
 _NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
 _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional", "missing", "publisher"})
-"""Keys that do not concern objects: a topic with signals and no other keys has no objects."""
+"""Keys that do not concern objects; an entry with `signals` and only such keys has no objects."""
 
 
 def load_mapping(path: str | PathLike[str]) -> LogMapping:
@@ -300,11 +306,11 @@ def load_mapping(path: str | PathLike[str]) -> LogMapping:
 
 @lru_cache(maxsize=8)
 def parse_mapping(text: str, name: str = "mapping", folder: Path | None = None) -> LogMapping:
-    """Parse the text of a mapping file; the last ones are parsed once.
+    """Parse the text of a mapping file; the last eight results are cached.
 
     Args:
-        name: of the file, for errors.
-        folder: where it lies: paths in it are relative to that.
+        name: name of the file, for errors.
+        folder: folder of the file, to which its paths are relative.
 
     Raises:
         UsageError: the text is not a valid mapping; all errors are listed.
@@ -320,7 +326,7 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
     value: Any = document.value
     shapes = value.get("shapes") or {}
     sample = value.get("sample", {})
-    # the hash ignores layout and comments: the same mapping has the same hash
+    # hashed in a canonical form, so that layout and comments do not change the hash
     canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
     topics = tuple(
@@ -364,7 +370,7 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
 
 
 def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any]]:
-    """Yield each topic or feature with the place of an entry and the entry; it may have a list of them."""
+    """Yield (topic or feature, place, entry) for each entry; a topic may have a list of entries."""
     for name, entry in value.get(key, {}).items():
         if isinstance(entry, list):
             yield from ((name, (key, name, index), part) for index, part in enumerate(entry))
@@ -373,7 +379,7 @@ def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any
 
 
 def _without_indices(entry: Any) -> Any:
-    """Return the entry of a feature, with `[3]` for the place 3."""
+    """Return the entry of a feature, with indices such as 3 written as places such as `[3]`."""
 
     def as_text(place: Any) -> Any:
         if isinstance(place, list):
@@ -389,12 +395,13 @@ def _without_indices(entry: Any) -> Any:
 
 
 _OF_TOPICS = ("topics", "fixed_frame", "origin", "clock", "sample", "max_age", "ends")
+"""Keys that apply to logs of messages only."""
 _OF_EPISODES = ("features", "label", "fps", "model", "assets", "order")
-"""Keys of logs of messages alone, and of data sets of episodes alone."""
+"""Keys that apply to data sets of episodes only."""
 
 
 def _contradictions_of_kinds(value: Table[str, Any]) -> Iterator[tuple[Place, str]]:
-    """Yield keys for logs of messages among those for data sets, and a file without either."""
+    """Yield faults of a file that mixes keys of logs and data sets, or has neither."""
     of_episodes = [key for key in _OF_EPISODES if key in value]
     if not of_episodes and "topics" not in value:
         yield (), "the key 'topics' is missing, or 'features' for a data set of episodes"
@@ -406,7 +413,7 @@ def _contradictions_of_kinds(value: Table[str, Any]) -> Iterator[tuple[Place, st
 
 
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
-    """Find what a schema cannot express: unknown shapes, keys that exclude each other, durations of 0."""
+    """Return faults that a schema cannot express: unknown shapes, conflicting keys, durations of 0."""
     value: Any = document.value
     if isinstance(value, dict) and "topics" in value and not value["topics"]:
         return [(("topics",), NO_TOPIC)]
@@ -462,10 +469,10 @@ def _contradictions_of_turns(entry: Table[str, Any], is_feature: bool) -> Iterat
 
 
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
-    """Return the mapping of a topic from an entry that follows the schema.
+    """Return the mapping of a topic from an entry that conforms to the schema.
 
     Raises:
-        UsageError: a path or a template is invalid, although the schema allows it.
+        UsageError: a path or a template is invalid, although it conforms to the schema.
     """
     if "objects" in entry:
         FieldPath.of(entry["objects"])
@@ -584,7 +591,7 @@ def _signal(name: str, value: Any) -> SignalMapping:
     """Return the mapping of a signal.
 
     Raises:
-        UsageError: two numbers have one name.
+        UsageError: two numbers have the same name.
     """
     if not isinstance(value, dict):
         return SignalMapping(name, value)

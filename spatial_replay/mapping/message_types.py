@@ -1,6 +1,6 @@
-"""Where the fields of objects are in messages: the built-in types, and any other type by common field names.
+"""Layouts of messages: the type of a topic and its entry in the mapping in, a `MessageLayout` out.
 
-Input is the name of a message type and the entry of its topic in the mapping; output is a `MessageLayout`.
+Built-in types have their own layouts. Other types share one, which lists common names of fields.
 """
 
 from __future__ import annotations
@@ -23,39 +23,40 @@ from spatial_replay.mapping.mapping_file import (
 )
 
 Alternatives: TypeAlias = tuple[str, ...]
-"""Field paths; the first that leads somewhere counts."""
+"""Field paths, of which the first that resolves is used."""
 
 _NO_CLASSES: Table[str, str | None] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """Where the fields of objects are in the messages of a topic, before the first one has been read.
+    """Paths of the fields of objects in a topic's messages, before the first message is read.
 
     Attributes:
         objects: path of the list of objects; "" for a message that is one object.
-        complete: whether a message lists all objects that exist.
+        complete: whether a message lists all existing objects.
         stays: whether an object stays valid until it is deleted.
-        name: a name template.
+        name: name template.
         position: alternatives, each the path of a point or the paths of its coordinates.
         orientation: alternatives, each the path of a quaternion or the paths of its x, y, z and w.
-        order: of the four numbers of a quaternion in a list; "" if that is not said.
-        angle_scale: radians in one unit of `yaw`, below 0 if it counts clockwise.
-        angle_zero: the yaw in radians where that field is 0.
-        is_bounds: whether `polygon` leads to two opposite corners of a box along the axes; then it may be
-            the paths of their four numbers.
+        order: order of the four numbers of a quaternion in a list; "" if unknown.
+        yaw: alternatives of an angle.
+        angle_scale: radians per unit of `yaw`; negative if it counts clockwise.
+        angle_zero: yaw in radians at angle 0.
+        polygon: path of the corners, or paths of the four numbers of bounds.
+        is_bounds: whether `polygon` is two opposite corners of a box along the axes.
         bounds_have_size: whether the last two numbers are width and height instead of a corner.
         sizes: alternatives, each the paths of length, width and maybe height of a box.
-        frame, stamp: in the object, or with `$.` in the message. An empty frame in the object is that of the
-            message.
-        own_stamp: of an object in a message with a time of its own, for the transforms that place it.
-        solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
+        frame, stamp: alternatives in the object or, with `$.`, in the message. An empty frame of an object
+            means the frame of its message.
+        own_stamp: path of an object's stamp, if the message has another; its transforms are those of its own.
+        solids: kind of message that lists the solids of an object; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
-        origin: where positions that are latitudes and longitudes are counted from; None for metres.
-        is_geojson: whether corners are longitudes and latitudes, and features stand in a text.
-        corner_origin: where corners that are longitudes and latitudes are counted from.
+        origin: latitude and longitude of (0, 0) if positions are latitudes and longitudes; otherwise None.
+        is_geojson: whether features are in a text, with longitudes and latitudes as corners.
+        corner_origin: latitude and longitude of (0, 0) if corners are longitudes and latitudes.
         scale: units of the log per unit of positions, sizes, heights and uncertainties.
-        invalid: numbers that say that a value is not available.
+        invalid: numbers that stand for a missing value.
     """
 
     objects: str = ""
@@ -96,10 +97,11 @@ class MessageLayout:
 
     @property
     def is_geodetic(self) -> bool:
-        """Whether positions or corners are degrees, counted from the mapping's origin."""
+        """Whether positions or corners are degrees, to be converted to metres from the mapping's origin."""
         return self.origin is not None or self.corner_origin is not None
 
 
+# classification codes of derived_object_msgs/Object, from 0
 _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
 _KNOWN = ("pedestrian", "bike", "car", "truck", "motorcycle", "other_vehicle", "barrier", "sign")
 _OBJECT_CLASSES = MappingProxyType({str(i): name for i, name in enumerate((*_UNKNOWN, *_KNOWN))})
@@ -149,8 +151,8 @@ _MARKER = MessageLayout(
 )
 
 GEODETIC: Alternatives = ("latitude", "longitude")
-"""The fields of a fix, in degrees."""
-# the receiver's frame says nothing about where latitude and longitude are counted from
+"""Fields of a fix, in degrees."""
+# no frame: that of the receiver does not affect latitude and longitude
 _FIX = MessageLayout(position=((*GEODETIC, "status.status"), GEODETIC), frame=())
 
 BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
@@ -239,7 +241,7 @@ GENERIC = MessageLayout(
     yaw=("theta", "yaw", "heading", "pose.theta", "pose.yaw", "base.orientation.yaw"),
     frame=(
         *("header.frame_id", "$.header.frame_id", "frame_id", "$.frame_id"),
-        # as protobuf writes them in JSON
+        # names in ProtoJSON (https://protobuf.dev/programming-guides/json/)
         *("header.frameId", "$.header.frameId", "frameId", "$.frameId"),
     ),
     stamp=tuple(
@@ -248,14 +250,14 @@ GENERIC = MessageLayout(
     ),
     is_generic=True,
 )
-"""The layout of an unknown type: the names that fields of poses usually have."""
+"""Layout of an unknown type: common names of the fields of poses."""
 
 
 _LATITUDE, _LONGITUDE = re.compile(r"lat(itude)?", re.I), re.compile(r"lon|lng|long(itude)?", re.I)
 
 
 def geodetic_order(paths: Alternatives) -> Alternatives | None:
-    """Return the paths of latitude and longitude among those of a position; None if it has none by name."""
+    """Return the paths of latitude and longitude among the paths of a position; None if names show none."""
     names = [path.rpartition(".")[2] for path in paths]
     latitude = [path for path, name in zip(paths, names, strict=True) if _LATITUDE.fullmatch(name)]
     longitude = [path for path, name in zip(paths, names, strict=True) if _LONGITUDE.fullmatch(name)]
@@ -268,14 +270,14 @@ def geodetic_paths(layout: MessageLayout) -> Alternatives | None:
 
 
 def short_type(name: str) -> str:
-    """Return `pkg/Name` for a type as written by ROS 1, ROS 2, protobuf or Foxglove's JSON schemas."""
+    """Return `pkg/Name` for the name of a type in ROS 1, ROS 2, protobuf or Foxglove's JSON schemas."""
     words = re.split(r"[/.]|::", name)
     short = f"{words[0]}/{words[-1]}" if len(words) > 1 else name
     return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short)
 
 
 def name_pattern(layout: MessageLayout, mapping: TopicMapping) -> str:
-    """Return a regular expression for the names that objects of a topic may have."""
+    """Return a regular expression for the possible names of a topic's objects."""
     parts = re.split(r"\{([^{}]+)\}", layout.name)
     texts = [name_from_topic(mapping.topic) if part == "topic" else None for part in parts[1::2]]
     fields = [".+" if text is None else re.escape(text) for text in texts]
@@ -288,7 +290,7 @@ def name_pattern(layout: MessageLayout, mapping: TopicMapping) -> str:
 
 
 def possible_classes(layout: MessageLayout) -> frozenset[str] | None:
-    """Return the classes that objects may have, in lower case; None for any."""
+    """Return the possible classes of objects, in lower case; None if any class is possible."""
     if not layout.class_field:
         return frozenset({layout.class_name.casefold()} if layout.class_name else ())
     if not layout.class_has_other:
@@ -298,11 +300,11 @@ def possible_classes(layout: MessageLayout) -> frozenset[str] | None:
 
 
 def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
-    """Return the layout of a topic: that of its type, changed by what its mapping says."""
+    """Return the layout of a topic: the layout of its type, with the changes of its mapping."""
     layout = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
     is_list = mapping.objects is not None
     if is_list and mapping.objects != layout.objects:
-        # another list than that of the type holds other objects, with fields of their own
+        # a list that is not the type's list of objects has elements with other fields
         layout = GENERIC
     changes: dict[str, object] = {}
     if is_list:

@@ -1,7 +1,7 @@
 """Outlines in messages: lists of corners, or rings with holes, in; corners in columns out.
 
-Rings are those of GeoJSON (RFC 7946): a list of an outer ring and holes; a `MultiPolygon` lists polygons.
-polygon_msgs/ComplexPolygon2D has them in the fields `outer` and `inner`.
+Rings follow GeoJSON (RFC 7946): a polygon is a list of an outer ring and holes, a `MultiPolygon` a list of
+polygons. polygon_msgs/ComplexPolygon2D has the outer ring in the field `outer`, and holes in `inner`.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _OUTER, _INNER = "outer", "inner"
 def outlines_from_lists(
     lists: list[Any], *, is_bounds: bool, have_size: bool = False
 ) -> tuple[Integers, Floats, int]:
-    """Return the counts (R,) and the corners (V, 3) of outlines, and how many have too few corners.
+    """Return the corner counts (R,) and corners (V, 3) of outlines, and the number of faulty outlines.
 
-    These have one corner, NaN, so that their objects are unknown.
+    An outline with too few corners gets one corner at NaN, so that its object is unknown.
 
     Args:
-        is_bounds: whether each list has two opposite corners of a box, which become four.
+        is_bounds: whether each list has two opposite corners of a box, which become four corners.
         have_size: whether bounds have width and height instead of the second corner.
     """
     counts, points = points_from_lists(lists)
@@ -52,7 +52,7 @@ def outlines_from_lists(
         starts = starts_from_counts(counts)[:-1][~few]
         ends = np.stack([points[starts], points[starts + 1]]) if len(starts) else np.empty((2, 0, 3))
         if have_size:
-            # a negative size makes the object unknown, as one of a shape does
+            # NaN instead of a negative size, so that the object is unknown
             ends[1] = ends[0] + np.where(ends[1] < 0, np.nan, ends[1])
         (left, low, _), (right, high, _) = ends.min(axis=0).T, ends.max(axis=0).T
         xs, ys = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
@@ -69,7 +69,10 @@ def outlines_from_lists(
 
 
 def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
-    """Return the counts (R,) and the corners (V, 3) of lists of points, of pairs, or of x, y, x, y …."""
+    """Return the corner counts (R,) and corners (V, 3) of lists.
+
+    Elements are points with fields, pairs of numbers, or x and y in turn.
+    """
     example = next((corners[0] for corners in lists if len(corners)), None)
     flat = list(chain.from_iterable(lists))
     counts = np.array([len(corners) for corners in lists], np.int64)
@@ -89,14 +92,14 @@ def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
 
 
 def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) -> Floats:
-    """Return the numbers (N, width) of elements, NaN for the null of JSON and for what a list lacks.
+    """Return the numbers (N, width) of elements; NaN for null in JSON and for missing elements of lists.
 
     Args:
-        get: returns the numbers of one element.
+        get: function from an element to its numbers.
     """
     count = len(elements)
     if style == "attributes":
-        # faster than a list of tuples, but it does not take None
+        # faster than a list of tuples, but np.fromiter refuses None
         with suppress(TypeError):
             numbers = chain.from_iterable(map(get, elements))
             return np.fromiter(numbers, np.float64, count * width).reshape(count, width)
@@ -104,10 +107,10 @@ def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) ->
 
 
 def features_in(message: object) -> dict[str, object]:
-    """Return the features of a foxglove.GeoJSON, whose only field is a text.
+    """Return the features of a foxglove.GeoJSON message, whose only field is a JSON text.
 
     Raises:
-        ContentError: the text is no GeoJSON.
+        ContentError: the text is not GeoJSON.
     """
     text = get_field(message, "geojson")
     try:
@@ -124,9 +127,9 @@ def features_in(message: object) -> dict[str, object]:
 
 
 def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
-    """Return the path of the object that holds the rings at a path; None if the path leads to corners.
+    """Return the path of the object that holds the rings at a path; None if the path resolves to corners.
 
-    A neighbouring field shows whether there are rings: `type` next to `coordinates`, `inner` next to `outer`.
+    A neighbouring field identifies rings: `type` next to `coordinates`, or `inner` next to `outer`.
     """
     for length, step in enumerate(path.steps):
         owner_path = FieldPath(path.text, path.steps[:length])
@@ -140,13 +143,13 @@ def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
 
 
 def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Floats, int]:
-    """Return the number of outlines (R,) of each object, their corners' counts and the corners (V, 3).
+    """Return outline counts (R,), corner counts, corners (V, 3), and the number of objects without a polygon.
 
-    A polygon without a hole is one outline, one with holes some convex ones. The last result counts objects
-    without a polygon, which have one corner, NaN, so that they are unknown.
+    A polygon without a hole is one outline. A polygon with holes is split into convex outlines. An object
+    without a polygon gets one corner at NaN, so that it is unknown.
 
     Raises:
-        ContentError: rings cross or touch themselves or each other.
+        ContentError: a ring crosses or touches itself or another ring.
     """
     outlines: list[Floats] = []
     outline_counts, empty = [], 0
@@ -168,19 +171,19 @@ def _polygons_in(holder: Any) -> list[Any]:
         return [[get_field(ring, "points") if "points" in field_names(ring) else ring for ring in rings]]
     if "type" in names:
         coordinates = get_field(holder, "coordinates") if "coordinates" in names else ()
-        # points and lines are no bodies
+        # points and lines cover no area
         kinds: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
         return list(kinds.get(get_field(holder, "type"), ()))
     return list(holder) if _depth(holder) > 3 else [holder]
 
 
 def _depth(value: Any) -> int:
-    """Return how many lists are nested in each other."""
+    """Return the depth of nested lists, 0 for other values."""
     return 1 + _depth(value[0]) if is_list(value) and len(value) else int(is_list(value))
 
 
 def _pieces(rings: Sequence[Any]) -> list[Floats]:
-    """Return the outlines (n, 3) of a polygon; none if its outer ring has too few corners."""
+    """Return the outlines (n, 3) of a polygon; no outline if its outer ring has too few corners."""
     outer, *holes = (_ring(ring) for ring in rings) if len(rings) else (np.empty((0, 3)),)
     if len(outer) < _LEAST_CORNERS:
         return []
@@ -195,7 +198,8 @@ def _pieces(rings: Sequence[Any]) -> list[Floats]:
 
 
 def _ring(corners: Any) -> Floats:
-    """Return the corners (n, 3) of a ring, without a last one that closes it."""
+    """Return the corners (n, 3) of a ring, without a last corner that repeats the first."""
     _, points = points_from_lists([corners])
+    # rings of GeoJSON are closed (RFC 7946, section 3.1.6), those of polygon_msgs are open
     is_closed = len(points) > 1 and (points[0] == points[-1]).all()
     return points[:-1] if is_closed else points

@@ -1,6 +1,6 @@
-"""Entries of a mapping on trial: an entry and some messages of its topic in, what contradicts it out.
+"""Trials of mapping entries: an entry and some messages of its topic in, contradictions out.
 
-`choose_entry` changes an entry by the keys that settle the contradictions, as long as fewer remain.
+`choose_entry` adds keys to an entry that resolve contradictions, as long as their number does not grow.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from spatial_replay.mapping.topic_reader import TopicReader
 from spatial_replay.trace.doubts import Doubt
 
 Fields: TypeAlias = Mapping[str, str]
-"""An entry of a topic: values in YAML's flow style, by their keys."""
+"""Entry of a topic: values in YAML's flow style, by key."""
 
 FROM_NORTH = "zero: north, clockwise: true"
-"""Keys of the angle of a compass."""
+"""Keys for the angle of a compass."""
 _PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
 
 
@@ -48,10 +48,10 @@ def flow_text(fields: Fields) -> str:
 def readable_messages(
     topic: Topic, entry: str, messages: Sequence[object], origin: str = ""
 ) -> tuple[list[object], list[str]]:
-    """Return the messages that an entry can read, and why it cannot read the others.
+    """Return the messages that an entry can read, and the reasons why it cannot read the others.
 
     Raises:
-        UsageError: it reads none of them.
+        UsageError: the entry can read no message.
     """
     reasons: list[str] = []
     reader = _reader(topic, entry, origin, reasons)
@@ -65,10 +65,10 @@ def readable_messages(
 def lateness_s(
     topic: Topic, entry: str, messages: Sequence[object], times_ns: Sequence[int], origin: str = ""
 ) -> Floats | None:
-    """Return how much later each message was recorded than its stamp says, seconds.
+    """Return the time from each message's stamp to its recording, seconds.
 
     Returns:
-        None if stamps are no clock: some are missing or 0, or they do not advance with the messages.
+        None if stamps are not a clock: a stamp is missing or 0, or stamps do not advance with the recording.
     """
     good = np.ones(len(messages), np.bool_)
     try:
@@ -76,7 +76,7 @@ def lateness_s(
     except UsageError:
         return None
     is_clock = good.all() and (stamps_ns > 0).all() and (np.diff(stamps_ns) > 0).all()
-    # in another unit they advance a thousand times as fast; a simulation may be some times as fast
+    # stamps in another unit advance by a factor of 1,000; a simulation may run some times faster than time
     advance = np.ptp(stamps_ns) / max(1, np.ptp(times_ns))
     if not is_clock or (len(messages) > 1 and not 1 / _FASTEST < advance < _FASTEST):
         return None
@@ -84,11 +84,11 @@ def lateness_s(
 
 
 _FASTEST = 20
-"""Seconds of stamps in one second of recording, and the reverse."""
+"""Greatest ratio of the time in stamps to the time of recording, and its reciprocal the least."""
 
 
 def _reader(topic: Topic, entry: str, head: str, reasons: list[str]) -> TopicReader:
-    """Return a reader of decoded messages; it adds why it cannot read some."""
+    """Return a reader of decoded messages, which adds a reason to `reasons` for each unreadable message."""
     mapping = parse_mapping(f"{head}topics:\n  {yaml_text(topic.name)}: {entry}")
     (planned,) = ReadingPlan.of(mapping, [topic]).planned
     return TopicReader(
@@ -105,12 +105,12 @@ def _reader(topic: Topic, entry: str, head: str, reasons: list[str]) -> TopicRea
 def choose_entry(
     topic: Topic, fields: Fields, messages: Sequence[object], times_ns: Sequence[int], origin: str = ""
 ) -> tuple[Fields, list[str]]:
-    """Return an entry that fewer measurements contradict, with the reasons of each change and the rest.
+    """Return an entry with fewer contradictions, and texts on each change and each remaining contradiction.
 
     Args:
-        fields: an entry that can read the messages.
-        times_ns: when each of the messages was recorded.
-        origin: the line of a mapping about the origin.
+        fields: entry that can read the messages.
+        times_ns: time of recording of each message.
+        origin: line of a mapping with the key `origin`; "" without one.
     """
     reasons: list[str] = []
     doubts = _doubts(topic, fields, messages, times_ns, origin)
@@ -124,7 +124,7 @@ def choose_entry(
         ]
         if not trials:
             continue
-        # another contradiction may come to light, such as a number that stands for "not available"
+        # a change may reveal another contradiction, such as a number that stands for a missing value
         changed, rest = min(trials, key=lambda trial: len(trial[1]))
         if len(rest) <= len(doubts):
             keys = [f"{key}: {value}" for key, value in changed.items() if fields.get(key) != value]
@@ -136,7 +136,7 @@ def choose_entry(
 def _doubts(
     topic: Topic, fields: Fields, messages: Sequence[object], times_ns: Sequence[int], origin: str
 ) -> tuple[Doubt, ...]:
-    """Return what contradicts an entry, in the order of the table of assumptions."""
+    """Return the contradictions of an entry, in the order of the table of assumptions."""
     text = f"{origin}max_age: forever\ntopics:\n  {yaml_text(topic.name)}: {flow_text(fields)}"
     plan = ReadingPlan.of(replace(parse_mapping(text), accept=()), [topic])
     assembler = Assembler(plan, lambda topic: lambda payload: messages[int(payload)], name="")
@@ -149,17 +149,17 @@ def _doubts(
         )
         assembler.finish()
     except (UsageError, LogError):
-        # times of recording that jump say nothing about the entry
+        # an error, such as a jump of the times of recording, is no evidence against the entry
         return ()
     return tuple(doubt for doubt in assembler.take_doubts() if doubt.assumption not in _OF_ALL_TOPICS)
 
 
 _OF_ALL_TOPICS = frozenset({"one_frame", "one_clock", "one_unit", "one_publisher"})
-"""Assumptions about all topics of a log together."""
+"""Assumptions that concern all topics of a log together."""
 
 
 def _clause(doubt: Doubt, *, with_remedy: bool = False) -> str:
-    """Return the measurement of a doubt, without its topic."""
+    """Return the text of a doubt without its topic, and without its remedy by default."""
     remedy = next(assumption.remedy for assumption in ASSUMPTIONS if assumption.name == doubt.assumption)
     clause = str(doubt.text).removeprefix(f"{doubt.topic}: ")
     return clause if with_remedy else clause.removesuffix(f"; {remedy}")
@@ -196,12 +196,13 @@ def _degrees(fields: Fields) -> Iterator[Fields]:
 
 def _latitudes(fields: Fields) -> Iterator[Fields]:
     invalid = fields.get("invalid", "[]").strip("[]")
+    # AIS sends 91 and 181 degrees for a missing position (ITU-R M.1371); GNSS receivers send degrees * 10^7
     yield {**fields, "invalid": f"[{', '.join(filter(None, (invalid, '91, 181')))}]"}
     yield {**fields, "scale": "1e-7"}
 
 
 _NOT_AVAILABLE = (511, 4095, 65535)
-"""Numbers that stand for an angle that is not available: in AIS, in 12 and in 16 bits."""
+"""Numbers that stand for a missing angle: 511 in AIS (ITU-R M.1371), the greatest of 12 and of 16 bits."""
 
 _ALTERNATIVES: Mapping[str, Callable[[Fields], Iterator[Fields]]] = MappingProxyType(
     {
@@ -214,4 +215,4 @@ _ALTERNATIVES: Mapping[str, Callable[[Fields], Iterator[Fields]]] = MappingProxy
         "complete_list": lambda fields: iter([{**fields, "complete": "false"}]),
     }
 )
-"""The entries that settle a contradicted assumption, by its name."""
+"""Functions from an entry to changed entries that may resolve a contradiction, by assumption."""

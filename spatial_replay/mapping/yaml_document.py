@@ -1,10 +1,12 @@
-"""Read YAML that people write: text in; plain values with their line numbers, or all errors at once, out.
+"""Read YAML files that people write: text in; plain values with line numbers, or all errors together, out.
 
-Size and depth are limited; tags, aliases and repeated keys are errors. Plain scalars follow YAML 1.2, so that
-`no` and `12:30` are texts: a topic or a name never becomes a truth value or a number of minutes. Numbers
-that are not finite are errors, since comparing with one holds always or never. A document
-is checked against a JSON Schema, whose descriptions say what belongs where; what a schema cannot express,
-the caller adds.
+Size and depth are limited. Tags, aliases and repeated keys are errors. Plain scalars follow YAML 1.2
+(https://yaml.org/spec/1.2.2/#103-core-schema), so that `no` and `12:30` are texts. In YAML 1.1, a topic or a
+name could become a truth value or a number of minutes. Infinity and NaN are errors, because a comparison with
+them always gives the same result.
+
+A document is checked against a JSON Schema, whose descriptions appear in error messages. The caller adds
+checks that a schema cannot express.
 """
 
 from __future__ import annotations
@@ -31,9 +33,10 @@ Place: TypeAlias = tuple[str | int, ...]
 """Keys and indices from the top of a document to a value."""
 
 LARGEST_TEXT = 256 * 1024
-"""Bytes; mappings are written by hand, so a larger file is something else."""
+"""Size limit, bytes; a larger file is no mapping, because mappings are written by hand."""
 
 _DEEPEST = 20
+"""Nesting limit of lists and mappings."""
 _INTEGER = re.compile(r"[-+]?[0-9]{1,300}", re.ASCII)
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
 _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None}
@@ -47,7 +50,7 @@ class Document:
 
     Attributes:
         value: mappings, lists, texts, numbers, truth values, None.
-        lines: the line of each value, from 1; for the value of a key, the line of the key.
+        lines: line of each value, from 1; a value with a key has the line of its key.
         faults: (line, text) of each error.
     """
 
@@ -56,7 +59,7 @@ class Document:
     faults: list[tuple[int, str]] = field(default_factory=list)
 
     def line_of(self, place: Place) -> int:
-        """Return the line of a value, or of the nearest one around it."""
+        """Return the line of a value, or of the innermost known value around it."""
         while place and place not in self.lines:
             place = place[:-1]
         return self.lines.get(place, 1)
@@ -66,8 +69,8 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
     """Read a YAML text; errors are in `faults` of the document.
 
     Args:
-        what: what the text is, for errors.
-        largest: size in bytes.
+        what: noun for the text, for errors.
+        largest: size limit, bytes.
     """
     import yaml
 
@@ -95,7 +98,7 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
 
 
 def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
-    """Return the remedy for a pattern of files whose characters mean something else in YAML, or ""."""
+    """Return the remedy for an unquoted file pattern, in which `*` and `[` are YAML syntax, or ""."""
     mark = error.problem_mark
     is_list = mark is not None and re.fullmatch(r"\S\[", text[max(0, mark.index - 1) : mark.index + 1])
     if not is_list and error.context != "while scanning an alias":
@@ -104,7 +107,10 @@ def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
 
 
 def _find_unsupported_feature(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
-    """Find the first feature that such files do not need and that could make a short text mean much."""
+    """Return the line and text of the first tag, alias, lone surrogate or deep nesting; None without one.
+
+    Aliases and deep nesting could expand a short text beyond memory.
+    """
     import yaml
 
     depth = 0
@@ -173,18 +179,18 @@ def _scalar(text: str) -> Value:
 
 
 MOST_FAULTS = 100
-"""Errors of a document that are listed."""
+"""Errors of a document at most that are listed."""
 
 
 def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> str:
-    """Read a text file, also at an address, and of one that is too large only its beginning.
+    """Read a text file from a path or an address; only the beginning if the file is too large.
 
     Args:
-        largest: size in bytes; no more than one byte beyond it is read.
+        largest: size limit, bytes; at most one byte more is read.
 
     Raises:
         MissingFileError: there is no such file.
-        UsageError: it is not UTF-8.
+        UsageError: the file is not UTF-8.
     """
     try:
         with local_copy(path).open("rb") as stream:
@@ -200,7 +206,7 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
 
 @cache
 def schema_of(room: str, kind: str) -> Mapping[str, Any]:
-    """Return the JSON Schema of a kind of file, which lies in a room of the package."""
+    """Return the JSON Schema of a kind of file from a subpackage."""
     text = files(f"spatial_replay.{room}").joinpath(f"{kind}.schema.json").read_text(encoding="utf-8")
     return cast("Mapping[str, Any]", json.loads(text))
 
@@ -215,10 +221,10 @@ def checked_document(
     """Read a YAML text and check it.
 
     Args:
-        name: of the file, for errors.
+        name: name of the file, for errors.
         schema: JSON Schema, draft 2020-12.
-        contradictions: finds what a schema cannot express; it may get any value, valid or not.
-        what: what the file is, such as "a mapping".
+        contradictions: returns faults that a schema cannot express; its document may violate the schema.
+        what: noun for the file, such as "a mapping".
 
     Raises:
         UsageError: the text is not valid; all errors are listed, with their lines.
@@ -236,19 +242,19 @@ def faults_by_place(
     schema: Mapping[str, Any],
     contradictions: Callable[[Document], list[tuple[Place, str]]],
 ) -> dict[Place, str]:
-    """Return what is wrong with the values of a document; for the arguments see `checked_document`."""
+    """Return the faults of the values of a document by place; for the arguments see `checked_document`."""
     if document.faults and document.value is None:
         return {}
     from jsonschema import Draft202012Validator
 
-    # one error for each place; a contradiction says more than the schema
+    # one fault per place; a contradiction replaces a violation, because its text is more specific
     errors = Draft202012Validator(schema).iter_errors(document.value)
     violations = [fault for error in errors for fault in _faults_in_words(error)]
     return dict(violations + contradictions(document))
 
 
 def numbered_faults(document: Document, by_place: Mapping[Place, str]) -> list[tuple[int, str]]:
-    """Return all that is wrong with a document, with lines, in their order."""
+    """Return all faults of a document as (line, text), in order of lines."""
     named = [
         (document.line_of(place), f"{_text_from_place(place)}{fault}") for place, fault in by_place.items()
     ]
@@ -263,7 +269,7 @@ def _text_from_place(place: Place) -> str:
 
 
 def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
-    """Iterate over the places of a violation of the schema, with what belongs there."""
+    """Yield the place and text of each fault in a violation of the schema."""
     place: Place = tuple(error.absolute_path)
     keyword = error.validator
     if keyword == "anyOf" and isinstance(error.instance, dict | list):
@@ -271,7 +277,7 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
         for violation in error.context:
             branches.setdefault(violation.schema_path[0], []).append(violation)
         for branch in branches.values():
-            # not an alternative that failed because the whole value has another type
+            # skip an alternative for another type: its violations would not help
             if not any(
                 violation.validator == "type" and len(violation.absolute_path) == len(place)
                 for violation in branch
@@ -301,7 +307,7 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
 
 
 def _around(error: Any) -> str:
-    """Return what belongs where a rule without a description was violated: that of the rule around it."""
+    """Return the description of the nearest enclosing rule, for a violated rule without a description."""
     parent = error.parent
     while parent is not None and "description" not in parent.schema:
         parent = parent.parent
