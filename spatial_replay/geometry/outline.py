@@ -54,9 +54,9 @@ class Outlines(NamedTuple):
 def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     """Order each outline counter-clockwise and drop repeated or collinear vertices.
 
-    A vertex is superfluous if its distance from the segment between its neighbours is at most a billionth of
-    the outline's extent, or below the resolution of its coordinates. A narrower outline becomes a segment or
-    a point. Convex counter-clockwise input is returned bit for bit.
+    A vertex is superfluous if it lies within a tolerance of the segment between its neighbours: a billionth
+    of the outline's extent, or the resolution of its coordinates. A narrower outline becomes a segment or a
+    point. Convex counter-clockwise input is returned bit for bit.
 
     Args:
         vertex_start: (P + 1,) int64; outline p is vertices[vertex_start[p] : vertex_start[p + 1]].

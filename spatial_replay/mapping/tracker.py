@@ -1,9 +1,10 @@
 """Track objects and signals through a log: pending messages of all topics in, traces at given times out.
 
-`rows_from_detections` makes checked observations of detections, in the fixed frame. `events_from_messages`
-makes a timeline of them that also says who left; `Events.state` reads it at the times of samples.
+`rows_from_detections` converts detections to checked observations in the fixed frame. `events_from_messages`
+arranges them in a timeline, together with the departures of objects. `Events.state` reads the timeline at
+the times of samples.
 
-The tracker holds the last state of every object and signal, so that a log can be processed in stretches.
+The tracker holds the last state of every object and signal, so that a log can be processed in parts.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from spatial_replay.trace.trace import ABSENT, LONG_PAUSE, Pauses, Trace, class_
 from spatial_replay.trace.units import Axes
 
 LEFT = -1
-"""Instead of a row: the object has left."""
+"""Code instead of a row, for an object that has left."""
 
 STALE = -2
-"""Instead of a row: the object exists, but its last observation is too old."""
+"""Code instead of a row, for an existing object whose last observation is too old."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,8 @@ class Events:
 
     Attributes:
         name, time_ns, class_code: (E,) int64.
-        row: (E,) int64, the observation, or `LEFT`.
-        expires_ns: (E,) int64, when the object leaves by itself.
+        row: (E,) int64, row of the observation, or `LEFT`.
+        expires_ns: (E,) int64, time at which the object leaves without another event.
     """
 
     name: Integers
@@ -66,16 +67,16 @@ class Events:
         return select(self, np.flatnonzero(is_last & (self.row != LEFT)))
 
     def after(self, before: Events) -> Events:
-        """Join earlier events of the same topic and these."""
+        """Return these events joined with earlier events of the same topic."""
         joined = concatenate_tables([before, self])
-        # those of a system that runs may come late
+        # sorted, because events of a running system may be late
         return select(joined, np.lexsort((joined.time_ns, joined.name)))
 
     def state(self, times_ns: Integers, max_age_ns: int) -> States:
         """Return the state of all N objects at T times."""
         starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
         if len(times_ns) == 1 and len(starts):
-            # all objects at once, as there are more of them than times
+            # vectorised over objects, because a running system has one time and many objects
             at = starts + np.add.reduceat(self.time_ns <= times_ns, starts, dtype=np.int64) - 1
             columns = self._standing(at, starts, times_ns, max_age_ns)
             return States(self.name[starts], *(column[None] for column in columns))
@@ -89,9 +90,11 @@ class Events:
     def _standing(
         self, at: Integers, starts: Integers | int, times_ns: Integers, max_age_ns: int
     ) -> tuple[Integers, Integers, Integers]:
-        """Return rows, class codes and times of reports by the events `at` some times.
+        """Return rows, class codes and report times at some times.
 
-        Events before `starts` are of other objects.
+        Args:
+            at: index of the last event up to each time; below `starts` if the object has no event so far.
+            starts: index of the first event of the object.
         """
         has_appeared = at >= starts
         at = np.maximum(at, starts)
@@ -106,10 +109,10 @@ class States(NamedTuple):
     """The states of N objects at T times.
 
     Attributes:
-        names: (N,), distinct.
+        names: (N,), distinct codes.
         rows: (T, N), each a row, `ABSENT` or `STALE`.
         classes: (T, N), codes.
-        reported_ns: (T, N), of the report that counts then.
+        reported_ns: (T, N), time of the last report.
     """
 
     names: Integers
@@ -126,13 +129,13 @@ def events_from_messages(
     alive: Events,
     is_complete: bool,
 ) -> Events:
-    """Return the events of messages in order: detections, deletions, and objects that lists leave out.
+    """Return the events of messages in order: detections, deletions, and objects missing from complete lists.
 
     Args:
-        times_ns: (M,) of each message.
-        rows: (R,) the row of each detection.
-        alive: the last event of each object before.
-        is_complete: whether objects that a message leaves out have left.
+        times_ns: (M,) time of each message.
+        rows: (R,) row of each detection.
+        alive: last earlier event of each object that has not left.
+        is_complete: whether objects missing from a message have left.
     """
     name, message, lifetime_ns = detections.name, detections.message, detections.lifetime_ns
     expires = np.full(len(name), FOREVER_NS, np.int64)
@@ -148,7 +151,7 @@ def events_from_messages(
         left_name = np.concatenate([left_name, deleted[:, 1]])
     every_name = np.concatenate([left_name, name])
     every_message = np.concatenate([left_message, message])
-    # the sort is stable and departures come first: an object that a message deletes and reports again exists
+    # the sort is stable with departures first, so that an object that a message deletes and reports exists
     order = np.lexsort((every_message, every_name))
     count = len(left_name)
 
@@ -177,7 +180,7 @@ def _named_deletions(detections: Detections, alive: Events) -> list[tuple[int, i
 
 
 def _left_out(name: Integers, message: Integers, alive: Integers, messages: int) -> tuple[Integers, Integers]:
-    """Return the names that a message leaves out while the one before has them, and those messages."""
+    """Return names that are in one message and missing from the next one, and the index of the next one."""
     every_name = np.concatenate([alive, name])
     # objects alive before the batch count as detected in message -1, just before the first
     every_message = np.concatenate([np.full(len(alive), -1, np.int64), message])
@@ -193,7 +196,7 @@ class ObservationRows:
     """R observations in the columns of a trace.
 
     Attributes:
-        is_valid: (R,) whether all numbers are finite.
+        is_valid: (R,) whether a footprint is known and all numbers are finite.
     """
 
     shapes: FootprintBatch
@@ -206,7 +209,7 @@ class ObservationRows:
         return len(self.yaw)
 
     def slice(self, begin: int, end: int) -> ObservationRows:
-        """Return the observations from one to before another, as views."""
+        """Return the observations from `begin` to before `end`, as views."""
         return ObservationRows(
             self.shapes.slice(begin, end),
             self.yaw[begin:end],
@@ -217,7 +220,7 @@ class ObservationRows:
 
     @classmethod
     def blank(cls, class_code: Integers) -> ObservationRows:
-        """Return observations of which only the class is known."""
+        """Return unknown observations with known classes."""
         count = len(class_code)
         nowhere = FootprintBatch.unknown(count)
         return cls(nowhere, np.full(count, np.nan), np.zeros(count), class_code, np.zeros(count, np.bool_))
@@ -230,12 +233,13 @@ def rows_from_detections(
     concave: Concave,
     report: Callable[[int, str], None],
 ) -> ObservationRows:
-    """Bring detections into the fixed frame; blank rows where there is no transform or no valid footprint.
+    """Transform detections into the fixed frame; rows without a transform or a valid footprint are blank.
 
     Args:
-        axes: those of the fixed frame; rows have ours.
-        transforms: fixed_from_frame of each object, or None if all are in the fixed frame.
-        report: receives the index of each object without a valid footprint, and the text after its name.
+        transforms: fixed_from_frame of each object; None if all objects are in the fixed frame.
+        axes: axes of the fixed frame, from which rows are converted to ours.
+        concave: treatment of polygons that are not convex.
+        report: receiver of invalid footprints: index of the object, and the rest of the sentence.
     """
     poses, solids, count = detections.poses, detections.solids, len(detections.name)
     unknown = np.zeros(count, np.bool_)
@@ -253,7 +257,7 @@ def rows_from_detections(
     uncertainty = detections.uncertainty if covariance is None else _radius(covariance)
     uncertainty = uncertainty * axes.scale
     shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
-    # each is checked as a sample of its own, so that an invalid one does not affect others
+    # each detection is checked as a separate sample, so that an invalid one does not affect others
     indices = np.arange(count, dtype=np.int64)
     readable, checked, faults = check_observations(
         Observations(
@@ -288,9 +292,9 @@ def _transform_solids(solids: Solids, transforms: Transforms) -> Solids:
 
 
 def _radius(covariance: Floats) -> Floats:
-    """Return the longest half axes (R,) of the ellipses of covariances (R, 3, 3), detections from above.
+    """Return the longer half axis (R,) of each covariance's ellipse in the plane, from (R, 3, 3).
 
-    NaN for a negative variance, by which some programs mark an unknown covariance.
+    The result is NaN for a negative variance, which some programs set for an unknown covariance.
     """
     a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     # the larger eigenvalue of [[a, b], [b, d]]
@@ -299,18 +303,22 @@ def _radius(covariance: Floats) -> Floats:
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
-"""After so many stretches, or with so many observations, those that no sample needs any more are dropped: not
-after each, for a stretch may be a single message."""
+"""Calls of `advance`, and observations, from which old observations are dropped. Dropping after each call
+would be slow, because a call may process a single message."""
 
 _FAR_NS = 366 * 86_400 * 10**9
-"""A stamp so far from when its message was recorded is of another clock, or in another unit."""
+"""Difference of stamp and recording that shows another clock or unit, nanoseconds."""
 
 _MOST_NAMES = 8
-"""Names listed in one remark."""
+"""Names at most in one remark."""
 
 
 class _Following(NamedTuple):
-    """An object that stays in its frame, which may move: as one message reports it."""
+    """An object that moves with its frame, as reported by one message.
+
+    Attributes:
+        place: index of the object in the detections.
+    """
 
     frame: str
     detections: Detections
@@ -319,12 +327,12 @@ class _Following(NamedTuple):
 
 @dataclass
 class Tracker:
-    """The state of every object and signal, carried from one stretch of a log to the next.
+    """The state of every object and signal between two parts of a log.
 
     Attributes:
         names, classes: codes that all topics share.
-        window_ns: only samples from the first time up to, not including, the second are wanted.
-        report: receives each observation that is lost.
+        window_ns: start and end of the window of samples, without its end.
+        report: receiver of lost observations.
     """
 
     plan: ReadingPlan
@@ -345,7 +353,7 @@ class Tracker:
         self._placed_messages: dict[str, Booleans] = {}
         self._begun_ns: dict[str, int] = {}
         self._unplaced_at: dict[str, list[Integers]] = defaultdict(list)
-        # until when topics stay silent after they were lost
+        # times of the first messages of lost topics after the loss; FOREVER_NS before such a message
         self._lost_until_ns: dict[str, int] = {}
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
@@ -365,7 +373,7 @@ class Tracker:
         """Process the pending messages up to a time.
 
         Returns:
-            times of the messages that are sampled; times of those sampled where the sampled topic is silent.
+            Times of messages of the sampled topic (of all topics without one), and of fallback topics.
         """
         self._advances += 1
         sampled, others = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -405,7 +413,7 @@ class Tracker:
         return np.concatenate(sampled), np.concatenate(others)
 
     def _note_messages(self, planned: PlannedTopic, times_ns: Integers, is_placed: Booleans) -> None:
-        """Note the times of a topic's messages, and which of them transforms place."""
+        """Note the times of a topic's messages, and whether transforms place their objects."""
         name = planned.name
         self._begun_ns.setdefault(name, int(times_ns[0]))
         latest_ns, latest = self._reported.get(name, times_ns[:0])[-1:], self._placed_messages.get(name)
@@ -425,7 +433,7 @@ class Tracker:
         """Return the samples at some times, up to the time of the last `advance`.
 
         Args:
-            newest_ns: how far the log has come.
+            newest_ns: newest time of the log.
         """
         if not len(times_ns):
             return Trace.empty()
@@ -440,11 +448,11 @@ class Tracker:
         is_valid = np.append(stored.is_valid, False)[np.where(rows >= 0, rows, -1)]
         numbered = np.where((rows == ABSENT) | is_valid, rows, -2 - rows)
         if is_stale.any():
-            # of stale objects only the class is known: one blank row for each class, after the others
+            # a stale object keeps only its class: one blank row for each class, after the other rows
             numbered = np.where(is_stale, -2 - (len(stored) + classes), numbered)
             blank = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
             stored = concatenate_tables([stored, blank])
-        # codes follow the log; a trace must not depend on the order of its messages
+        # codes depend on the order of messages, on which a trace must not depend
         by_code = self.classes.by_code
         classes_of = class_order(by_code)
         places = {name: place for place, name in enumerate(classes_of)}
@@ -469,13 +477,13 @@ class Tracker:
         )
 
     def _is_lasting(self, name: int) -> bool:
-        """Return whether an object stands where it is until it is reported again."""
+        """Return whether an object keeps its place until its next report."""
         planned = self.readers[self._topic_of_name[name]].planned
-        # transforms report frames in every sample
+        # static transforms count as reports in every sample
         return planned.is_lasting and not planned.is_static
 
     def _spans(self, times_ns: Integers) -> tuple[TopicSpan, ...]:
-        """Return when each mapped topic could be judged in some samples."""
+        """Return the span of each mapped topic: the samples in which it could be judged."""
         spans = []
         for topic, reader in self.readers.items():
             if not reader.is_mapped:
@@ -497,7 +505,7 @@ class Tracker:
         return tuple(spans)
 
     def _is_judged(self, planned: PlannedTopic, times_ns: Integers) -> Booleans:
-        """Return in which samples a topic has begun, is not silent, and is placed by transforms."""
+        """Return for each sample whether a topic has begun, is not silent, and is placed by transforms."""
         begun_ns, heard_ns = self._begun_ns.get(planned.name), self._reported.get(planned.name)
         if begun_ns is None or heard_ns is None:
             return np.zeros(len(times_ns), np.bool_)
@@ -510,7 +518,7 @@ class Tracker:
         return np.asarray(is_judged)
 
     def forget(self, upto_ns: int) -> None:
-        """Drop what no later sample needs: all but the last observation of each object and signal."""
+        """Drop old observations, except the last one of each object and signal."""
         if self._advances < _OLD_ADVANCES and len(self._rows) < _OLD_ROWS:
             return
         self._advances = 0
@@ -531,7 +539,7 @@ class Tracker:
         self._following = {int(number[row]): e for row, e in self._following.items() if row in rows_left}
 
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
-        """Make unknown, from a time on, what some topics have reported: objects stay, without a place."""
+        """Make the objects and signals of some topics unknown from a time on; objects continue to exist."""
         for topic in topics:
             self._begun_ns.pop(topic, None)
             last = self._events[topic].last()
@@ -540,7 +548,7 @@ class Tracker:
             at = np.full(len(rows), time_ns, np.int64)
             forever = np.full(len(rows), FOREVER_NS, np.int64)
             self._events[topic] = Events(last.name, at, rows, forever, last.class_code).after(last)
-            # it does not pause, and did not fall silent by itself
+            # without reports, the loss counts neither as a pause nor as a silence of the topic
             self._reported.pop(topic, None)
         self._lost_until_ns |= dict.fromkeys(topics, FOREVER_NS)
         self._signals = {
@@ -552,7 +560,7 @@ class Tracker:
     def _take_detections(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
     ) -> Booleans:
-        """Store the objects of messages; return which messages (M,) transforms place."""
+        """Store the objects of messages; return whether transforms place the objects of each message (M,)."""
         if detections.skipped:
             self.remarks.skipped[reader.name] += detections.skipped
         self._claim_names(reader.name, detections.name)
@@ -578,7 +586,7 @@ class Tracker:
         if again:
             for index in again:
                 report(index, " is there twice in one message; name each object once")
-            # which of the two is right is not known, so the object is unknown
+            # unknown, because either of the two may be right
             number[again] = self._add(ObservationRows.blank(detections.class_code[again]))
         before = self._events[reader.name]
         alive = before.last()
@@ -596,7 +604,7 @@ class Tracker:
         return is_placed
 
     def _place_following(self, topic: str, times_ns: Integers, states: States) -> None:
-        """Replace the rows (T, N) of objects that stay in moving frames by those of each time."""
+        """Replace the rows (T, N) of objects that move with frames by rows for each time."""
         if not self._following:
             return
         for rows, reported_ns in zip(states.rows.T, states.reported_ns.T, strict=True):
@@ -604,11 +612,11 @@ class Tracker:
                 if row in self._following:
                     where = np.flatnonzero(rows == row)
                     rows[where] = self._rows_at(topic, self._following[row], times_ns[where])
-                    # a transform is a report of where it is now
+                    # a transform counts as a report at the time of the sample
                     reported_ns[where] = times_ns[where]
 
     def _rows_at(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
-        """Return the rows of an object that stays in a frame, where that is at some times."""
+        """Return the rows of an object that moves with a frame, at some times."""
         mapping, (frame, detections, index) = self.plan.mapping, following
         fixed, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
         log_ns = times_ns if self.plan.by_log_time else None
@@ -617,10 +625,10 @@ class Tracker:
         )
         self._count_missing(topic, frame, times_ns[~poses_of_frame.known])
         self._unplaced_at[topic].append(times_ns[~poses_of_frame.known])
-        # while nothing moves, one observation is enough
+        # equal transforms in a row share one observation
         changed = _changes(poses_of_frame)
         repeated, moved = detections.repeat(index, len(changed)), poses_of_frame.select(changed)
-        # faults were reported when it arrived
+        # faults were reported on arrival
         rows = rows_from_detections(repeated, moved, mapping.axes, self.concave, lambda index, what: None)
         return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]
 
@@ -630,7 +638,7 @@ class Tracker:
             self.remarks.missing.add((topic, frame, is_known), times_ns)
 
     def _count_replacements(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
-        """Count messages of which nothing, or not all, counts, because a later one has the same time."""
+        """Count messages that are replaced, wholly or in part, by a later message of the same time."""
         start_ns, end_ns = self.window_ns
         at = times_ns[replaced]
         at = at[(at >= start_ns) & (at < end_ns)]
@@ -664,7 +672,7 @@ class Tracker:
     def _transforms(
         self, reader: TopicReader, detections: Detections, times_ns: Integers, log_times_ns: Integers
     ) -> Transforms | None:
-        """Return fixed_from_frame of each object; None if everything is in the fixed frame."""
+        """Return fixed_from_frame of each object; None if all objects are in the fixed frame."""
         fixed = self.plan.mapping.fixed_frame
         if detections.frames is None or fixed is None:
             return None
@@ -674,10 +682,10 @@ class Tracker:
         result = Transforms.unknown(count)
         clock_ns, log_ns = times_ns[detections.message], log_times_ns[detections.message]
         stamp_ns = np.zeros(count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
-        # a stamp of 0 is one that was never set
+        # a stamp of 0 means a stamp that was not set
         stamped = stamp_ns != 0
         follows = self._follows(reader, detections)
-        # these are placed at the times of samples
+        # objects that move with frames are placed later, at the times of samples
         result.put(follows, Transforms.identity(len(follows)))
         stays = np.ones(count, np.bool_)
         stays[follows] = False
@@ -695,14 +703,14 @@ class Tracker:
                 if by_stamp and len(missing):
                     first = int((~between.known).argmax())
                     self.remarks.stamps.setdefault(reader.name, (int(at[first]), int(log[first])))
-                # those that may be valid in the window
+                # only observations that may be valid in the window are counted
                 start_ns, end_ns = self.window_ns
                 is_near = (missing < end_ns) & (missing >= start_ns - reader.planned.max_age_ns)
                 self._count_missing(reader.name, frame, missing[is_near])
         return result
 
     def _follows(self, reader: TopicReader, detections: Detections) -> Integers:
-        """Return the indices of objects that stay in frames that may move."""
+        """Return the indices of objects that move with their frames."""
         if detections.frames is None or self.plan.mapping.fixed_frame is None:
             return np.empty(0, np.int64)
         if reader.planned.is_static:
@@ -710,13 +718,13 @@ class Tracker:
         return np.flatnonzero(False if detections.is_locked is None else detections.is_locked)
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
-        """Return at which times a topic pauses for longer than `max_gap`."""
+        """Return for each time whether it lies in a pause of the topic that is longer than `max_gap`."""
         most_ns, reported_ns = self.plan.mapping.max_gap_ns, self._reported.get(topic)
         planned = self.readers[topic].planned
         if most_ns is None or reported_ns is None or planned.is_lasting or planned.is_latched:
             return np.zeros(len(times_ns), np.bool_)
         first = self.readers[topic].pending.first_ns
-        # where no message follows, the time up to now shows whether this is a pause
+        # if no message follows, the pause lasts at least until the newest time
         following = newest_ns if first is None else first
         after = np.searchsorted(reported_ns, times_ns, "right")
         before_ns = reported_ns[np.maximum(after - 1, 0)]
@@ -724,7 +732,7 @@ class Tracker:
         return np.asarray((after > 0) & (next_ns - before_ns > most_ns) & (times_ns > before_ns))
 
     def _states(self, times_ns: Integers, newest_ns: int) -> States:
-        """Return the states of the objects of all topics, as `Events.state` does."""
+        """Return the states of the objects of all topics at some times."""
         states = []
         for topic, events in self._events.items():
             state = events.state(times_ns, self.readers[topic].planned.max_age_ns)
@@ -742,7 +750,7 @@ class Tracker:
     def _signal_columns(
         self, times_ns: Integers, newest_ns: int
     ) -> tuple[dict[str, Floats], dict[str, Integers]]:
-        """Return the signals, and when they were reported where that is not the sample's time."""
+        """Return the signals, and report times of signals that were reported before a sample."""
         columns: dict[str, Floats] = {}
         reported: dict[str, Integers] = {}
         unknown: list[tuple[str, str, Booleans, Booleans]] = []
@@ -757,7 +765,7 @@ class Tracker:
             name = planned.mapping.signals[index].name
             is_stale = (at >= 0) & (is_old | in_gap) & (times_ns >= self._lost_until_ns.get(topic, 0))
             unknown.append((topic, name, is_stale, in_gap))
-            # several topics may report one signal: the first that has a value counts
+            # if several topics report one signal, the first with a value is used
             first = columns.get(name, np.full(len(times_ns), np.nan))
             reported[name] = np.where(np.isnan(first), reported_ns[at], reported.get(name, times_ns))
             columns[name] = np.where(np.isnan(first), column, first)
@@ -772,7 +780,7 @@ class Tracker:
 
 
 class _Counts(dict[Any, tuple[int, int]]):
-    """Counts by key, each with the first time."""
+    """Counts by key, with the time of the first."""
 
     def add(self, key: Hashable, times_ns: Integers) -> None:
         count, first_ns = self.get(key, (0, int(times_ns[0])))
@@ -780,17 +788,18 @@ class _Counts(dict[Any, tuple[int, int]]):
 
 
 class Remarks:
-    """Counts of objects that became unknown, and why.
+    """Remarks on a log, and the counts from which they are made.
 
     Attributes:
-        missing: observations without a transform, by topic, frame, and whether the frame is known.
-        stale: samples in which an object is unknown because its topic was silent, by topic, whether for
-            longer than `max_gap`, and name.
-        replaced: messages that have the time of a later one, by topic.
+        missing: observations without a transform, by (topic, frame, whether the frame is known).
+        stale: samples in which an object or signal is unknown because of a silence, by (topic, whether the
+            silence is longer than `max_gap`, name).
+        replaced: messages replaced by a later one of the same time, by topic.
         skipped: objects without solids, by topic.
-        stamps: the first stamp without a transform, and when its message was recorded, by topic.
-        samples, messages: the intervals between samples, and between messages by topic.
-        lasting: topics whose messages stay valid, with the reason.
+        stamps: first stamp without a transform, and log time of its message, by topic.
+        samples: intervals between samples.
+        messages: intervals between messages, by topic.
+        lasting: reasons why the messages of topics stay valid, by topic.
     """
 
     def __init__(self, name: str, mapping: LogMapping) -> None:
@@ -807,14 +816,14 @@ class Remarks:
     def count_stale(
         self, topic: str, name: str, times_ns: Integers, stale: Booleans, in_gap: Booleans
     ) -> None:
-        """Count the samples in which an object or a signal is unknown since its topic was silent."""
+        """Count the samples in which an object or a signal is unknown because its topic was silent."""
         for is_gap in (False, True):
             stale_ns = times_ns[stale & (in_gap == is_gap)]
             if len(stale_ns):
                 self.stale.add((topic, is_gap, name), stale_ns)
 
     def add_pauses(self) -> None:
-        """Remark pauses of topics, but for those in which there are no samples either."""
+        """Add remarks on pauses of topics, unless all of a topic's pauses are also pauses of the samples."""
         pauses = self.samples.longest_first()
         for topic, messages in sorted(self.messages.items()):
             if topic in self.lasting:
@@ -829,7 +838,7 @@ class Remarks:
                 self.add(remark)
 
     def add_silences(self) -> None:
-        """Remark topics that came regularly and stopped, and whose last message stays valid."""
+        """Add remarks on topics that stopped after regular messages, and whose last message stays valid."""
         for topic, why in sorted(self.lasting.items()):
             messages = self.messages[topic]
             last_ns, end_ns, usual_ns = messages.last_ns, self.samples.last_ns, messages.usual_ns
@@ -850,7 +859,7 @@ class Remarks:
         self._texts.append(text)
 
     def take(self) -> tuple[str, ...]:
-        """Return all remarks, and forget them."""
+        """Return all remarks and remove them."""
         texts = [*self._texts, *self._missing_texts(), *self._stale_texts()]
         for topic, count in sorted(self.skipped.items()):
             were = "object was" if count == 1 else "objects were"
@@ -887,7 +896,7 @@ class Remarks:
         for (topic, is_gap), stale in by_topic.items():
             reason = "the topic was silent for longer than `max_gap`"
             if not is_gap:
-                # other objects of the topic may have been reported
+                # the reason does not call the topic silent, because other objects may have been reported
                 reason = "no report came for longer than max_age; `max_age: forever` keeps the last one"
             names = ", ".join(name for name, _, _ in stale[:_MOST_NAMES])
             more = f" and {len(stale) - _MOST_NAMES} more" if len(stale) > _MOST_NAMES else ""
@@ -919,7 +928,7 @@ def _unheard(planned: PlannedTopic) -> TopicSpan:
 
 
 def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
-    """Return what is wrong with a stamp that is years from when its message was recorded; "" otherwise."""
+    """Return a clause on a stamp that is more than a year from the recording of its message, or ""."""
     if abs(stamp_ns - log_ns) < _FAR_NS:
         return ""
     year, unit = datetime.fromtimestamp(stamp_ns / 1e9, UTC).year, unit_of_stamp(stamp_ns, log_ns)
@@ -928,7 +937,7 @@ def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
 
 
 def _superseded_messages(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:
-    """Return the messages with an object that a later message of the same time reports, or leaves out."""
+    """Return the indices of messages that a later message of the same time replaces, wholly or in part."""
     followed = np.append(times_ns[1:] == times_ns[:-1], False)
     if is_complete or not followed.any():
         return np.flatnonzero(followed)
@@ -940,7 +949,7 @@ def _superseded_messages(detections: Detections, times_ns: Integers, *, is_compl
 
 
 def _changes(transforms: Transforms) -> Integers:
-    """Return the indices of transforms that differ from the one before, and the first."""
+    """Return the index of the first transform, and of each transform that differs from its predecessor."""
     rotation, translation, is_known = transforms
     changed = np.ones(len(is_known), np.bool_)
     changed[1:] = (
@@ -952,7 +961,7 @@ def _changes(transforms: Transforms) -> Integers:
 
 
 def _repeated_names(detections: Detections) -> list[int]:
-    """Return the indices of detections whose name was in the same message before."""
+    """Return the indices of detections that repeat a name within a message."""
     order = np.lexsort((detections.name, detections.message))
     message, name = detections.message[order], detections.name[order]
     again: list[int] = order[1:][(message[1:] == message[:-1]) & (name[1:] == name[:-1])].tolist()

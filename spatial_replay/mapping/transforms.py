@@ -1,9 +1,11 @@
 """Frames: messages with transforms in, the transform between any two frames at any time out.
 
 A transform places a child frame in its parent. Between two transforms of a child, translation is interpolated
-linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static transform holds
-until another one replaces it. Where stamps step back, a new run begins, such as that of a simulation: only
-static transforms last beyond it. Rotations are arrays of many at once: quaternions (x, y, z, w) and matrices.
+linearly and rotation along the shorter arc, as in tf2. There is no extrapolation. A static transform holds
+until another one replaces it.
+
+A step back of the stamps begins a new run, such as a restarted simulation. Only static transforms hold across
+runs. Rotations are arrays: quaternions (x, y, z, w) and matrices.
 """
 
 from __future__ import annotations
@@ -39,14 +41,14 @@ _UPRIGHT = 1e-9
 def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
     """Convert quaternions of any length to rotation matrices.
 
-    A quaternion of zeros, the default of messages whose orientation was never set, means no rotation.
+    A quaternion of zeros, the default of messages, means no rotation.
 
     Args:
         quaternions: (N, 4) x, y, z, w.
 
     Returns:
-        (N, 3, 3) a_from_b matrices, whose columns are the axes of b; (N,) the angle of the projected x axis,
-        NaN for quaternions of zeros.
+        (N, 3, 3) a_from_b matrices, whose columns are the axes of b, and (N,) angles of the projected x axes.
+        The angle is NaN for quaternions of zeros.
     """
     norm = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
     is_zero = norm < _LEAST_NORM
@@ -62,13 +64,13 @@ def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
     matrices[:, 2, 0] = 2 * (x * z - y * w)
     matrices[:, 2, 1] = 2 * (y * z + x * w)
     matrices[:, 2, 2] = 1 - 2 * (x * x + y * y)
-    # rotations about z alone, the common case, exactly upright
+    # exactly the identity, also for norms that are above 0 and below the limit
     matrices[is_zero] = np.eye(3)
     return matrices, np.where(is_zero, np.nan, yaw_of(matrices))
 
 
 def matrices_from_yaw(yaw: Floats) -> Floats:
-    """(N, 3, 3) rotations about z by angles (N,) in radians."""
+    """Return rotations (N, 3, 3) about z by angles (N,) in radians."""
     matrices = np.zeros((len(yaw), 3, 3))
     cosine, sine = np.cos(yaw), np.sin(yaw)
     matrices[:, 0, 0] = matrices[:, 1, 1] = cosine
@@ -84,13 +86,13 @@ def no_rotations(count: int) -> Floats:
 
 
 def yaw_of(matrices: Floats) -> Floats:
-    """Return the angle (N,) of the projected x axis in radians; NaN if its projection is a point."""
+    """Return the angle (N,) of the x axis in the plane, in radians; NaN if the axis is vertical."""
     x, y = matrices[:, 0, 0], matrices[:, 1, 0]
     return np.asarray(np.where(np.hypot(x, y) > _UPRIGHT, np.arctan2(y, x), np.nan))
 
 
 def is_upright(matrices: Floats) -> Booleans:
-    """Return whether (N,) the rotation maps the z axis to itself, up or down."""
+    """Return for each rotation (N,) whether it keeps the z axis vertical, up or down."""
     return np.asarray(np.hypot(matrices[:, 0, 2], matrices[:, 1, 2]) <= _UPRIGHT)
 
 
@@ -98,17 +100,17 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     """Interpolate between quaternions at constant angular speed, along the shorter arc.
 
     Args:
-        first, second: (N, 4) x, y, z, w, of any length but 0.
-        share: (N,) 0 for the first up to 1 for the second.
+        first, second: (N, 4) x, y, z, w, of any length above 0.
+        share: (N,) from 0 for `first` to 1 for `second`.
     """
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
     dot = np.einsum("ij,ij->i", first, second)
-    # q and -q are one rotation; the arc to the nearer one is the shorter
+    # q and -q are the same rotation; the shorter arc ends at the nearer one
     second = np.where(dot[:, None] < 0, -second, second)
     angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
     sine = np.sin(angle)
-    # the quotient below is 0 / 0 for equal quaternions, and linear interpolation is exact enough near them
+    # linear interpolation for nearly equal quaternions, for which the quotient below tends to 0 / 0
     is_close = sine < _LEAST_NORM
     divisor = np.where(is_close, 1.0, sine)
     weight = np.where(is_close, 1.0 - share, np.sin((1.0 - share) * angle) / divisor)
@@ -117,19 +119,22 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
 
 
 HISTORY_NS = 10 * 10**9
-"""How far two transforms may lie apart, at most, to place what is between them."""
+"""Longest time between two transforms that are interpolated, nanoseconds."""
 
 _LONGEST_CHAIN = 100
+"""Frames at most from a frame to its root."""
 _OFF_LENGTH = 0.01
-"""By how much the squared length of a rotation's quaternion may differ from 1, as in tf2."""
+"""Largest error of the squared length of a rotation's quaternion, as in tf2."""
 _LEAST_JUMP = 0.1
-"""Least jump of a frame, in metres and radians."""
+"""Least jump of a frame: distance in metres plus turn in radians."""
 _MANY_JUMPS = 3
+"""Jumps of a frame from which they are reported."""
 _MOST_PUBLISHERS = 4
-"""Most poses between two of one publisher, plus one."""
+"""Publishers at most that are assumed to send a frame in turn."""
 LEAST_STEP_NS = 10_000_000
-"""Least step back of a clock: recorders that write from several threads mix messages within this."""
+"""Least step back of a clock, nanoseconds; recorders with several threads mix messages by less."""
 _MOST_RESTARTS = 1_000
+"""Restarts at most that are kept."""
 
 
 class Transforms(NamedTuple):
@@ -138,7 +143,7 @@ class Transforms(NamedTuple):
     Attributes:
         rotation: (N, 3, 3).
         translation: (N, 3).
-        known: (N,) bool; numbers of unknown transforms have no meaning.
+        known: (N,) whether a transform is known; other numbers of unknown transforms have no meaning.
     """
 
     rotation: Floats
@@ -155,7 +160,7 @@ class Transforms(NamedTuple):
         return cls(np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count, np.bool_))
 
     def put(self, places: Integers, others: Transforms) -> None:
-        """Replace the transforms in some places, while these are being collected."""
+        """Set the transforms at some indices in place, to collect a result."""
         for whole, part in zip(self, others, strict=True):
             whole[places] = part
 
@@ -177,7 +182,7 @@ class Transforms(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """One transform of a child frame: its pose is x, y, z, then the quaternion x, y, z, w."""
+    """One transform of a child frame; the pose is x, y, z, then the quaternion x, y, z, w."""
 
     stamp_ns: int
     clock_ns: int
@@ -187,7 +192,7 @@ class _Entry(NamedTuple):
 
 
 class _Restart(NamedTuple):
-    """Where stamps step back: the last transform before, and the first one after."""
+    """A step back of the stamps: the last transform before it, and the first one after."""
 
     old: _Entry
     new: _Entry
@@ -195,10 +200,10 @@ class _Restart(NamedTuple):
 
 @dataclass(slots=True)
 class _Child:
-    """The transforms of one child frame; static ones, if it has any, count alone.
+    """The transforms of one child frame.
 
     Attributes:
-        restart: where the stamps step back, if they do so at the last transform.
+        restart: step back of the stamps at the last transform; None without one.
     """
 
     moving: list[_Entry] = field(default_factory=list)
@@ -211,9 +216,12 @@ class _Child:
 
 
 class _Series(NamedTuple):
-    """The transforms of one child frame, ordered by stamp or by clock; parents by number.
+    """The transforms of one child frame, ordered by stamp or by clock.
 
-    The first ones are static, so that nothing is interpolated between them; `still` is their number.
+    Attributes:
+        still: number of static transforms, which come first and are not interpolated.
+        parents: names of parents.
+        parent: index of each transform's parent in `parents`.
     """
 
     still: int
@@ -224,19 +232,19 @@ class _Series(NamedTuple):
     poses: Floats
 
     def at(self, times_ns: Integers) -> Integers:
-        """Return which transform was the last at each time; before the first, the first."""
+        """Return the index of the last transform up to each time; 0 before the first."""
         return np.maximum(np.searchsorted(self.times_ns, times_ns, "right") - 1, 0)
 
 
 class FrameTree:
-    """The transforms of a log, added as they arrive; see `remarks` for those that contradict each other."""
+    """The transforms of a log, added in order of arrival; `remarks` lists contradictions between them."""
 
     def __init__(self) -> None:
         self._children: dict[str, _Child] = {}
         self._series: dict[str, dict[tuple[str, int | None], _Series]] = {}
         self._restarts: list[_Restart] = []
         self.newest_stamp_ns = 0
-        """The stamp of the last transform that is not static."""
+        """Stamp of the last added transform that is not static."""
         self._ignored: dict[str, tuple[int, _Entry, str]] = {}
         self._steps: dict[str, tuple[int, _Entry, _Entry]] = {}
         self._contradictions: dict[tuple[str, bool, bool], Sentence] = {}
@@ -255,16 +263,16 @@ class FrameTree:
         log_ns: int,
         is_static: bool,
     ) -> None:
-        """Add one transform; those that tf2 ignores are only counted.
+        """Add one transform; a transform that tf2 would ignore is only counted.
 
-        A static transform counts from its stamp on, the first one of a frame before that, too. One that has
-        no stamp, or an older one than the transform that it replaces, counts from its clock on.
+        A static transform holds from its stamp on. The first one of a frame also holds before. A static
+        transform without a stamp, or with an older stamp than its predecessor, holds from its clock time on.
 
         Args:
             pose: x, y, z, then the quaternion x, y, z, w.
-            stamp_ns: the time inside the message.
-            clock_ns: the time of the message on the clock of the samples.
-            log_ns: when the message was recorded.
+            stamp_ns: stamp in the message.
+            clock_ns: time of the message on the clock of the samples.
+            log_ns: time of recording.
         """
         entry = _Entry(stamp_ns, clock_ns, parent, pose, log_ns)
         if (reason := _reason_to_ignore(child, entry)) is not None:
@@ -291,9 +299,10 @@ class FrameTree:
         self._series.pop(child, None)
 
     def _note_restart(self, name: str, child: _Child, new: _Entry) -> None:
-        """Note that the stamps of a frame step back.
+        """Note a restart if the stamps of a frame step back.
 
-        If the next transform steps forward again, two programs with different clocks take turns.
+        If the next transform steps forward again, there was no restart: two programs with different clocks
+        send the frame in turn.
         """
         old, before, child.restart = child.moving[-1], child.restart, None
         if before in self._restarts and new.stamp_ns >= before.old.stamp_ns - DISORDER_NS:
@@ -306,7 +315,7 @@ class FrameTree:
             return
         restart = child.restart = _Restart(old, new)
         if self._restarts and self._restarts[-1].new.log_ns > old.log_ns:
-            # in one restart, all frames step back one after the other
+            # one restart makes all frames step back, one after the other
             restart = min(restart, self._restarts.pop(), key=lambda restart: restart.new.log_ns)
         self._restarts = [*self._restarts[1 - _MOST_RESTARTS :], restart]
         self._series.clear()
@@ -317,12 +326,12 @@ class FrameTree:
             keep = [entry for entry in child.moving if entry.clock_ns >= clock_ns]
             if len(keep) < len(child.moving):
                 self._look_for_jumps(name, [entry for entry in child.moving if entry.clock_ns < clock_ns])
-                # the last one names the parent, and may be the start of the next interpolation
+                # the last one is kept for its parent, and as the start of the next interpolation
                 child.moving = keep or child.moving[-1:]
         self._series.clear()
 
     def forget_moving(self) -> None:
-        """Drop every transform but the static ones: nothing is known between those and what comes next."""
+        """Drop all transforms except static ones, so that nothing is interpolated across a loss."""
         self._children = {
             name: _Child(static=child.static) for name, child in self._children.items() if child.static
         }
@@ -330,9 +339,9 @@ class FrameTree:
 
     @property
     def names(self) -> frozenset[str]:
-        """All frames that are a child or a parent of a transform."""
+        """Names of all frames that are a child or a parent of a transform."""
         parents = {entry.parent for child in self._children.values() for entry in child.entries}
-        # the log has the frames of a transform that does not count, too
+        # frames of ignored transforms are frames of the log, too
         ignored = {name for _, entry, child in self._ignored.values() for name in (child, entry.parent)}
         return frozenset(self._children) | parents | ignored
 
@@ -347,12 +356,12 @@ class FrameTree:
         longest_ns: int = HISTORY_NS,
         holds: bool = False,
     ) -> Transforms:
-        """Return target_from_source at each of N times; unknown where the tree has no transforms.
+        """Return target_from_source at each of N times; unknown at times without transforms.
 
         Args:
             times_ns: (N,) stamps, or times of messages on the clock of the samples (`by_stamp=False`).
-            log_ns: (N,) when that was recorded, which shows its run; without it, all runs count.
-            longest_ns: between two transforms that are farther apart, nothing is known.
+            log_ns: (N,) times of recording, which identify the run; without them, all runs are used.
+            longest_ns: longest time between two transforms that are interpolated.
             holds: whether a transform holds for `longest_ns` if none follows in that time.
         """
         count = len(times_ns)
@@ -366,7 +375,7 @@ class FrameTree:
         return result
 
     def _by_run(self, ask: _Question) -> list[_Question]:
-        """Divide a question by the runs of the log, and by whether stamps are far from times of the log."""
+        """Divide a question by run, and into stamps near to and far from the times of recording."""
         times_ns, log_ns = ask.times_ns, ask.log_ns
         if log_ns is None:
             return [ask]
@@ -383,7 +392,7 @@ class FrameTree:
         ]
 
     def _by_parents(self, ask: _Question) -> list[_Question]:
-        """Divide a question so that in each part every frame has one parent."""
+        """Divide a question into parts in which each frame has a single parent."""
         keys = [np.zeros(len(ask.times_ns), np.int64)]
         for name in self._children:
             series, times_ns = self._series_of(name, ask)
@@ -406,7 +415,7 @@ class FrameTree:
         return common_from_target.inverse().after(common_from_source)
 
     def _ancestors(self, frame: str, ask: _Question) -> list[str]:
-        """Return a frame, its parent, the parent of that and so on, at the first time."""
+        """Return the chain of a frame, its parent and so on up to the root, at the first time."""
         chain = [frame]
         while len(chain) < _LONGEST_CHAIN:
             series, times_ns = self._series_of(chain[-1], ask)
@@ -422,7 +431,7 @@ class FrameTree:
         return chain
 
     def _climb(self, frames: list[str], ask: _Question) -> Transforms:
-        """Return the transform from the first frame of a chain into the parent of the last."""
+        """Return the transform from the first frame of a chain to the parent of the last frame."""
         total = Transforms.identity(len(ask.times_ns))
         for frame in frames:
             total = self._step(frame, ask).after(total)
@@ -453,7 +462,7 @@ class FrameTree:
         is_held = ask.holds & ~is_between & (times_ns - start <= ask.longest_ns)
         is_known &= is_between | is_held
         span = np.where(end > start, end - start, 1)
-        # poses in different parents cannot be interpolated; the earlier one holds
+        # no interpolation between poses in different parents: the earlier pose holds
         moves = is_between & (end > start) & (series.parent[before] == series.parent[after])
         share = np.where(moves, (times_ns - start) / span, 0.0)
         first, second = series.poses[before], series.poses[after]
@@ -464,10 +473,11 @@ class FrameTree:
         )
 
     def _series_of(self, frame: str, ask: _Question) -> tuple[_Series, Integers]:
-        """Return the transforms of a child that a question is about, in order, and the times to look for.
+        """Return the ordered transforms of a frame for a question, and the times to look up in them.
 
-        Static transforms of all runs count. If stamps are not times of the log, these count from when they
-        were recorded. They count before the frame first moves, if it does.
+        Static transforms of all runs are used, but only those before the first moving transform of the frame.
+        If stamps are far from times of recording, a frame without moving transforms is looked up by the time
+        of recording.
         """
         child = self._children.get(frame, _Child())
         clock, run, times_ns = "stamp_ns" if ask.by_stamp else "clock_ns", ask.run, ask.times_ns
@@ -487,7 +497,7 @@ class FrameTree:
         return bisect_right(self._restarts, entry.log_ns, key=lambda restart: restart.new.log_ns)
 
     def _contradict(self, child: str, old: _Entry, new: _Entry, *, is_mixed: bool = False) -> None:
-        """Note, once for each frame, two kinds, two parents, or a static transform that changes."""
+        """Note the first contradiction of a kind: static and moving, two parents, or a changed static one."""
         key = child, is_mixed, old.parent == new.parent
         if key in self._contradictions:
             return
@@ -504,7 +514,7 @@ class FrameTree:
         )
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
-        """Count the transforms of a child that lie far from the one before and the one after, which agree."""
+        """Count the jumps of a child: transforms far from both neighbours, which agree with each other."""
         kinds = [(entry.parent, self._run_of(entry)) for entry in entries]
         for kind in dict.fromkeys(kinds):
             self._look_for_jumps_in(
@@ -521,7 +531,7 @@ class FrameTree:
             turn = 2 * np.arccos(np.minimum(cosine, 1.0))
             return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turn)
 
-        # from one pose over some of others to the next of the same publisher
+        # lags at which a pose and a later one may be of the same publisher, with other poses between them
         lags = range(2, min(_MOST_PUBLISHERS, len(poses) - 1) + 1)
         aside = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
         usual = min(float(np.quantile(distances, 0.3)) for distances in aside.values())
@@ -536,7 +546,7 @@ class FrameTree:
                 jumps[: len(over)] |= (least > max(_LEAST_JUMP, times * usual)) & (over * times < least)
             return np.flatnonzero(jumps)
 
-        # noise jumps rarely, and hardly ever by ten times the usual motion
+        # noise causes few jumps, and hardly any of ten times the usual motion
         jumps = jumps_of(5)
         jumps = jumps if len(jumps) > 0.05 * len(poses) else jumps_of(10)
         if len(jumps):
@@ -547,7 +557,7 @@ class FrameTree:
             self._jumps[name] = count + len(jumps), most, example[0], example[1]
 
     def remarks(self) -> list[str]:
-        """Return texts on the transforms that were ignored, that contradict each other, or that pause."""
+        """Return remarks on transforms that were ignored, contradict each other, jump or pause."""
         for name, child in self._children.items():
             self._look_for_jumps(name, child.moving)
         texts: list[str] = []
@@ -595,12 +605,12 @@ class FrameTree:
 
 
 class _Question(NamedTuple):
-    """At which times transforms are wanted; see `FrameTree.between`.
+    """A request for transforms at some times; see `FrameTree.between`.
 
     Attributes:
-        places: indices of the times in the whole question.
-        run: the number of the run; None for all.
-        is_apart: whether stamps are on a clock far from that of the log.
+        places: indices of the times in the original question.
+        run: number of the run; None for all runs.
+        is_apart: whether stamps are far from the times of recording.
     """
 
     places: Integers
@@ -618,7 +628,12 @@ class _Question(NamedTuple):
 
 
 def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
-    """Return transforms in order of a clock, static before a time; of equal times, the later one counts."""
+    """Return transforms in order of a clock, without all but the last of those with equal times.
+
+    Args:
+        clock: attribute of entries with the time.
+        first_ns: time before which transforms are static.
+    """
     times = np.array([getattr(entry, clock) for entry in entries], np.int64)
     order = np.argsort(times, kind="stable")
     ordered = times[order]
@@ -636,7 +651,7 @@ def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
 
 
 def _reason_to_ignore(child: str, entry: _Entry) -> str | None:
-    """Return why a transform does not count, as in tf2; None if it does."""
+    """Return the reason for which tf2 would ignore a transform; None without one."""
     if not child or not entry.parent:
         return "it has no name for the frame or its parent (child_frame_id, frame_id)"
     if child == entry.parent:
@@ -670,7 +685,7 @@ _REST = ("nanosec", "nsec", "nsecs", "nanos")
 
 
 class TransformReader:
-    """Reads the transforms in the messages of one topic, in the types of ROS 1, ROS 2 and Foxglove."""
+    """Reader of the transforms in one topic's messages, of ROS 1, ROS 2 and Foxglove types."""
 
     def __init__(self) -> None:
         self._list: Get | None = None
@@ -682,11 +697,11 @@ class TransformReader:
         """Add the transforms of a message to a tree.
 
         Args:
-            clock_ns: of the message, on the clock of the samples; None for the stamp of each transform.
-            log_ns: when the message was recorded.
+            clock_ns: time of the message on the clock of the samples; None for the stamp of each transform.
+            log_ns: time of recording.
 
         Raises:
-            FieldError, AttributeError, LookupError, TypeError, ValueError: the message holds no transforms.
+            FieldError, AttributeError, LookupError, TypeError, ValueError: the message has no transforms.
         """
         for transform in self._each(message):
             child, parent, seconds, rest, *pose = self._values(transform)
@@ -702,7 +717,7 @@ class TransformReader:
             )
 
     def stamp(self, message: object) -> int | None:
-        """Return the stamp of the first transform of a message; None if there is no transform."""
+        """Return the stamp of the first transform of a message; None without one."""
         for transform in self._each(message):
             _, _, seconds, rest, *_ = self._values(transform)
             return _nanoseconds(seconds, rest)
@@ -722,7 +737,7 @@ class TransformReader:
 
 
 def _getter(example: object) -> Get:
-    """Return a getter for child, parent, seconds, nanoseconds, x, y, z and the quaternion x, y, z, w."""
+    """Return a getter of child, parent, seconds, nanoseconds, x, y, z and the quaternion x, y, z, w."""
     names = field_names(example)
     in_header = "header" in names
     stamp, parent = ("header.stamp", "header.frame_id") if in_header else ("timestamp", "parent_frame_id")
