@@ -1,1 +1,1 @@
-"""Samples as columns, with a cache of their measurements."""
+"""Traces: samples as columns, with a cache of measurements."""

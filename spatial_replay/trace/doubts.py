@@ -1,4 +1,4 @@
-"""Assumptions about how a log is read that the log itself contradicts."""
+"""Doubts: contradictions between a log and the assumptions by which it is read."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any, Final
 from spatial_replay.text import Sentence, counted_from
 
 MANY_TURNS: Final = 8 * pi
-"""Angles in radians beyond four turns are taken for degrees."""
+"""Limit on angles in radians, four turns; larger angles are probably degrees."""
 
 SHORTEST_PERIOD_NS: Final = 200_000
-"""No robot is recorded at a higher rate: shorter intervals are times in another unit."""
+"""Shortest plausible period of a recording, ns; a shorter one means times in another unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +22,11 @@ class Doubt:
     """A contradiction between a log and an assumption by which it was read.
 
     Attributes:
-        assumption: its name, as `accept` in a mapping takes it.
-        topic: the topic whose messages contradict it; "" for a log without topics.
-        text: the measurement, and the key that settles it; it begins with the topic.
-        objects, signals: names whose values rest on the assumption.
-        is_accepted: whether the mapping accepts it, so that verdicts are not doubtful.
+        assumption: name of the assumption, as in `accept` of a mapping.
+        topic: topic whose messages contradict it; "" for a log without topics.
+        text: the measurement, and the key that settles it. It begins with the topic.
+        objects, signals: names whose values depend on the assumption.
+        is_accepted: whether the mapping accepts the doubt, so that verdicts are not doubtful.
     """
 
     assumption: str
@@ -37,7 +37,7 @@ class Doubt:
     is_accepted: bool = False
 
     def remark(self, log: str) -> Sentence:
-        """Return the remark on a log that this doubt is about."""
+        """Return the remark about this doubt, with the name of the log."""
         if self.is_accepted:
             return Sentence(f"{log}: accepted: ", self.text)
         remedy = f"`accept: [{self.assumption}]` in the mapping" if self.topic else "`--allow doubtful`"
@@ -45,12 +45,12 @@ class Doubt:
 
     @property
     def title(self) -> str:
-        """Its assumption and topic, as certificates list them."""
+        """The assumption and the topic, as in certificates."""
         return " ".join(filter(None, (self.assumption, self.topic, "(accepted)" * self.is_accepted)))
 
 
 def metadata_from_doubts(doubts: Iterable[Doubt]) -> dict[str, str]:
-    """Return doubts as a metadata record of a log: by title, each as JSON."""
+    """Return doubts as a metadata record of a log: JSON texts by title."""
     return {doubt.title: json.dumps(json_doubt(doubt), ensure_ascii=False) for doubt in doubts}
 
 
@@ -67,7 +67,7 @@ def json_doubt(doubt: Doubt) -> dict[str, Any]:
 
 
 def doubts_from_metadata(record: Mapping[str, str]) -> Iterator[Doubt]:
-    """Yield the doubts of a metadata record; entries that nothing of ours wrote are left out."""
+    """Yield the doubts of a metadata record; entries in other formats are skipped."""
     for text in record.values():
         try:
             entry = json.loads(text)
@@ -84,7 +84,7 @@ def doubts_from_metadata(record: Mapping[str, str]) -> Iterator[Doubt]:
 
 
 def distinct_doubts(doubts: Iterable[Doubt], first_ns: int) -> tuple[Doubt, ...]:
-    """Return each doubt once; its times count from `first_ns`, where it knows them."""
+    """Return each doubt once, with the times in its text counted from `first_ns`."""
     return tuple(
         replace(doubt, text=counted_from([doubt.text], first_ns)[0]) for doubt in dict.fromkeys(doubts)
     )

@@ -1,4 +1,4 @@
-"""How each topic of a log was read, in numbers that a person checks at a glance."""
+"""Facts about each topic of a log, as numbers that show a person how it was read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Distribution(NamedTuple):
-    """The least, the median and the greatest of numbers, and when the greatest came, if that is known."""
+    """Least, median and greatest number of a set, and the time of the greatest, if known."""
 
     least: float
     median: float
@@ -20,22 +20,24 @@ class TopicFacts:
     """Content of one mapped topic, as it was read; numbers without a measurement are None.
 
     Attributes:
-        messages: their number, from `first_ns` to `last_ns` on the clock of the mapping.
-        period_s: the intervals between messages, seconds; the greatest is the longest pause.
-        lateness_s: how much later messages were recorded than their stamps say, seconds.
+        messages: number of messages.
+        first_ns, last_ns: times of the first and the last message, on the clock of the mapping.
+        period_s: intervals between messages, s; the greatest is the longest pause.
+        lateness_s: recording times minus stamps of messages, s.
         publishers: number of channels.
-        frames: that its messages name.
-        objects: number of reports, of which one message has up to `most_at_once`.
-        name: how names are made: the entry of the mapping; "" for the default of the type.
-        names: of the objects.
-        classes: of the objects; None for objects without one.
-        class_changes: how often an object was reported with another class than before.
+        frames: frames that its messages name.
+        objects: number of reports of objects.
+        most_at_once: largest number of reports in one message.
+        name: entry of the mapping that makes names; "" for the default of the type.
+        names: names of the objects.
+        classes: classes of the objects; None for objects without a class.
+        class_changes: number of reports with another class than the object's previous report.
         signals: names of the signals.
         size, shorter_side: longer and shorter sides of outlines, in footprint units.
-        low, high: the least and the greatest coordinates, as messages have them.
-        speed, turn_rate: between reports of an object, in footprint units and radians a second.
+        low, high: least and greatest coordinates, as in messages.
+        speed, turn_rate: speeds between reports of an object, in footprint units and radians per second.
         bottom, top: heights of objects.
-        uncertainty: radii of objects.
+        uncertainty: uncertainty radii of objects.
     """
 
     topic: str

@@ -1,4 +1,4 @@
-"""Build a trace from objects as a log reports them: check, normalise, arrange in columns."""
+"""Build a trace from the objects that a log reports: check, normalise and arrange them in columns."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ class Observations:
 
     Attributes:
         times_ns: (T,) int64, increasing.
-        sample: (R,) int64, the index of the sample in which an object was detected.
+        sample: (R,) int64, index of the sample in which an object was detected.
         name: (R,) int64, index into `names`.
-        names: objects' names, in any order.
+        names: names of the objects, in any order.
         class_code: (R,) int64, index into `classes`.
-        classes: class names; None for objects without one.
-        yaw: (R,) float64, radians; NaN for none.
+        classes: class names; None for objects without a class.
+        yaw: (R,) float64, radians; NaN for objects without orientation.
         uncertainty: (R,) float64, radius in footprint units.
-        shapes: the R footprints, bottom and top NaN where there is no height.
-        invalid: (R,) bool, where the report itself marks a number as unknown.
+        shapes: footprints of the R objects; bottom and top are NaN for objects without height.
+        invalid: (R,) bool, whether the report itself marks a number as unknown.
         signals: numeric signals by name, each (T,) float64, NaN where unknown.
-        reported_ns: (R,) int64, when each was reported; None where all have the times of their samples.
-        signals_reported_ns: the same of signals, as in a `Trace`.
-        lasting: the objects that stand where they are until they are reported again.
+        reported_ns: (R,) int64, times of the reports; None if all equal the times of their samples.
+        signals_reported_ns: times of the signals' reports, as in a `Trace`.
+        lasting: objects that keep their position until their next report.
     """
 
     times_ns: Integers
@@ -61,14 +61,14 @@ class Observations:
 def trace_from_observations(observed: Observations, *, concave: Concave) -> tuple[Trace, dict[int, str]]:
     """Check every observation and normalise its polygons.
 
-    Observations with a number that is not finite become unreadable rows. Samples are left out that name an
-    object twice, or have a negative radius or uncertainty, a height upside down, or an invalid polygon.
+    Observations with a number that is not finite become unreadable rows. Samples are left out if they name
+    an object twice, or have a negative radius or uncertainty, a height upside down, or an invalid polygon.
 
     Args:
-        concave: how polygons that are not convex are treated.
+        concave: treatment of polygons that are not convex.
 
     Returns:
-        the trace of the other samples, and the fault of each sample left out, by its index.
+        the trace of the remaining samples, and the fault of each sample left out, by its index.
     """
     observed = _sort_observations(observed)
     faults = _duplicates(observed)
@@ -108,8 +108,8 @@ def check_observations(
     """Check every observation on its own, and normalise its polygons.
 
     Returns:
-        which observations (R,) have only finite numbers; the footprints; and the fault of each sample with
-        an observation that cannot be, by its index.
+        whether each observation (R,) has only finite numbers; the footprints; and the fault of each sample
+        with an impossible observation, by its index.
     """
     readable = _finite(observed) & ~observed.invalid
     faults = _wrong_numbers(observed, readable)
@@ -118,7 +118,7 @@ def check_observations(
 
 
 def _sort_observations(observed: Observations) -> Observations:
-    """Sort the observations by sample, then name, with names in order of code points."""
+    """Sort the observations by sample, then by name in order of code points."""
     order = sorted(range(len(observed.names)), key=observed.names.__getitem__)
     names = [observed.names[index] for index in order]
     rank = np.zeros(len(order), np.int64)
@@ -152,12 +152,12 @@ def _duplicates(observed: Observations) -> dict[int, str]:
 
 
 def _finite(observed: Observations) -> Booleans:
-    """Return whether all numbers of each observation are finite, (R,); an absent yaw or height is."""
+    """Return whether all numbers of each observation are finite, (R,); a missing yaw or height is."""
     shapes = observed.shapes
     is_bad = ~np.isfinite(shapes.radius)
     finite = np.isfinite(shapes.vertices)
     if not finite.all():
-        # looked at in pairs only now: that takes ten times as long
+        # per vertex only if needed: the reduction over pairs takes ten times as long as `all`
         is_bad |= count_in_rows(np.asarray(~finite.all(axis=1)), shapes.vertex_start) > 0
     bad_parts = count_in_rows(is_bad, shapes.part_start)
     no_height = np.isnan(shapes.bottom) & np.isnan(shapes.top)
@@ -192,7 +192,7 @@ def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]
 def _normalise_shapes(
     observed: Observations, readable: Booleans, concave: Concave
 ) -> tuple[FootprintBatch, dict[int, str]]:
-    """Return normalised polygons and the samples' faults; cut up those that are not convex."""
+    """Return normalised polygons and the samples' faults; polygons that are not convex are decomposed."""
     shapes = observed.shapes
     part_counts = np.diff(shapes.part_start)
     vertex_start, vertices, fault = normalise_polygons(shapes.vertex_start, shapes.vertices)
@@ -200,7 +200,7 @@ def _normalise_shapes(
     if not fault.any():
         return shapes, {}
     owner = np.repeat(np.arange(len(readable)), part_counts)
-    # few are concave, so the slow decomposition runs one by one
+    # few polygons are concave, so the slow decomposition treats them one by one
     odd = np.flatnonzero((fault != SOUND) & readable[owner] & (np.diff(vertex_start) > 0))
     pieces: dict[int, Footprint] = {}
     faults: dict[int, str] = {}
@@ -215,7 +215,7 @@ def _normalise_shapes(
 
 
 def _with_pieces(shapes: FootprintBatch, pieces: Mapping[int, Footprint]) -> FootprintBatch:
-    """Replace some parts of the shapes, each by the parts of a footprint."""
+    """Replace each given part of the shapes by the parts of a footprint."""
     counts = np.ones(len(shapes.radius), np.int64)
     counts[list(pieces)] = [len(footprint.parts) for footprint in pieces.values()]
     added = [part.vertices for footprint in pieces.values() for part in footprint.parts]

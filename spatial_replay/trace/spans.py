@@ -1,4 +1,4 @@
-"""When each mapped topic of a log could be judged, from its first usable sample to its last."""
+"""Spans of samples in which each mapped topic of a log could be judged."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True)
 class TopicSpan:
-    """When one topic could be judged: it had begun, went on, and transforms placed its messages.
+    """The samples in which one topic could be judged.
+
+    A topic can be judged after its first message, while messages arrive, and if transforms place them.
 
     Attributes:
         objects: names of its objects so far.
-        pattern: a regular expression for the names that its objects may have; None without objects.
+        pattern: regular expression for the names of its possible objects; None without objects.
         signals: names of its signals.
-        classes: classes that its objects may have, in lower case; None for any.
-        limit_ns: how much of an end of the log may be left out because of this topic.
-        begun_ns, heard_ns: times of its first and last message; None without any.
-        first_ns, last_ns: times of the first and the last sample where it could be judged; None without any.
+        classes: classes of its possible objects, in lower case; None for any class.
+        limit_ns: longest part of the log that may be left out at an end because of this topic, ns.
+        begun_ns, heard_ns: times of its first and last message; None without messages.
+        first_ns, last_ns: times of the first and the last such sample; None without such samples.
     """
 
     topic: str
@@ -33,11 +35,11 @@ class TopicSpan:
     last_ns: int | None
 
     def may_have(self, name: str) -> bool:
-        """Whether an object of this name may come on the topic."""
+        """Return whether the topic may report an object of this name."""
         return self.pattern is not None and re.fullmatch(self.pattern, name, re.DOTALL) is not None
 
     def join(self, later: TopicSpan) -> TopicSpan:
-        """Return the span over these samples and later ones."""
+        """Return the span over these and later samples of the topic."""
         return replace(
             later,
             objects=self.objects | later.objects,
@@ -49,7 +51,7 @@ class TopicSpan:
 
 
 def join_spans(stretches: Iterable[tuple[TopicSpan, ...]]) -> tuple[TopicSpan, ...]:
-    """Return the spans over stretches of a log in order."""
+    """Join the spans of consecutive parts of a log, by topic."""
     spans: dict[str, TopicSpan] = {}
     for stretch in stretches:
         for span in stretch:

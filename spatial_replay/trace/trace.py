@@ -1,4 +1,4 @@
-"""A sample; samples as columns, their pauses, a cache of their measurements, and the time points of callers.
+"""Samples and traces, with a cache of measurements; pauses of a log, and time points that users write.
 
 Times are whole nanoseconds (signed 64-bit).
 """
@@ -47,7 +47,7 @@ def require_time(value: object, name: str) -> None:
     """Check that a value is None or a time in ns.
 
     Raises:
-        UsageError: anything else than None or an integer of at least 0.
+        UsageError: the value is not None and not an integer of at least 0.
     """
     if value is None:
         return
@@ -76,7 +76,7 @@ _EXAMPLES = MappingProxyType(
 
 
 def _signal_value(name: str, value: Any) -> float:
-    """Return a number as it is, and that of a text that is none."""
+    """Return a number unchanged, and a text as its `text_number`."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
@@ -95,14 +95,13 @@ class Sample:
 
     Attributes:
         time_ns: nanoseconds, 0 to 2**63 - 1.
-        objects: the detected objects by name; a bare footprint stands for a `TrackedObject` with it.
+        objects: detected objects by name; a bare footprint stands for a `TrackedObject`.
         signals: numbers by name, NaN for an unknown value; a text is stored as its `text_number`.
-        unknown: the objects that are there, but not known where: their classes by name, None without one.
-            Unlike an object that is left out, they stay members of open groups, and make atoms over these
-            unknown.
-        reported_ns: when objects and signals were reported, by name, at most `time_ns`; the sample's own time
-            for others. An object and a signal of the same name share a time.
-        lasting: the objects that stand where they are until they are reported again, such as a latched map.
+        unknown: classes of objects with unknown position, by name; None for an object without a class. Such
+            objects stay members of open groups, so atoms over these groups are unknown.
+        reported_ns: times of the reports of objects and signals, by name, at most `time_ns`. By default
+            it is the sample's time. An object and a signal of the same name share a time.
+        lasting: objects that keep their position until their next report, such as a latched map.
 
     Raises:
         TraceError: an invalid time, name or value.
@@ -116,7 +115,7 @@ class Sample:
     lasting: frozenset[str] = frozenset()
 
     if TYPE_CHECKING:
-        # what is given may be less than what is there then
+        # the constructor accepts bare footprints and texts, which the fields never hold
         def __init__(
             self,
             time_ns: int,
@@ -158,7 +157,7 @@ class Sample:
             _require_name(name, "an object")
             if name in objects:
                 raise TraceError(f"object {name!r} is both known and unknown; give it once")
-            # a class may be empty, as that of a tracked object
+            # a class may be empty, like the class of a `TrackedObject`
             if class_name not in (None, ""):
                 _require_name(class_name, "a class")
         for name, reported_ns in self.reported_ns.items():
@@ -169,7 +168,7 @@ class Sample:
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
-        # equal samples are equal however their own time is written
+        # reports at the sample's own time are dropped, so that samples with and without them are equal
         others = {
             name: reported_ns
             for name, reported_ns in self.reported_ns.items()
@@ -187,25 +186,25 @@ class Sample:
 
 
 def require_sample(value: object) -> None:
-    """Refuse anything but a sample.
+    """Check that a value is a sample.
 
     Raises:
-        UsageError: it is something else.
+        UsageError: the value is not a `Sample`.
     """
     if not isinstance(value, Sample):
         raise UsageError(f"{shortened(value)} is not a sample; give a Sample(time_ns, objects)")
 
 
 MOST_NAMES = 20_000
-"""Objects, and signals, of a trace."""
+"""Limit on objects of a trace, and on its signals."""
 _BYTES = 1 << 30
 
 
 class MeasurementCache:
-    """Arrays computed from one frozen trace; above 1 GiB the least recently used are dropped.
+    """Cache of arrays computed from one frozen trace; above 1 GiB, the least recently used are evicted.
 
-    Each trace owns one, so a result for one trace is never taken for another's. Keys are compared by
-    equality, never by hash alone. Several threads may evaluate the same trace.
+    Each trace has its own cache, so traces never share results. Keys are compared by equality, never by hash
+    alone. Several threads may evaluate the same trace.
     """
 
     def __init__(self) -> None:
@@ -236,7 +235,7 @@ _DURATION = re.compile(
 )
 _ABSOLUTE = re.compile(r"(?P<number>\d{1,19})(?P<unit>ns)?", re.ASCII | re.I)
 _LEAST_WITHOUT_UNIT_NS = 10**12
-"""Smaller integers without a unit could be seconds or milliseconds as well."""
+"""Least integer that is read as nanoseconds without a unit; smaller ones could be s or ms."""
 _CALENDAR = re.compile(
     r"(?P<date>\d{4}-\d\d-\d\d)[T ](?P<time>\d\d:\d\d:\d\d)(?:\.(?P<fraction>\d{1,9}))?"
     r"(?P<offset>Z|[+-]\d\d:\d\d)",
@@ -247,18 +246,18 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class TimePoint:
-    """A time in a log, as people write it.
+    """A time in a log, as users write it.
 
     Attributes:
-        nanoseconds: since the first sample, since the last one (at most 0), or since the log's own zero.
-        origin: which of the three.
+        nanoseconds: time after the origin, ns; at most 0 from the last sample.
+        origin: first sample, last sample, or zero of the log's clock.
     """
 
     nanoseconds: int
     origin: Literal["first sample", "last sample", "zero"]
 
     def absolute_ns(self, first_ns: int = 0, last_ns: int = 0) -> int:
-        """Return this time on the clock of a log, by the times of its first and last sample."""
+        """Return this time on the clock of a log, given the times of its first and last sample."""
         origins_ns = {"first sample": first_ns, "last sample": last_ns, "zero": 0}
         return max(0, origins_ns[self.origin] + self.nanoseconds)
 
@@ -266,11 +265,10 @@ class TimePoint:
 def time_point_from_text(text: str) -> TimePoint:
     """Read `12.5s` after the first sample, `-1s` before the last, `5250000000ns` on the clock, or RFC 3339.
 
-    The unit of nanoseconds can be left out from 10^12 on.
+    Integers from 10^12 on are nanoseconds without a unit.
 
     Raises:
-        UsageError: for anything else, for a small integer without a unit, and for a time beyond the range of
-            logs.
+        UsageError: any other text, a small integer without a unit, or a time beyond the range of logs.
     """
     if _DURATION.fullmatch(text):
         return TimePoint(duration_ns_from_text(text), "first sample")
@@ -295,13 +293,13 @@ def duration_ns_from_text(text: str) -> int:
     """Read a duration such as `2s`, `0.5s` or `1500ms` as nanoseconds, rounded to the nearest.
 
     Raises:
-        UsageError: for anything else.
+        UsageError: any other text, or a duration beyond the range of logs.
     """
     match = _DURATION.fullmatch(text)
     if match is None:
         raise UsageError(f"{text!r} is not a duration; write it as 2s, 0.5s or 1500ms")
     nanoseconds = Decimal(match["number"]) * (10**9 if match["unit"].lower() == "s" else 10**6)
-    # compared before it becomes an integer, which might have a hundred digits
+    # capped before the conversion, because an exponent can give an integer of a hundred digits
     return _checked_ns(int(min(nanoseconds, Decimal(LATEST_NS + 1)).to_integral_value()), text)
 
 
@@ -329,38 +327,38 @@ ABSENT = -1
 class Trace(Displayed):
     """T samples with strictly increasing times.
 
-    Objects are stored as observations: rows of flat arrays, one for each time an object was reported.
+    Objects are stored as observations: rows of flat arrays, one row for each report of an object.
     `rows[t, n]` is the observation of object n in sample t, or `ABSENT`. An observation with a number
-    that is not finite is stored too, so that nothing is lost, but under the row number -2 - row: the
-    object is unknown there (unreadable).
+    that is not finite is unreadable: the object is unknown. It is stored under the row number -2 - row, so
+    that no data is lost.
 
-    Two traces are equal if they hold the same samples; `faults`, `remarks`, `doubts`, `units`, `spans`, the
-    order of observations and names that no sample uses do not matter.
+    Two traces are equal if they hold the same samples. Equality ignores `faults`, `remarks`, `doubts`,
+    `units`, `spans`, the order of observations, and names that no sample uses.
 
     Attributes:
         times_ns: (T,) int64.
-        names: the N objects' names, in order of code points.
+        names: names of the N objects, in order of code points.
         rows: (T, N) int64.
-        footprints: the R observations' footprints.
-        yaw: (R,) float64, radians; NaN where the observation has no orientation.
+        footprints: footprints of the R observations.
+        yaw: (R,) float64, radians; NaN for observations without orientation.
         uncertainty: (R,) float64, radius in footprint units, at least 0.
         class_code: (R,) int64, index into `classes`.
-        classes: class names; None for objects without one.
+        classes: class names; None for objects without a class.
         signals: numeric signals by name, each (T,) float64, NaN where unknown.
-        reported_ns: (T, N) int64, when the observation that each sample shows was reported; None where every
-            report has the time of its sample.
-        signals_reported_ns: the same of signals by name, each (T,) int64; without those whose reports all
-            have the times of samples.
-        lasting: the objects that stand where they are until they are reported again.
+        reported_ns: (T, N) int64, time of the report that each sample shows; None if every report has the
+            time of its sample.
+        signals_reported_ns: times of reports by signal, each (T,) int64. A signal is left out if all its
+            reports have the times of their samples.
+        lasting: objects that keep their position until their next report.
         faults: messages about samples lost or left out while reading, each with its place.
-        remarks: other messages about the log, where nothing was lost.
-        doubts: assumptions by which the log was read, and which it contradicts.
-        units: those that are declared, of signals by their names, of lengths by "".
-        spans: when each mapped topic could be judged, for logs whose ends are trimmed.
-        cache: measurements already taken from this trace.
+        remarks: other messages about the log; no data was lost.
+        doubts: assumptions of the reader that the log contradicts.
+        units: declared units, of signals by name, of lengths under "".
+        spans: samples in which each mapped topic could be judged, for logs with trimmed ends.
+        cache: cached measurements of this trace.
 
     Raises:
-        TraceError: columns whose lengths do not fit together, times that do not increase, or too many names.
+        TraceError: columns with lengths that do not match, times that do not increase, or too many names.
     """
 
     times_ns: Integers
@@ -424,12 +422,12 @@ class Trace(Displayed):
 
     @property
     def unreadable_count(self) -> int:
-        """Count the observations with a number that is not finite."""
+        """Number of observations with a number that is not finite."""
         return int(np.count_nonzero(self.rows < ABSENT))
 
     @property
     def is_unknown(self) -> NDArray[np.bool_]:
-        """Return (T,), in which samples no object and no signal is known."""
+        """(T,), whether no object and no signal is known in each sample."""
         unknown: NDArray[np.bool_] = np.asarray((self.rows < 0).all(axis=1))
         for values in self.signals.values():
             unknown &= np.isnan(values)
@@ -437,7 +435,10 @@ class Trace(Displayed):
 
     @property
     def filling(self) -> NDArray[np.bool_]:
-        """Return (T,), which samples fill a pause: nothing is known, right after a sample or before one."""
+        """(T,), whether a sample fills a pause.
+
+        Such samples are unknown, in runs that begin 1 ns after a sample or end 1 ns before one.
+        """
         unknown = self.is_unknown
         turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
         is_close = np.concatenate([[False], np.diff(self.times_ns) == 1, [False]])
@@ -447,7 +448,7 @@ class Trace(Displayed):
         return is_filling
 
     def without_filling(self) -> Trace:
-        """Return the samples that the log has."""
+        """Return the trace without the samples that fill pauses."""
         filling = self.filling
         return self.take(np.flatnonzero(~filling)) if filling.any() else self
 
@@ -462,7 +463,7 @@ class Trace(Displayed):
         """Build the trace of the given samples, in their order.
 
         Args:
-            units: for sentences and axes: of signals by their names, of lengths by "".
+            units: declared units for sentences and axes: of signals by name, of lengths under "".
 
         Raises:
             TraceError: times that do not increase, or too many names.
@@ -477,7 +478,7 @@ class Trace(Displayed):
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(sequence), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
-        # what is known of an object that is not known where: its class, in a row after the others
+        # objects with unknown position have rows, too, after all others: these hold their classes
         blank: list[tuple[int, str, str | None]] = []
         for index, sample in enumerate(sequence):
             for name in sorted(sample.objects):
@@ -513,8 +514,10 @@ class Trace(Displayed):
         )
 
     def samples(self) -> Iterator[Sample]:
-        """Iterate over the samples as objects, without the numbers of unreadable observations and without
-        unknown signals."""
+        """Iterate over the samples as objects.
+
+        Numbers of unreadable observations and unknown signals are left out.
+        """
         for index, time_ns in enumerate(self.times_ns.tolist()):
             rows = list(zip(self.names, self.rows[index].tolist(), strict=True))
             known_rows = [row for _, row in rows if row >= 0]
@@ -538,7 +541,7 @@ class Trace(Displayed):
         return reported_ns
 
     def observation(self, row: int) -> TrackedObject:
-        """Return the object that row `row` (at least 0) reports."""
+        """Return the object of the observation `row`, which is at least 0."""
         return self._observation(row, self.footprints.footprint(row))
 
     def _observation(self, row: int, footprint: Footprint) -> TrackedObject:
@@ -552,7 +555,7 @@ class Trace(Displayed):
         )
 
     def slice(self, start: int, stop: int) -> Trace:
-        """Return the samples `start` up to `stop`, with the observations they need."""
+        """Return the samples from `start` to before `stop`, with their observations only."""
         begin, end, _ = slice(start, stop).indices(len(self))
         return self.take(np.arange(begin, max(begin, end), dtype=np.int64))
 
@@ -574,7 +577,7 @@ class Trace(Displayed):
         )
 
     def compact(self) -> Trace:
-        """Return the same samples in the normal form that equal traces share.
+        """Return the same samples in the normal form, which is the same for equal traces.
 
         Observations are numbered by sample, then name; names, classes and signals that no sample uses
         are dropped; classes are sorted, None first.
@@ -593,7 +596,7 @@ class Trace(Displayed):
         return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
 
     def _report_times(self, observed: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return the columns of the observed objects and of signals, the sample's time where nothing is."""
+        """Return the columns of report times in the normal form; unknown values have the sample's time."""
         own_ns = self.times_ns[:, None]
         reported_ns = None
         if self.reported_ns is not None:
@@ -616,7 +619,7 @@ class Trace(Displayed):
         """Join traces that follow each other in time.
 
         Raises:
-            TraceError: a trace that begins before the previous one has ended.
+            TraceError: a trace begins before the previous one has ended.
         """
         names = tuple(sorted({name for trace in traces for name in trace.names}))
         number = {name: index for index, name in enumerate(names)}
@@ -670,7 +673,7 @@ class Trace(Displayed):
 def _reported_of_samples(
     samples: Sequence[Sample], names: Sequence[str], signals: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the columns `reported_ns` and `signals_reported_ns` of some samples."""
+    """Return the columns `reported_ns` and `signals_reported_ns` of samples, if they are needed."""
     if not any(sample.reported_ns for sample in samples):
         return {}
     times_ns = np.array([sample.time_ns for sample in samples], np.int64)
@@ -686,14 +689,14 @@ def _reported_of_samples(
 
 
 _LONGEST_UNIT = 64
-"""Characters of a unit."""
+"""Limit on the length of a unit, characters."""
 
 
 def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Return units that a caller declares, in the order of their names; none for None.
+    """Return declared units in the order of their names; none for None.
 
     Raises:
-        UsageError: something else than short texts by names.
+        UsageError: the units are not short texts by name.
     """
     if units is None:
         return {}
@@ -709,24 +712,24 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Return the index range of the times from `start_ns` up to, not including, `end_ns`.
+    """Return the index range of the times from `start_ns` to before `end_ns`.
 
     Args:
         times_ns: (T,) int64, in order.
         start_ns, end_ns: integers of any size.
     """
-    # numpy's own search would round to doubles for an end that no int64 holds
+    # `np.searchsorted` would round to doubles for an end that no int64 holds
     return bisect_left(times_ns, start_ns), bisect_left(times_ns, end_ns)
 
 
 def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
-    """Return the samples of a trace from `start_ns` up to, not including, `end_ns`."""
+    """Return the samples of a trace from `start_ns` to before `end_ns`."""
     begin, end = window_of(trace.times_ns, start_ns or 0, FOREVER if end_ns is None else end_ns)
     return trace if (begin, end) == (0, len(trace)) else trace.slice(begin, end)
 
 
 def require_few(objects: Collection[str], signals: Collection[str]) -> None:
-    """Check the number of names, each of which takes a number in every sample.
+    """Check the number of names, because each name takes a number in every sample.
 
     Raises:
         TraceError: more objects or signals than `MOST_NAMES`.
@@ -792,12 +795,12 @@ def _same_samples(a: Trace, b: Trace) -> bool:
     pairs += [(reported[name], others[name]) for name in reported]
     if a.reported_ns is not None and b.reported_ns is not None:
         pairs.append((a.reported_ns, b.reported_ns))
-    # only numbers with a point can be NaN
+    # `equal_nan` is for floats: integers are never NaN
     return all(np.array_equal(first, second, equal_nan=first.dtype.kind == "f") for first, second in pairs)
 
 
 def renumber_rows(rows: Integers) -> tuple[Integers, Integers]:
-    """Return the rows in use, by sample and name, and the row numbers that point at them."""
+    """Return the used observations, by sample and name, and the new row numbers that point at them."""
     present = rows != ABSENT
     marked = rows[present]
     unreadable = marked < ABSENT
@@ -814,18 +817,18 @@ def class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
 
 
 LONG_PAUSE: Final = 5
-"""A pause is longer than so many usual periods."""
+"""Ratio of an interval to the usual period above which the interval is a pause."""
 _FEWEST: Final = 10
-"""Intervals that show which period is usual."""
+"""Minimum number of intervals to determine the usual period."""
 _RARE: Final = 20
-"""Where more than one in so many intervals is long, nothing comes regularly."""
+"""Minimum number of intervals per pause; with more pauses, the times are irregular."""
 _MOST_LISTED: Final = 3
 _MOST_HELD: Final = 65_536
-"""After so many intervals, only the long ones are held."""
+"""Number of intervals from which on only the long ones are stored."""
 
 
 class Pauses:
-    """The intervals between times, added in order; few of them are held in a long log."""
+    """The intervals between times, added in order; a long log stores only long intervals."""
 
     def __init__(self) -> None:
         self._last, self._is_lost = np.empty(0, np.int64), np.empty(0, np.bool_)
@@ -834,10 +837,10 @@ class Pauses:
         self._count = 0
 
     def add(self, times_ns: Integers, is_lost: NDArray[np.bool_] | None = None) -> None:
-        """Add times, which follow those before.
+        """Add times that follow the previous ones.
 
         Args:
-            is_lost: (T,) where nothing is known from a time on, so that the interval after it is no pause.
+            is_lost: (T,), whether everything is unknown from a time on; the interval after it is no pause.
         """
         times = np.concatenate([self._last, times_ns])
         lost = np.concatenate(
@@ -860,7 +863,7 @@ class Pauses:
 
     @property
     def _held(self) -> Integers:
-        """(2, N): starts and lengths."""
+        """(2, N): starts and lengths of the stored intervals."""
         return np.concatenate([np.empty((2, 0), np.int64), *self._pieces], axis=1)
 
     def longest_first(self) -> list[tuple[int, int]]:
@@ -873,24 +876,24 @@ class Pauses:
 
     @property
     def last_ns(self) -> int | None:
-        """The latest time; None without any."""
+        """The latest time; None without times."""
         return int(self._last[-1]) if len(self._last) else None
 
     @property
     def is_regular(self) -> bool:
-        """Whether there are enough intervals to show which is usual, and few are long."""
+        """Whether there are enough intervals to determine the usual one, and few are long."""
         long = int(np.count_nonzero(self._held[1] > LONG_PAUSE * self.usual_ns))
         return self._count >= _FEWEST and long <= max(1, self._count // _RARE)
 
     @property
     def usual_ns(self) -> int:
-        """The median of the intervals, in a long log of the first ones; 0 without any."""
+        """The median of the intervals, for a long log of its first ones; 0 without intervals."""
         if self._first_usual_ns is not None:
             return self._first_usual_ns
         return int(np.median(self._held[1])) if self._pieces else 0
 
     def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
-        """Return a sentence about the pauses of `what`; None without any."""
+        """Return a sentence about the pauses of `what`; None without pauses."""
         pauses = self.longest_first()
         if not pauses:
             return None
@@ -908,14 +911,14 @@ class Pauses:
 
 
 class ReportsBack:
-    """Counts reports that are earlier than the last other one of their object or signal."""
+    """Counts reports that are earlier than the previous report of their object or signal."""
 
     def __init__(self) -> None:
         self._last = Trace.empty()
         self._counts: dict[str, tuple[int, int]] = {}
 
     def add(self, trace: Trace) -> None:
-        """Add samples, which follow those before."""
+        """Add samples that follow the previous ones."""
         before, self._last = self._last, trace if len(trace) else self._last
         if any(part.reported_ns is not None or part.signals_reported_ns for part in (before, trace)):
             joined = Trace.concatenate([before.slice(len(before) - 1, len(before)), trace])

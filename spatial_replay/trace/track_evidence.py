@@ -1,4 +1,4 @@
-"""Evidence of how a track file was read: its samples in, doubts out."""
+"""Evidence against the assumptions by which a track file is read."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from spatial_replay.trace.doubts import MANY_TURNS, SHORTEST_PERIOD_NS, Doubt
 from spatial_replay.trace.trace import Trace
 
 _FEW_SAMPLES = 10
-"""Fewer samples may be written by hand, at any times."""
+"""Minimum number of samples to doubt their times; shorter files may be written by hand."""
 
 
 class TrackEvidence:
-    """Measures the angles and the times of a track file, block by block."""
+    """Measures the angles and times of a track file, block by block."""
 
     def __init__(self) -> None:
         self._widest_turn = 0.0
@@ -46,7 +46,7 @@ class TrackEvidence:
             self._turned.update(trace.names)
 
     def _add_steps(self, trace: Trace) -> None:
-        """Look whether angles count turns: they begin within one, and step by less than half of one."""
+        """Update whether angles count turns: they begin within one turn, and step by less than half of it."""
         yaw = np.where(trace.rows >= 0, trace.yaw[np.maximum(trace.rows, 0)], np.nan)
         begins = self._samples == len(trace)
         steps, seconds = np.abs(np.diff(yaw, axis=0)), np.diff(trace.times_ns)[:, None] / 1e9
@@ -55,8 +55,8 @@ class TrackEvidence:
         self._fast_steps += int(np.count_nonzero(steps > 2 * pi * seconds))
 
     def doubts(self) -> Iterator[Doubt]:
-        """Yield the assumptions that the samples contradict, after the last of them."""
-        # few robots turn more than once a second
+        """Yield the assumptions that the samples contradict; call it after the last sample."""
+        # few robots turn more than once per second, so many fast steps point to degrees
         is_fast = self._fast_steps > self._steps / 10
         if self._turned and not (self._counts_turns and not is_fast):
             text = f"its angles reach {number_text(self._widest_turn)} and are read as radians"

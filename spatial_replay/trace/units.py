@@ -1,7 +1,7 @@
-"""The axes and units of a source: where its y points, how long its unit is, and the units of its signals.
+"""The axes and units of a source: direction of y, length of its unit, and units of its signals.
 
-Samples always have y upwards, so that `above` means above and drawings are the right way up. Images count
-their rows downwards; what is measured in them is turned over when it is read, and by nothing else.
+Samples always have y upwards, so that `above` means above and drawings are the right way up. Image rows count
+downwards, so coordinates from images are mirrored once, when they are read.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
-"""The entry of a log's metadata that says what the axes of its source were."""
+"""Key of a log's metadata for the axes of its source and the unit of lengths."""
 SIGNAL_UNITS_KEY = "signal_units"
-"""The entry of a log's metadata with the units of its signals; that of lengths is among the axes."""
+"""Key of a log's metadata for the units of its signals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +29,10 @@ class Axes:
     """The axes and units of a source, as opposed to those of samples.
 
     Attributes:
-        y: where its y points.
+        y: direction of its y axis.
         scale: footprint units per unit of the source.
-        unit: what a footprint unit is, for readers: "m"; "" where nothing declares it.
-        signals: units of signals, by their names; or names of their numbers, see `names_from_unit`.
+        unit: name of the footprint unit, such as "m"; "" if it is not declared.
+        signals: units of signals, by name; or names of their numbers (see `names_from_unit`).
     """
 
     y: Literal["up", "down"] = "up"
@@ -42,12 +42,12 @@ class Axes:
 
     @classmethod
     def of_units(cls, units: Mapping[str, str]) -> Axes:
-        """Return our axes with units: of signals by their names, of lengths by ""."""
+        """Return our axes with declared units: of signals by name, of lengths under ""."""
         return cls(unit=units.get("", ""), signals={name: unit for name, unit in units.items() if name})
 
     @classmethod
     def from_metadata(cls, about: Mapping[str, str]) -> Axes:
-        """Return the axes that a log's metadata say its source had; ours, where they say nothing."""
+        """Return the axes of a log's source from its metadata; our axes if they have none."""
         try:
             axes, signals = (json.loads(about.get(key, "{}")) for key in (AXES_KEY, SIGNAL_UNITS_KEY))
             y: Literal["up", "down"] = "down" if axes.get("y") == "down" else "up"
@@ -57,7 +57,7 @@ class Axes:
             return cls()
 
     def metadata(self) -> dict[str, str]:
-        """Return the entries for the metadata of a log; none where the source has our axes and no units."""
+        """Return the entries for a log's metadata; none for a source with our axes and no units."""
         unit = {"unit": self.unit} if self.unit else {}
         axes = {"scale": self.scale, **unit, "y": self.y} if self != OUR_AXES else {}
         about = {AXES_KEY: axes, SIGNAL_UNITS_KEY: dict(sorted(self.signals.items()))}
@@ -65,7 +65,7 @@ class Axes:
 
     @property
     def units(self) -> dict[str, str]:
-        """All that is declared: the units of signals by their names, and that of lengths by ""."""
+        """All declared units: of signals by name, of lengths under ""."""
         return {**self.signals, **({"": self.unit} if self.unit else {})}
 
     def __str__(self) -> str:
@@ -75,12 +75,12 @@ class Axes:
         return f"y up{turned}{scaled}{lengths}"
 
     def convert_shapes(self, shapes: FootprintBatch) -> FootprintBatch:
-        """Return footprints of the source as those of samples."""
+        """Return footprints of the source as footprints of samples."""
         if self == OUR_AXES:
             return shapes
         vertices, start = shapes.vertices, shapes.vertex_start
         if self.y == "down":
-            # a mirrored outline runs clockwise, so each part's vertices are listed from its last to its first
+            # mirroring turns an outline clockwise, so the order of each part's vertices is reversed
             mirror = np.repeat(start[:-1] + start[1:] - 1, np.diff(start)) - np.arange(len(vertices))
             vertices = vertices[mirror]
             # 0 - y rather than -y: zero stays zero
@@ -94,7 +94,7 @@ class Axes:
         )
 
     def convert_yaw(self, yaw: Floats) -> Floats:
-        """Return angles (R,) from the source's x axis as those of samples."""
+        """Return angles (R,) of the source as angles of samples."""
         return 0.0 - yaw if self.y == "down" else yaw
 
     def convert_trace(self, trace: Trace) -> Trace:
@@ -110,24 +110,24 @@ class Axes:
 
 
 OUR_AXES = Axes()
-"""Axes of samples: y up."""
+"""The axes of samples: y upwards, scale 1."""
 
 
 OTHER_UNITS: Final = 8.0
 """Size ratio from which two runs are taken to use different units."""
 
 _MOST_SIZES: Final = 256
-"""Samples of an object that its size is the median of."""
+"""Limit on samples of an object for its median size."""
 
 
 def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B")) -> None:
-    """Refuse runs whose common objects are all many times as large in one as in the other.
+    """Refuse two runs if every common object is many times larger in the same one of them.
 
     Args:
-        called: what the runs are called in the message.
+        called: names of the runs in the message.
 
     Raises:
-        UsageError: the runs are in other units.
+        UsageError: the runs seem to have different units.
     """
     ratios, example = [], ""
     for name in sorted(set(a.names) & set(b.names)):
@@ -144,7 +144,7 @@ def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B"))
 
 
 def _size(trace: Trace, name: str) -> float:
-    """Return the median extent of an object, radii included; 0 where it is a point or never observed."""
+    """Return the median extent of an object, with radii; 0 for a point, and without any position."""
     rows = trace.rows[:, trace.names.index(name)]
     rows = rows[rows >= 0]
     if not len(rows):
