@@ -1,12 +1,12 @@
 """Leaves (atoms and open quantifiers) compiled to instructions over columns of samples.
 
-Each instruction writes one column in every channel (see `online.codes`): computed from earlier columns, or
-read from measurements, signals and constants.
+Each instruction writes one column in every channel (see `online.codes`). It computes it from earlier columns,
+or reads measurements, signals and constants.
 
-The closest two of a group decide some quantifiers, so that not every pair has to be measured.
-`forall p, q in people: p dist q >= 0.5` has a binding for each ordered pair, 39,800 for 200 people. But its
-body falls with the distance of p and q, and reads nothing else: its value for the closest two is the least
-over all pairs. Likewise, `exists p, q` of a body that rises as the distance falls is the greatest.
+For some quantifiers, only the closest two members of a group are measured.
+`forall p, q in people: p dist q >= 0.5` has a binding for each ordered pair, 39,800 for 200 people. Its body
+depends only on the distance of p and q, and falls with it, so the closest pair gives the least value.
+Likewise, it gives the greatest value for `exists p, q` with a body that rises as the distance falls.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ClosestPair:
     """The signed distance of the closest two members of an open group.
 
     Attributes:
-        enlargement: of both together, in footprint units.
+        enlargement: enlargement of both members together, in footprint units.
     """
 
     group: Group
@@ -78,13 +78,13 @@ class ClosestPair:
 
 
 def closest_pair_of(formula: Quantified) -> ClosestPair | None:
-    """Return the pair whose distance decides a quantifier; None if it takes more."""
+    """Return the closest pair if its distance alone decides a quantifier; else None."""
     closest = number_of_closest(formula)
     return None if closest is None else closest[0]
 
 
 def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | None:
-    """Return the pair that decides a quantifier, and the quantifier's number, with it as a leaf."""
+    """Return the closest pair that decides a quantifier, and the quantifier's number as a function of it."""
     body, sign = formula.body, 1 if formula.quantifier == "forall" else -1
     is_negated = False
     while isinstance(body, Boolean) and body.operator == "not":
@@ -110,8 +110,7 @@ def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | N
 def _leaves(expression: Expression, sign: int) -> Iterator[tuple[int, Expression]]:
     """Iterate over the leaves of an expression, with the sign of their effect.
 
-    A minimum or a maximum counts as a leaf: it is unknown with any of its operands, and so does not fall as
-    one of them falls.
+    A minimum or a maximum counts as a leaf, because it is not monotone: one unknown operand makes it unknown.
     """
     match expression:
         case Sum(first, second):
@@ -126,7 +125,7 @@ def _leaves(expression: Expression, sign: int) -> Iterator[tuple[int, Expression
 
 
 def _enlargement(leaf: Expression, variables: tuple[str, ...]) -> float | None:
-    """Return the enlargement of both terms of a distance between two variables; None of anything else."""
+    """Return the total enlargement of a distance between the variables; None for other leaves."""
     if not isinstance(leaf, SignedDistance):
         return None
     names, radii = zip(*(_variable_and_radius(term) for term in (leaf.first, leaf.second)), strict=True)
@@ -134,7 +133,7 @@ def _enlargement(leaf: Expression, variables: tuple[str, ...]) -> float | None:
 
 
 def _variable_and_radius(term: Term) -> tuple[str | None, float]:
-    """Return the name of a variable, and by how much it is enlarged; no name for anything else."""
+    """Return the name and the enlargement of a variable; name None for other terms."""
     match term:
         case Enlarged(inner, radius):
             name, inner_radius = _variable_and_radius(inner)
@@ -144,21 +143,21 @@ def _variable_and_radius(term: Term) -> tuple[str | None, float]:
     return None, 0.0
 
 
-# instructions: operation, a, b, c
+# instructions: operation, a, b, c; a "number" is NaN where it is undefined
 CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # number a of its kind
-ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # numbers; not a number where an operand is not
-HOLDS = 7  # a number as an interval: all of the reals where it is not a number
+ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # numbers; NaN where an operand is NaN
+HOLDS = 7  # a number as an interval: [-inf, inf] where it is NaN
 AND, OR = 8, 9  # intervals
-AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
+AND_MEMBER, OR_MEMBER = 10, 11  # a, joined with b where members c is 1, with [-inf, inf] where it is -1
 DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
-EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where one of them is a text, or none
-QUOTIENT = 15  # a by b, which is positive and the same in every channel
-HAS_VALUE = 16  # +inf where a is a number, else -inf; not a number where b is not
+EQUAL = 14  # signal a and constant b: +inf or -inf; NaN where only one of them is a text, or a is missing
+QUOTIENT = 15  # a by b, which is positive and equal in all channels
+HAS_VALUE = 16  # +inf where a is a number, else -inf; NaN where b is NaN
 MULTIPLY = 17  # a by constant b, which is positive
 
 TILE = 128
-"""Samples processed together: few, so that their columns stay in the processor's cache."""
+"""Number of samples processed together, small enough for the columns to stay in the CPU cache."""
 
 
 @inlined
@@ -190,12 +189,13 @@ def run_instructions(
     begin: int,
     end: int,
 ) -> None:
-    """Run the instructions over some samples; leaf j is what instruction outputs[j] gives.
+    """Run the instructions over the samples from `begin` to before `end`.
 
     Args:
         code: four numbers for each instruction.
-        values, spreads, signals, closest, members: row after row of T numbers; four rows a closest pair.
-        leaves: (C, A, T), receives them.
+        values, spreads, signals, closest, members: rows of T numbers each; four rows per closest pair.
+        outputs: instruction whose column is leaf j, for each j.
+        leaves: (C, A, T), output.
     """
     channels, total, instructions = leaves.shape[0], leaves.shape[2], len(code) // 4
     columns = np.empty((instructions * channels, min(TILE, end - begin)))
@@ -206,10 +206,10 @@ def run_instructions(
             row, member = a * total + t, c * total + t
             for channel in range(channels):
                 mirror = channel ^ 1 if channels > 1 else channel
-                # rows by their numbers: a slice of an array takes as long as ten samples
+                # rows are indexed, because slicing an array takes as long as ten samples
                 target, opposite = i * channels + channel, a * channels + mirror
                 first, second = a * channels + channel, b * channels + channel
-                # a loop for each operation: a single loop would test the operation at each sample
+                # one loop per operation: a single loop would test the operation at each sample
                 if op == CONSTANT:
                     for k in range(count):
                         columns[target, k] = constants[a]
@@ -292,27 +292,27 @@ def run_instructions(
 
 
 MAX_BINDINGS = 20_000
-"""The most bindings of variables that the open quantifiers of one formula may have in total."""
+"""Limit on bindings of variables in all open quantifiers of a formula."""
 MAX_CLOSEST = 20_000
-"""The most objects of an open group of which the closest two are found."""
+"""Limit on members of an open group whose closest pair is searched."""
 
 
 class OpenGroups(Protocol):
     """The possible members of open groups in some samples."""
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
-        """Return the names of the objects that are members in any of the samples."""
+        """Return the names of objects that are members in any sample."""
 
     def may_be_unknown(self, group: Group | Earlier) -> bool:
-        """Return whether any sample looks back to a group before the first sample."""
+        """Return whether a group ever looks back to a time before the first sample."""
 
 
 class Membership(NamedTuple):
     """A binding of an open quantifier: 1 in samples where all of `candidates` are members, 0 elsewhere.
 
     Attributes:
-        candidates: their places among the group's. With none it stands for the group itself: -1 in samples
-            where that is unknown, 0 elsewhere.
+        candidates: their indices among the candidates of the group. If empty, it stands for the group itself:
+            -1 in samples with unknown members, 0 elsewhere.
     """
 
     group: Group | Earlier
@@ -320,12 +320,11 @@ class Membership(NamedTuple):
 
 
 class LeafCode:
-    """Instructions for some leaves, operands first; equal ones share a column.
+    """Instructions for leaves, operands first; equal instructions share a column.
 
     Attributes:
-        rows: operation, a, b, c of each instruction, with its number.
-        constants, measurements, signals, closest, members: what instructions read, with the number that they
-            know it by.
+        rows: number of each instruction, by operation, a, b and c.
+        constants, measurements, signals, closest, members: numbers of the inputs of instructions.
     """
 
     def __init__(self, groups: OpenGroups) -> None:
@@ -339,10 +338,10 @@ class LeafCode:
         self.members: dict[Membership, int] = {}
 
     def add_leaves(self, leaves: Sequence[Formula], bindings: Bindings) -> list[int]:
-        """Return the number of the instruction that computes each leaf of a formula, as an interval.
+        """Return the numbers of the instructions that compute the leaves of a formula, as intervals.
 
         Raises:
-            UsageError: more than `MAX_BINDINGS`.
+            UsageError: the bindings exceed `MAX_BINDINGS`.
         """
         self._bindings = 0
         return [self._add(leaf, bindings) for leaf in leaves]
@@ -410,7 +409,7 @@ class LeafCode:
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
     def _current(self, rate: Rate, bindings: Bindings) -> int:
-        """Return a row that is a number where all objects of a rate, or its signal, are in the sample."""
+        """Return a row that is a number in samples with all objects of a rate, or its signal."""
         if rate.signal is not None:
             return self._expression(rate.signal, bindings)
         row, *other_rows = [self._expression(Projection(term, "x", "min"), bindings) for term in rate.terms]
@@ -419,9 +418,9 @@ class LeafCode:
         return row
 
     def _expansion_row(self, formula: Formula, rows: Mapping[int, int]) -> int:
-        """Return the row of an expansion, given the rows of the operands that were written, by `id`.
+        """Return the row of an expansion, given the rows of the original operands, by `id`.
 
-        An expansion holds an operand more than once: compiling it each time would take 2**depth steps.
+        An expansion repeats an operand, and compiling each repetition would take 2**depth steps.
         """
         if id(formula) in rows:
             return rows[id(formula)]

@@ -1,12 +1,12 @@
 """The leaves of single samples, for monitors: plans are compiled once and reused.
 
-Most samples differ in their numbers, not in their names. A plan holds what follows from the names as index
-arrays, so that a sample costs little more than its numbers. It serves every sample whose members of open
-groups fit into it; an object missing from a sample is only a flag.
+Most samples differ in their numbers, not in their names. A plan stores all that depends on names as index
+arrays, so a sample only has to copy its numbers. A plan serves every sample whose members of open groups fit
+into it; an object missing from a sample is only a flag.
 
-Without open groups one plan serves all samples. Otherwise it depends on how many members they have. Objects
-that the specification does not name differ only in their classes, so a plan has placeholders for them. Each
-sample assigns objects to placeholders. Tracks that appear under new names need no new plan.
+Without open groups, one plan serves all samples. Otherwise a plan depends on the number of members. It has
+placeholders for objects that the specification does not name, because these differ only in their classes.
+Each sample assigns its objects to placeholders, so tracks with new names need no new plan.
 """
 
 from __future__ import annotations
@@ -81,32 +81,36 @@ from spatial_replay.trace.trace import Sample
 
 ABSENT = -1
 ANY = -1
-"""The required class if any class matches."""
+"""Class code that stands for any class."""
 
 MOST_CHANNELS = 4
-"""As many as leaves may be in (see `online.codes`)."""
+"""Limit on channels of leaves (see `online.codes`)."""
 
 _OF_OBJECT, _OF_PART = 5, 2
-"""How many numbers come before those of an object's parts, and before those of a part's vertices."""
+"""Number of values before the parts of a packed object, and before the vertices of a part."""
 
 
 class PlanArrays(NamedTuple):
-    """Work of a plan for every sample; ragged lists come with the offsets of their rows.
+    """The arrays of a plan, the same for every sample; ragged lists come with the offsets of their rows.
 
     Attributes:
-        region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
-            parts of each, vertices of each part, radius of each part, x and y of all vertices,
-            (bottom, top) of each.
-        listed_start, listed_rows, listed_classes: rows of each operand, then of each closest pair's group,
-            and the class that each row must have. After them come the rows needed for each binding, and those
-            without which each measurement is unknown.
-        enlargement: of each operand.
+        region_parts: number of parts of each region's footprint.
+        region_sizes: number of vertices of each part.
+        region_radius: radius of each part.
+        region_vertices: x and y of all vertices.
+        region_heights: (bottom, top) of each region.
+        listed_start: offsets of the lists in `listed_rows`. There is one list per operand, per closest pair,
+            per binding, and per measurement, in this order.
+        listed_rows: rows of an operand or a pair's group, rows needed for a binding, and rows without which a
+            measurement is unknown.
+        listed_classes: the class that each listed row must have, or `ANY`.
+        enlargement: enlargement of each operand.
         geometric: numbers of the measurements between footprints, with their `quantity` and operands
             `first` and `second` (-1: none).
-        yaws: (Y, 3), the number of each measurement between orientations, and its two rows.
-        closest_enlargement: of both in each closest pair.
-        is_group: for each binding, 1 where it stands for a group itself: not known without its row.
-        code, constants, outputs: what `run_instructions` takes.
+        yaws: (Y, 3), number of each measurement between orientations, and its two rows.
+        closest_enlargement: total enlargement of each closest pair.
+        is_group: 1 if a binding stands for a group itself, which is unknown without its row; else 0.
+        code, constants, outputs: arguments of `run_instructions`.
     """
 
     region_parts: Integers
@@ -131,7 +135,7 @@ class PlanArrays(NamedTuple):
 
 
 class PlanExtent(NamedTuple):
-    """How many samples, regions, places, signals, and classes of places a plan has."""
+    """The numbers of samples, regions, places, signals, and class codes of places in a plan."""
 
     samples: int
     regions: int
@@ -141,12 +145,12 @@ class PlanExtent(NamedTuple):
 
 
 class PackedPlan(NamedTuple):
-    """A plan's arrays one after the other, so that a kernel gets two.
+    """A plan's arrays joined into two arrays, because a kernel pays for each array that it receives.
 
     Attributes:
-        whole: the fields of `PlanPlaces`, and then the arrays of whole numbers.
-        real: the others.
-        room: for how many numbers `measure_sample` takes room, besides three for each of the objects'.
+        whole: the fields of `PlanPlaces`, then the integer arrays.
+        real: the float arrays.
+        room: work space of `measure_sample`, numbers; each number of the objects needs three more.
     """
 
     whole: Integers
@@ -155,7 +159,7 @@ class PackedPlan(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """The memory of both."""
+        """The size of both arrays in bytes."""
         return self.whole.nbytes + self.real.nbytes
 
     @classmethod
@@ -186,14 +190,14 @@ class PackedPlan(NamedTuple):
 
 
 class PlanPlaces(NamedTuple):
-    """Where the arrays of a plan begin in `PackedPlan.whole` and `PackedPlan.real`, and counts of them.
+    """Places of the plan's arrays in `PackedPlan.whole` and `PackedPlan.real`, and their counts.
 
-    A field named after an array of `PlanArrays` is its begin; one that ends in `_end` is its end. Kernels
-    count references to arrays, also to those in tuples; numbers cost nothing.
+    A field named after an array of `PlanArrays` is its begin; a field that ends in `_end` is its end. They
+    are numbers, because kernels count references to arrays, even in tuples.
 
     Attributes:
-        samples, regions, places, signals, coded: the extent.
-        parts, corners: of all regions.
+        samples, regions, places, signals, coded: the plan's extent.
+        parts, corners: numbers of parts and vertices of all regions.
     """
 
     samples: int
@@ -234,9 +238,9 @@ class PlanPlaces(NamedTuple):
 
 @inlined
 def plan_at(whole: Integers) -> PlanPlaces:
-    """Return the numbers that `PackedPlan.of` writes first: one for each field, in their order.
+    """Read the fields that `PackedPlan.of` writes first, in their order.
 
-    A compiler needs as many indices as a tuple has fields; no other line knows a place by its number.
+    The compiler needs one index per field, so the indices are written out.
     """
     return PlanPlaces(
         whole[0], whole[1], whole[2], whole[3], whole[4], whole[5], whole[6], whole[7], whole[8], whole[9],
@@ -247,13 +251,13 @@ def plan_at(whole: Integers) -> PlanPlaces:
 
 
 class RowPlaces(NamedTuple):
-    """Where the rows of a plan begin in one sample's numbers, as `measure_rows` takes them.
+    """Places of a plan's rows in the numbers of one sample, in the layout of `measure_rows`.
 
     Attributes:
-        rows, parts, corners: how many there are.
-        classes: the class code of each row.
-        yaw, uncertainty: of each row; NaN and 0 for samples and regions.
-        edges: (V, 4), room for `measure_rows`.
+        rows, parts, corners: numbers of rows, parts and vertices.
+        classes: class code of each row.
+        yaw, uncertainty: yaw and uncertainty of each row; NaN and 0 for samples and regions.
+        edges: (V, 4), work space of `measure_rows`.
     """
 
     rows: int
@@ -273,7 +277,7 @@ class RowPlaces(NamedTuple):
 
 @inlined
 def _rows_at(plan: PlanPlaces, sample: Floats, begin: int) -> RowPlaces:
-    """Return the places of the rows of a sample in the room that begins there."""
+    """Return the places of a sample's rows in the work space from `begin` on."""
     rows = plan.samples + plan.regions + plan.places
     parts, corners, cursor = plan.parts, plan.corners, plan.samples + plan.signals + plan.coded
     for _ in range(plan.places):
@@ -307,7 +311,7 @@ def _rows_at(plan: PlanPlaces, sample: Floats, begin: int) -> RowPlaces:
 def _fill_rows(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers
 ) -> None:
-    """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
+    """Copy regions and the objects of a sample into rows; `sample` is that of `measure_sample`."""
     samples, object_begin = plan.samples, plan.samples + plan.regions
     lists[rows.part_start] = lists[rows.vertex_start] = 0
     for k in range(object_begin):
@@ -355,7 +359,7 @@ def _is_there(lists: Integers, classes: int, row: int, class_code: int) -> bool:
 
 @inlined
 def _is_hidden(plan: PlanPlaces, rows: RowPlaces, lists: Integers, row: int) -> bool:
-    """Return whether an object that is there is not known where."""
+    """Return whether a present object has an unknown position."""
     start = rows.part_start + row
     return bool(row >= plan.samples + plan.regions and lists[start] == lists[start + 1])
 
@@ -365,10 +369,10 @@ def _measure(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     values: int, begin: int,
 ) -> None:  # fmt: skip
-    """Fill K `values` and the spreads after them, as `measurements.measurement_values` gives them.
+    """Write K values, then K spreads, at `values`; they equal those of `measurements.measurement_values`.
 
     Args:
-        begin: of the room for operands.
+        begin: begin of the work space for operands.
     """
     operands, count = plan.operands, plan.geometric_count + plan.yaw_count
     spreads, starts = values + count, plan.listed_start
@@ -378,7 +382,7 @@ def _measure(
     sample[of_operands + operands], lists[hidden + operands] = (
         0.0,
         0,
-    )  # read for a measurement without a second operand
+    )  # entry of the missing second operand of a measurement
     for operand in range(operands):
         first, last = whole[starts + operand], whole[starts + operand + 1]
         lists[widths + operand], lists[hidden + operand], spread = last - first, 0, 0.0
@@ -436,7 +440,7 @@ def _closest(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     closest: int,
 ) -> None:  # fmt: skip
-    """Fill `closest` (K, 4), as `measurements.leaf_values` computes it."""
+    """Write the ends (K, 4) of the closest pairs at `closest`; they equal those of `leaf_values`."""
     nearest = np.empty((1, 3))
     for k in range(plan.pairs):
         start = plan.listed_start + plan.operands + k
@@ -468,13 +472,13 @@ def _closest(
         pair_at = closest + 4 * k
         sample[pair_at] = sample[pair_at + 1] = nearest[0, 0]
         sample[pair_at + 2], sample[pair_at + 3] = nearest[0, 1], nearest[0, 2]
-        if hidden > 0 and present > 1:  # a hidden member may be one of the closest two
+        if hidden > 0 and present > 1:  # a hidden member may belong to the closest pair
             sample[pair_at] = sample[pair_at + 2] = -np.inf
 
 
 @inlined
 def _members(plan: PlanPlaces, classes: int, whole: Integers, lists: Integers, members: int) -> None:
-    """Fill M `members`: whether each binding is one (1, 0), or that is not known (-1)."""
+    """Write at `members` whether all objects of each binding are members: 1, 0, or -1 if unknown."""
     first = plan.listed_start + plan.operands + plan.pairs
     for m in range(plan.groups):
         is_group = whole[plan.is_group + m] != 0
@@ -489,7 +493,7 @@ def _members(plan: PlanPlaces, classes: int, whole: Integers, lists: Integers, m
 def _channels_of(
     values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Integers, constants: Floats
 ) -> int:
-    """Return the number of channels needed: 4 with uncertainty, 2 with anything unknown, else 1."""
+    """Return the number of channels: 4 with an uncertain value, 2 with an unknown value, else 1."""
     channels = 1
     for k in range(len(constants)):
         if -np.inf < constants[k] <= TEXTS:
@@ -515,24 +519,25 @@ def _channels_of(
 
 @kernel
 def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leaves: Floats) -> int:
-    """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
+    """Compute the leaves of one sample, (C, A, 1), with the same results as `leaf_values`.
 
     Args:
-        whole, real: of a `PackedPlan`.
+        whole, real: arrays of a `PackedPlan`.
         sample: 0 or `ABSENT` for each sample, then the value of each signal. If the plan distinguishes
-            classes, the class code of each place follows. Last comes each place's `packed` object: without
-            parts if it is absent, with -1 parts if its place is unknown. Room to work in begins at `end`.
-        leaves: (MOST_CHANNELS, A, 1), receives them.
+            classes, the class code of each place follows. The `packed` object of each place comes last: with
+            0 parts for an absent object, with -1 parts for an unknown position.
+        end: end of these numbers; work space follows.
+        leaves: (MOST_CHANNELS, A, 1), output.
 
     Returns:
-        C, in how many channels they are.
+        C, the number of channels in use.
     """
     plan, lists = plan_at(whole), sample.view(np.int64)
     count = plan.geometric_count + plan.yaw_count
-    # room for the results, then for operands, then for rows: new arrays would take as long as distances
+    # work space for results, operands and rows: allocating arrays would take as long as the distances
     closest, members = end + 2 * count, end + 2 * count + 4 * plan.pairs
     begin = members + plan.groups
-    if count + plan.groups + plan.pairs > 0:  # not signals alone
+    if count + plan.groups + plan.pairs > 0:  # else there are only signals
         operands = 3 * plan.operands + 2 + plan.geometric_count + whole[plan.listed_start + plan.operands]
         rows = _rows_at(plan, sample, begin + operands)
         _fill_rows(plan, rows, whole, real, sample, lists)
@@ -558,12 +563,12 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
 
 
 class SampleRoom:
-    """The newest sample of a stream, as kernels take it; the next one takes its place.
+    """Memory for the newest sample of a stream in the layout of kernels; the next sample replaces it.
 
     Attributes:
-        arguments: those of `measure_sample`.
-        leaves: (MOST_CHANNELS, A, 1), once they are measured.
-        channels: in how many of them the leaves differ; 0 until they are measured.
+        arguments: arguments of `measure_sample`.
+        leaves: (MOST_CHANNELS, A, 1), measured leaves.
+        channels: number of channels in use; 0 before the leaves are measured.
     """
 
     __slots__ = ("_bytes", "_length", "_numbers", "_plan", "arguments", "channels", "leaves")
@@ -576,7 +581,7 @@ class SampleRoom:
         self._bytes, self._numbers = bytearray(), np.empty(0)
 
     def fill(self, plan: PackedPlan, layout: Struct, numbers: Sequence[float], objects: list[bytes]) -> None:
-        """Take the next sample: a plan for it, its numbers, and the packed objects of its places."""
+        """Store the next sample: its plan, its numbers, and the packed objects of its places."""
         packed = b"".join(objects)
         if plan is not self._plan or len(packed) != self._length:
             self._fit(plan, layout.size, len(packed))
@@ -586,11 +591,11 @@ class SampleRoom:
         self.channels = 0
 
     def _fit(self, plan: PackedPlan, begin: int, length: int) -> None:
-        """Have room for objects of some length, in bytes."""
+        """Make room for packed objects of the given length in bytes."""
         self._plan, self._length = plan, length
         size = begin + 4 * length + 8 * plan.room
         if size > len(self._bytes):
-            # doubled, since the numbers of objects and vertices change from sample to sample
+            # doubled, because numbers of objects and vertices change from sample to sample
             self._bytes = bytearray(2 * size)
             self._numbers = np.frombuffer(self._bytes)
         self.arguments = plan.whole, plan.real, self._numbers, (begin + length) // 8, self.leaves
@@ -605,7 +610,7 @@ Leaves: TypeAlias = Sequence[Atom | Quantified]
 
 
 class Member(NamedTuple):
-    """An object that an open group may hold: its name, and the code of its class."""
+    """A possible member of an open group: its name and the code of its class."""
 
     name: str
     class_code: int
@@ -616,10 +621,10 @@ class PlanContext:
     """State that the plans of a specification share.
 
     Attributes:
-        leaves: those of each formula.
-        delays: the samples looked at, the newest first.
-        classes: the code of each class that open groups ask for, by its name in lower case; others have 0.
-        regions: the regions that formulas name, and those of which they name the centre.
+        leaves: leaves of each formula.
+        delays: delays of the samples that the terms read, 0 first.
+        classes: code of each class of an open group, by its name in lower case. Other classes have code 0.
+        regions: regions in formulas, and centres of regions in formulas.
     """
 
     leaves: Sequence[Leaves]
@@ -629,10 +634,10 @@ class PlanContext:
 
 
 class Place(NamedTuple):
-    """An object in one of the samples looked at, or the point at its centre.
+    """An object in one of the samples that a plan reads, or the point at its centre.
 
     Attributes:
-        rate: the terms of the rate that moves it back, if any does.
+        rate: terms of the rate that moves the object back; empty without a rate.
     """
 
     sample: int
@@ -642,7 +647,7 @@ class Place(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A row of a plan, and the class that it must have (or `ANY`) to count."""
+    """A row of a plan, and the class that it must have to count, or `ANY`."""
 
     row: int
     class_code: int = ANY
@@ -678,7 +683,7 @@ class PlanRows:
         return [Row(self._place(sample, names[candidate]), class_code) for candidate in membership.candidates]
 
     def of_term(self, term: Term) -> list[Row]:
-        """Return the rows whose union a term is."""
+        """Return the rows whose union is the term."""
         is_point, term = is_centre(term), standing(term)
         base = term.term if isinstance(term, Earlier) else term
         rate = term.rate if isinstance(term, Earlier) else ()
@@ -693,7 +698,7 @@ class PlanRows:
         return [Row(place(name)) for name in named_members(base)]
 
     def required_rows(self, term: Term) -> list[Row]:
-        """Return the rows, its sample's among them, without which a term is unknown."""
+        """Return the rows without which a term is unknown, with the row of its sample."""
         current_term, base = standing(term), base_of(term)
         sample = [Row(self._sample_of(current_term))] if isinstance(current_term, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
@@ -714,18 +719,18 @@ class PlanRows:
 
 
 class LeafPlan:
-    """Index arrays that compute the leaves of a sample and the earlier ones it looks back at."""
+    """Index arrays for the leaves of a sample, with the earlier samples that it looks back at."""
 
     def __init__(
         self, frame: PlanContext, members: frozenset[Member], placeholders: Mapping[_Classes, Sequence[str]]
     ) -> None:
-        """Plan for samples that hold no other members of open groups.
+        """Create a plan for samples whose open groups have no other members than `members`.
 
         Args:
-            placeholders: those members that stand for unnamed objects, of each kind.
+            placeholders: names of members that stand for unnamed objects, by the classes of the object.
 
         Raises:
-            UsageError: more bindings than `MAX_BINDINGS`.
+            UsageError: the bindings exceed `MAX_BINDINGS`.
         """
         rows = PlanRows(frame, members)
         code = LeafCode(rows)
@@ -768,11 +773,11 @@ class LeafPlan:
         """Flatten samples for `measure_sample`.
 
         Args:
-            room: receives them.
-            samples: the one at each of the frame's delays; None before the first.
-            stands_for: the objects that go by another name among the plan's members.
-            code_of: returns that of a class.
-            reports: those that the newest sample shows.
+            room: output.
+            samples: sample at each delay of the context; None before the first sample.
+            stands_for: object of each placeholder.
+            code_of: returns the code of a class.
+            reports: reports of the newest sample.
         """
         newest: Any = samples[0]
         numbers = [0.0]
@@ -820,7 +825,7 @@ class LeafPlan:
 
 
 def _signal(signal: Signal, sample: Sample, reports: RecentReports) -> float:
-    """Return what `TraceScene.signal` does of one sample."""
+    """Return the value of a signal in one sample, as `TraceScene.signal` does."""
     if isinstance(signal, ReportStep | PreviousSignal):
         latest = reports.latest.get(signal.signal or signal)
         if latest is None or latest.before is None:
@@ -834,7 +839,7 @@ def _signal(signal: Signal, sample: Sample, reports: RecentReports) -> float:
 def _step(
     terms: Sequence[Term], sample: Sample, reports: RecentReports, stands_for: Mapping[str, str]
 ) -> float:
-    """Return the shortest time between two reports of what moves in some terms."""
+    """Return the shortest time between two reports of the terms' objects, s; NaN if undefined."""
     if stands_for:
         names = {placeholder: TrackedName(name) for placeholder, name in stands_for.items()}
         terms = [names.get(term.name, term) if isinstance(term, TrackedName) else term for term in terms]
@@ -899,15 +904,15 @@ def _whole(numbers: Iterable[int]) -> Integers:
 
 
 def _enlargement(term: Term) -> float:
-    """Return the total enlargement of a term, summed in the order in which `TraceScene` sums it."""
+    """Return the total enlargement of a term; the order of summation equals that of `TraceScene`."""
     return _enlargement(term.term) + term.radius if isinstance(term, Enlarged) else 0.0
 
 
 MOST_PLANS = 64
 _MOST_BYTES = 1 << 22
-"""Limits on stored plans, by number and memory; the least recently used go first, never the newest."""
+"""Limits on stored plans, by number and bytes; the least recently used plans are evicted first."""
 _MOST_CLASSES = 1024
-"""Classes whose codes are kept: objects name them in any case."""
+"""Limit on cached spellings of class names, which objects write in any case."""
 
 _NO_OBJECT = ""
 """A name that no object has."""
@@ -919,14 +924,14 @@ def _region(outline: Outline) -> TrackedObject:
 
 
 _Classes: TypeAlias = tuple[int, ...]
-"""Codes of the classes of one object in the samples looked at: nearly always one."""
+"""Class codes of one object in all samples that a plan reads; usually a single code."""
 
 _Counts: TypeAlias = tuple[tuple[_Classes, int], ...]
-"""The number of placeholders for the unnamed objects of each kind."""
+"""Number of placeholders for unnamed objects, by their class codes."""
 
 
 class SampleLeaves:
-    """The leaves of some formulas, sample by sample."""
+    """The leaves of formulas, sample by sample."""
 
     def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
         formulas = list(chain.from_iterable(leaves))
@@ -958,7 +963,7 @@ class SampleLeaves:
             self._prefix += "?"
         self._spec_members: frozenset[Member] = (
             frozenset()
-        )  # at most the members that the specification names
+        )  # members seen so far among the objects that the specification names
         self._code_of = lru_cache(_MOST_CLASSES)(partial(_class_code, self._frame.classes))
         self._plans: dict[tuple[frozenset[Member], _Counts], LeafPlan] = {}
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
@@ -968,17 +973,17 @@ class SampleLeaves:
         self.room = SampleRoom(len(formulas))
 
     def look_at(self, sample: Sample) -> Sequence[Sample | None]:
-        """Add the next sample; return it and those that it looks back at."""
+        """Add the next sample; return it with the samples at the terms' delays."""
         if not self._looks_back:
             return (sample,)
         self._reports.add(sample)
         return self._recent.add(sample)
 
     def fill_room(self, sample: Sample) -> SampleRoom:
-        """Add the next sample, and flatten it and those that it looks back at for kernels.
+        """Add the next sample and write it, with the samples it looks back at, into memory for kernels.
 
         Raises:
-            UsageError: more bindings than `MAX_BINDINGS`.
+            UsageError: the bindings exceed `MAX_BINDINGS`.
         """
         samples = self.look_at(sample) if self._looks_back else (sample,)
         plan, stands_for = self._only_plan, _NOTHING
@@ -988,7 +993,7 @@ class SampleLeaves:
         return self.room
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
-        """Return a plan for the members of open groups in some samples, and their names in it."""
+        """Return a plan for the members of open groups in the samples, and the object of each placeholder."""
         unnamed = self._unnamed_members(samples)
         counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
@@ -1002,7 +1007,7 @@ class SampleLeaves:
         return plan, stands_for
 
     def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
-        """Return the members of open groups that the specification does not name, by their classes."""
+        """Return the members of open groups that the specification does not name, by their class codes."""
         classes_by_name: dict[str, _Classes] = {}
         spec_members: list[Member] = []
         code_of, takes_any, spec_names = self._code_of, self._takes_any, self._spec_names
@@ -1027,9 +1032,9 @@ class SampleLeaves:
         return names_by_classes
 
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
-        """Return the plan for the given number of unnamed members of each kind."""
+        """Return the plan for the given numbers of unnamed members, from the cache if possible."""
         key, plans = (self._spec_members, tuple(sorted(counts.items()))), self._plans
-        # taken out and put back: the order of the dict is that of use
+        # removed and added again, so that the order of the dict is the order of use
         plan = plans.pop(key, None)
         if plan is None:
             plan = _plan(self._frame, self._prefix, *key)
@@ -1041,7 +1046,7 @@ class SampleLeaves:
 
 
 def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
-    """Return an empty memory of the reports that the rates in some formulas compare."""
+    """Return an empty `RecentReports` for the rates in formulas."""
     rates = [rate for formula in formulas for rate in rates_of(formula)]
     bases = [base_of(term) for rate in rates for term in rate.terms]
     is_any = any(isinstance(base, Variable) or (isinstance(base, Group) and base.is_open) for base in bases)
@@ -1050,7 +1055,7 @@ def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
 
 
 def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], counts: _Counts) -> LeafPlan:
-    """Return the plan for the given number of unnamed members of each kind."""
+    """Create the plan for the given numbers of unnamed members."""
     # no name of the specification begins with the prefix
     placeholders = {
         classes: [f"{prefix}{classes} {number}" for number in range(count)] for classes, count in counts
@@ -1062,7 +1067,7 @@ def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], count
 
 
 def _class_code(classes: Mapping[str, int], name: str | None) -> int:
-    """Return the code of a class as an object names it; 0 of one that no group asks for."""
+    """Return the code of a class name in any case; 0 for a class without an open group."""
     return classes.get((name or "").casefold(), 0)
 
 
@@ -1073,7 +1078,7 @@ def _room(count: int) -> int:
 
 
 def _names(bases: Sequence[Term]) -> frozenset[str]:
-    """Return the objects that terms name."""
+    """Return the names of objects in terms, members and exclusions of groups included."""
     names: set[str] = set()
     for base in bases:
         if isinstance(base, TrackedName):

@@ -1,4 +1,4 @@
-"""The leaves of whole traces, from signals and from measurements that the trace caches."""
+"""The leaves of whole traces, computed from signals and cached measurements."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from spatial_replay.text import TEXTS
 from spatial_replay.trace.trace import ABSENT
 
 _SHARE = 200_000
-"""So many instructions, each over one sample, pay for a thread of their own."""
+"""Minimum work of a thread: instructions times samples."""
 
 
 def measurement_values(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
-    """Compute each measurement in each sample of a scene, or take it from the trace's cache.
+    """Compute each measurement in each sample of a scene, or read it from the trace's cache.
 
     Returns:
-        Values (K, T), NaN where unknown, and how far each may be off for uncertainty (K, T).
+        values (K, T), NaN where unknown, and their spreads from uncertainty (K, T).
     """
     keys = [_key(scene, measurement) for measurement in measurements]
     cache = scene.trace.cache
@@ -61,10 +61,11 @@ def measurement_values(scene: TraceScene, measurements: Sequence[Measurement]) -
 
 
 def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Floats]:
-    """Compute value (NaN if unknown) and uncertainty of each measurement, in one kernel call.
+    """Compute values and spreads of all measurements in one kernel call.
 
     Returns:
-        (2, T) each, or (1, T), the values alone, where the scene is sure.
+        (2, T) for each measurement: values, NaN where unknown, and spreads. (1, T), without spreads, if the
+        scene is sure.
     """
     operand_numbers: dict[Term, int] = {}
     operands: list[Operand] = []
@@ -98,7 +99,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
 
 
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
-    """Return the cache key of a measurement: independent of its specification, with regions by shape."""
+    """Return the cache key of a measurement, with the shapes of regions instead of their names."""
     shapes = tuple(scene.regions[name] for name in map(_region, measurement.terms) if name is not None)
     if not shapes:
         return scene.skip, measurement
@@ -121,11 +122,11 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     """Compute each leaf in each sample of a scene.
 
     Returns:
-        (C, A, T). C = 1 if everything is known, C = 2 (low and high end) if something may be unknown, C = 4
-        (the same with uncertainty behind them) if there is uncertainty.
+        (C, A, T) in C channels. C = 1 if all values are known. C = 2, low and high end, if a value is
+        unknown. C = 4, also both ends with uncertainty, if a value is uncertain.
 
     Raises:
-        UsageError: more than `MAX_BINDINGS`.
+        UsageError: the bindings exceed `MAX_BINDINGS`.
     """
     code = LeafCode(scene)
     outputs = np.array(code.add_leaves(leaves, bindings), np.int64)
@@ -158,13 +159,13 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
 
 
 def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:
-    """Compute the ends of a closest pair's distance, (4, T), or take them from the trace's cache."""
+    """Compute the ends of a closest pair's distance, (4, T), or read them from the trace's cache."""
     cache, key = scene.trace.cache, (scene.skip, pair)
     ends = cache.get(key)
     if ends is None:
         rows, uncertainty = scene.resolve(pair.group).operand.rows, scene.trace.uncertainty
         nominal, low, high = closest_pairs(scene.batch, rows, uncertainty, pair.enlargement).T
-        # a member with an unknown position may be one of the closest two
+        # a member with unknown position may belong to the closest pair
         is_hidden = (rows < ABSENT).any(axis=1) & ((rows != ABSENT).sum(axis=1) > 1)
         nominal_low, wide_low = (np.where(is_hidden, -np.inf, distances) for distances in (nominal, low))
         ends = np.stack((nominal_low, nominal, wide_low, high))

@@ -1,6 +1,6 @@
-"""Reports that samples show of objects and signals: the last other one before, and the time between both.
+"""Reports of objects and signals in samples: the previous report, and the time between both.
 
-A run of samples that show one report of an object ends where they show another one, or none.
+Consecutive samples may show the same report. A sample without a report starts the history anew.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 
 def before_last_reports(trace: Trace) -> Integers:
-    """Return the samples right before those that show the last reports."""
+    """Return the last sample before the first that shows the newest report, for each object and signal."""
     columns = [(trace.rows >= 0, trace.reported_ns)] if trace.reported_ns is not None else []
     for name, reported_ns in trace.signals_reported_ns.items():
         columns.append((is_signal_known(trace.signals[name])[:, None], reported_ns[:, None]))
@@ -41,24 +41,24 @@ def before_last_reports(trace: Trace) -> Integers:
 
 
 def is_signal_known(values: Floats) -> Booleans:
-    """Return where the values of a signal are numbers."""
+    """Return whether each value of a signal is a number, not a text."""
     return np.asarray(np.isfinite(values) & (values > TEXTS))
 
 
 def _begins(is_known: Booleans, reported_ns: Integers) -> Booleans:
-    """Return where reports begin to be shown; both columns are (T, ...)."""
+    """Return whether a sample is the first that shows its report; both columns are (T, ...)."""
     begins = is_known.copy()
     begins[1:] &= ~is_known[:-1] | (reported_ns[1:] != reported_ns[:-1])
     return begins
 
 
 class Reports(NamedTuple):
-    """The report of an object or a signal that each sample shows, and the last other one before it.
+    """The previous report of an object or a signal, in each sample.
 
     Attributes:
-        before: (T,), the last sample that showed the other one, -1 if there is none: what is reported for the
-            first time, or for the first time after a hole.
-        seconds: (T,), the time between both; NaN if there is none, or if it is not positive.
+        before: (T,), last sample that shows the previous report. -1 for the first report, also for the first
+            after a sample without one.
+        seconds: (T,), time between both reports; NaN if there is no previous one, or if not positive.
     """
 
     before: Integers
@@ -80,10 +80,10 @@ class LatestReport:
 
     Attributes:
         value: the object, or the number of the signal.
-        reported_ns: when it was reported.
-        before: the last other report, None if there is none.
-        seconds: the time between both; NaN if there is none, or if it is not positive.
-        centre: of an object, once it was asked for: its packed centre.
+        reported_ns: time of the report.
+        before: previous report; None if there is none.
+        seconds: time between both reports; NaN if there is no previous one, or if not positive.
+        centre: packed centre of an object; None until it is needed.
     """
 
     value: Any
@@ -93,7 +93,7 @@ class LatestReport:
     centre: tuple[bytes, bytes] | None = None
 
     def follow(self, value: Any, reported_ns: int) -> LatestReport:
-        """Return what the next sample shows, by what it reports."""
+        """Return the report of the next sample: this one again if the time is the same, else a new one."""
         if reported_ns == self.reported_ns:
             return LatestReport(value, reported_ns, self.before, self.seconds)
         step_ns = reported_ns - self.reported_ns
@@ -102,10 +102,11 @@ class LatestReport:
 
 
 class RecentReports:
-    """The reports that the newest sample shows of objects and signals, and the last other ones.
+    """The reports of objects and signals in the newest sample, with their previous reports.
 
     Args:
-        objects: their names; None for all objects.
+        objects: names of the objects; None for all objects.
+        signals: the signals.
     """
 
     def __init__(self, objects: frozenset[str] | None, signals: Iterable[Signal]) -> None:
@@ -114,7 +115,7 @@ class RecentReports:
         self.latest: dict[str | Signal, LatestReport] = {}
 
     def add(self, sample: Sample) -> None:
-        """Add the next sample; a hole forgets the reports before it."""
+        """Add the next sample; objects and signals without a report lose their history."""
         latest: dict[str | Signal, LatestReport] = {}
         objects, times = sample.objects, sample.reported_ns
         for name in objects if self._objects is None else self._objects:
@@ -135,7 +136,10 @@ class RecentReports:
         return LatestReport(value, reported_ns) if latest is None else latest.follow(value, reported_ns)
 
     def step(self, terms: Iterable[Term], sample: Sample) -> float:
-        """Return the shortest time between two reports of what moves in some terms, NaN for none."""
+        """Return the shortest time between two reports of the terms' objects, s.
+
+        Lasting objects without two reports are ignored. NaN if another object lacks two reports.
+        """
         shortest, latest = inf, self.latest
         for term in terms:
             for name in (term.name,) if isinstance(term, TrackedName) else _members_in(term, sample):
@@ -156,7 +160,11 @@ class RecentReports:
         return packed_centre(tracked)
 
     def moved_back(self, name: str, sample: Sample, shortest: float) -> TrackedObject | None:
-        """Return an object as it was some seconds ago by its velocity; None if it was not reported before."""
+        """Return an object moved back by its velocity; None if it was not reported before.
+
+        Args:
+            shortest: time by which it is moved back, s.
+        """
         latest = self.latest.get(name)
         if latest is None:
             return None
@@ -179,7 +187,7 @@ class RecentReports:
 
 
 def _members_in(term: Term, sample: Sample) -> Iterable[str]:
-    """Return the objects of a term in a sample."""
+    """Return the names of a term's objects in a sample."""
     if not isinstance(term, Group):
         return (term.name,)  # type: ignore[union-attr]
     if not term.is_open:

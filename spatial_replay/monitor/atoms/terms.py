@@ -1,4 +1,4 @@
-"""Terms in a trace: footprints, uncertainty, where they are unknown, and how far they look back (`a[-3]`).
+"""Terms in a trace: their footprints, uncertainty, unknown samples, and reach into the past (`a[-3]`).
 
 A rate looks back at reports (see `reports`).
 """
@@ -57,7 +57,7 @@ from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 
 class Delay(NamedTuple):
-    """How far a term looks back: some samples, at least some ns, or to a report (neither)."""
+    """The delay of a term: a number of samples, at least some ns, or a report (both None)."""
 
     samples: int | None
     duration_ns: int | None
@@ -72,7 +72,7 @@ TO_REPORTS = Delay(None, None)
 
 
 def iter_delays(formulas: Sequence[Formula]) -> Iterator[Delay]:
-    """Iterate over the delays of the terms in some formulas that look back."""
+    """Iterate over the delays of all terms in formulas that look back."""
     for term in map(standing, iter_terms(formulas)):
         if isinstance(term, Earlier):
             yield Delay.of(term)
@@ -81,7 +81,7 @@ def iter_delays(formulas: Sequence[Formula]) -> Iterator[Delay]:
 
 
 class Reach(NamedTuple):
-    """How far terms look back: some samples (`a[-3]`), some ns (`a[-2s]`), and to reports (`speed(a)`)."""
+    """The largest delays of terms: in samples (`a[-3]`), in ns (`a[-2s]`), and to reports (`speed(a)`)."""
 
     samples: int
     duration_ns: int
@@ -92,7 +92,7 @@ class Reach(NamedTuple):
 
 
 def look_back(formulas: Sequence[Formula]) -> Reach:
-    """Return how far the terms of some formulas look back."""
+    """Return the largest delays of the terms in formulas."""
     delays = list(iter_delays(formulas))
     samples = max((delay.samples or 0 for delay in delays), default=0)
     duration_ns = max((delay.duration_ns or 0 for delay in delays), default=0)
@@ -100,10 +100,10 @@ def look_back(formulas: Sequence[Formula]) -> Reach:
 
 
 def tail(trace: Trace, reach: Reach) -> Trace:
-    """Return the samples of a trace that the next one may look back at (see `look_back`)."""
+    """Return the samples of a trace that the next sample may look back at (see `look_back`)."""
     begin = len(trace) - max(reach.samples, reach.to_reports)
     if reach.duration_ns:
-        # the next sample is later than the newest, so it needs nothing before what the newest looks back at
+        # the next sample is later than the newest, so its delay cannot reach further back
         latest_ns = trace.times_ns[-1] - reach.duration_ns
         begin = min(begin, int(np.searchsorted(trace.times_ns, latest_ns, side="right")) - 1)
     recent = np.arange(max(begin, 0), len(trace))
@@ -113,14 +113,14 @@ def tail(trace: Trace, reach: Reach) -> Trace:
 
 
 class RecentSamples:
-    """The samples at some delays from the newest; older ones are dropped."""
+    """The samples at given delays before the newest one; older samples are dropped."""
 
     def __init__(self, delays: Iterable[Delay]) -> None:
         self._queues: list[tuple[Delay, deque[Sample]]] = [(delay, deque()) for delay in delays]
         self._is_newest_only = [delay for delay, _ in self._queues] == [NO_DELAY]
 
     def add(self, sample: Sample) -> list[Sample | None]:
-        """Add the next sample; return the one at each delay from it, None before the first sample."""
+        """Add the next sample; return the sample at each delay before it, None before the first sample."""
         if self._is_newest_only:
             return [sample]
         return [_at_delay(delay, queue, sample) for delay, queue in self._queues]
@@ -141,10 +141,10 @@ def _at_delay(delay: Delay, queue: deque[Sample], sample: Sample) -> Sample | No
 
 
 _NO_REPORT = ABSENT - 1
-"""In place of a row: the object is there, but was not reported before."""
+"""Row number of a present object without an earlier report."""
 
 Bindings = Mapping[str, TrackedName]
-"""The objects that variables stand for."""
+"""Objects by the names of variables."""
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ class ResolvedTerm:
 
     Attributes:
         operand: its footprints.
-        unknown: (T,), where it is unknown as a whole.
-        spread: (T,), its uncertainty; the largest of a group's members.
-        yaw: (T,), its orientation, NaN if it has none.
+        unknown: (T,), whether the whole term is unknown.
+        spread: (T,), its uncertainty; for a group, the largest of its members.
+        yaw: (T,), its orientation; NaN if it has none.
     """
 
     operand: Operand
@@ -168,9 +168,9 @@ _Base: TypeAlias = TrackedName | Variable | RegionName | Group
 
 
 class TraceScene:
-    """The samples `skip` and after of a trace, and the regions of a specification.
+    """The samples of a trace from `skip` on, and the regions of a specification.
 
-    Earlier samples are there for terms that look back (`a[-3]`).
+    Terms may look back at the samples before (`a[-3]`).
     """
 
     def __init__(self, trace: Trace, regions: Mapping[str, Outline], skip: int = 0) -> None:
@@ -192,14 +192,14 @@ class TraceScene:
 
     @cached_property
     def is_sure(self) -> bool:
-        """Whether nothing in the trace is uncertain."""
+        """Whether the trace has no uncertainty."""
         return not self.trace.uncertainty.any()
 
     @property
     def batch(self) -> FootprintBatch:
-        """The trace's footprints, then the regions'.
+        """Footprints of the trace, then of the regions.
 
-        If terms need them, the centres of all come next, then what is moved back, each with its centre.
+        If terms need them, the centres of all these follow, then moved footprints, each before its centre.
         """
         if not self._has_centres:
             return self._whole
@@ -222,7 +222,7 @@ class TraceScene:
         )
 
     def signal(self, signal: Signal) -> Floats:
-        """Return a signal, (T,), NaN where it is missing."""
+        """Return the values of a signal, (T,); NaN where it is missing."""
         return self._signal(signal)[self.skip :]
 
     def _signal(self, signal: Signal) -> Floats:
@@ -240,9 +240,10 @@ class TraceScene:
         return self.trace.signals.get(signal.name, np.full(len(self.trace), np.nan))
 
     def compared_ns(self, rate: Rate) -> tuple[int, int] | None:
-        """Return the times of the two reports that a rate compares in the first sample; None if it has none.
+        """Return the times of the two reports that a rate compares in the first sample.
 
-        If a rate is of several objects, the pair of reports with the shortest time between them.
+        For several objects, it is the pair with the shortest time between reports. None if the rate has no
+        value.
         """
         sources: list[TrackedName | Signal] = [rate.signal] if rate.signal else []
         for term in step_of(rate).terms:
@@ -256,7 +257,7 @@ class TraceScene:
         return int(times_ns[previous_sample]), int(times_ns[self.skip])
 
     def _reported_ns(self, source: TrackedName | Signal) -> Integers:
-        """Return when each sample's report of an object or a signal was made, (T,) of the whole trace."""
+        """Return the report times of an object or a signal in each sample, (T,) of the whole trace."""
         trace, reported_ns = self.trace, None
         if isinstance(source, TrackedName):
             if trace.reported_ns is not None and source.name in self._column:
@@ -276,7 +277,7 @@ class TraceScene:
         return self._reports[source]
 
     def _step(self, terms: tuple[TrackedName | Variable | Group, ...]) -> Floats:
-        """Return the shortest time between two reports of some terms, (T,) of the whole trace."""
+        """Return the shortest time between two reports of terms in seconds, (T,) of the whole trace."""
         if terms not in self._steps:
             shortest = np.full(len(self.trace), np.inf)
             for term in terms:
@@ -299,19 +300,19 @@ class TraceScene:
         return self._resolved[term]
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
-        """Return the names of the objects that are ever in an open group."""
+        """Return the names of all objects that are ever in an open group."""
         return self.members(group)[0]
 
     def may_be_unknown(self, group: Group | Earlier) -> bool:
-        """Return whether an open group is ever that of a time before the trace."""
+        """Return whether an open group ever looks back to a time before the trace."""
         return bool(self.members(group)[2].any())
 
     def members(self, group: Group | Earlier) -> tuple[tuple[str, ...], Flags, Booleans]:
         """Return the members of an open group.
 
         Returns:
-            Names of all members (M,); their membership (T, M) as 1 or 0; and (T,), whether membership is
-            unknown because the group belongs to a time before the trace.
+            the names of all members (M,), their membership (T, M) as 1 or 0, and whether (T,) it is unknown
+            because the group looks back to a time before the trace.
         """
         if group not in self._members:
             self._members[group] = self._find_members(group)
@@ -333,7 +334,7 @@ class TraceScene:
         if isinstance(term, Centre):
             inner, self._has_centres = self.resolve(term.term), True
             rows, row_count = inner.operand.rows, len(self._whole)
-            # a row that is moved back is followed by the row of its centre
+            # the row of a moved footprint precedes the row of its centre
             centres = np.where(rows < 2 * row_count, rows + row_count, rows + 1)
             return replace(inner, operand=Operand(np.where(rows < 0, rows, centres)))
         if isinstance(term, Earlier) and term.rate:
@@ -352,7 +353,7 @@ class TraceScene:
         return self._resolve_rows(rows, unknown | (source < 0))
 
     def _moved_back(self, term: Earlier) -> ResolvedTerm:
-        """Resolve a term as a rate looks back at it."""
+        """Resolve the earlier position of a rate's term."""
         shortest, columns, spreads = self._step(term.rate), [], []
         for name, current in zip(*self._members_of(term.term), strict=True):
             rows, spread = self._moved_rows(name, current, shortest)
@@ -369,11 +370,11 @@ class TraceScene:
         return ResolvedTerm(Operand(rows), unknown, spread, np.full(len(rows), np.nan))
 
     def _moved_rows(self, name: str, current: Integers, shortest: Floats) -> tuple[Integers, Floats]:
-        """Return an object's row in each sample, moved back by its velocity, and its uncertainty then.
+        """Return the rows of an object moved back by its velocity, and the uncertainty of these positions.
 
         Args:
-            current: (T,), its row in each sample of the whole trace.
-            shortest: (T,), how far to move it back, in seconds.
+            current: (T,), row of the object in each sample of the whole trace.
+            shortest: (T,), time by which the object is moved back, s.
         """
         before, seconds = self._reports_of(TrackedName(name))
         is_there, stands = current >= 0, np.isnan(seconds) & (name in self.trace.lasting)
@@ -382,7 +383,7 @@ class TraceScene:
         uncertainty = np.append(self.trace.uncertainty, 0.0)
         spread = np.where(is_there, uncertainty[np.where(is_there, current, -1)], 0.0)
         is_previous = is_there & (seconds == shortest)
-        # the earlier report itself, so that a log and a live run have the same bits
+        # the earlier report itself, so that a replay and a live run give the same bits
         rows[is_previous], spread[is_previous] = (
             before_rows[is_previous],
             uncertainty[before_rows[is_previous]],
@@ -395,7 +396,7 @@ class TraceScene:
         return rows, spread
 
     def _add_moved_rows(self, newer: Integers, older: Integers, share: Floats) -> Integers:
-        """Move some rows by a share of the way back to others; return their new rows."""
+        """Move rows by a share of the way back to older rows; return their new row numbers."""
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
         moved_batch = shift_rows(
@@ -410,7 +411,7 @@ class TraceScene:
     def _members_of(
         self, term: TrackedName | Variable | RegionName | Group
     ) -> tuple[Sequence[str], Integers]:
-        """Return the objects of a term, and their rows (N, T) in the whole trace, `ABSENT` if not members."""
+        """Return the objects of a term and their rows (N, T) in the whole trace, `ABSENT` for non-members."""
         if isinstance(term, Group):
             if term.is_open:
                 names, rows = self._open_rows(term)
@@ -419,7 +420,7 @@ class TraceScene:
         return (term.name,), self._rows_of(term.name)[None]
 
     def _base_and_source(self, term: _Base | Earlier) -> tuple[_Base, Integers]:
-        """Return what a term is about, and the trace's sample each of the scene's looks at (-1: none)."""
+        """Return the base of a term, and the sample that it reads at each sample of the scene (-1: none)."""
         samples = np.arange(self.skip, len(self.trace), dtype=np.int64)
         if not isinstance(term, Earlier):
             return term, samples
@@ -451,7 +452,7 @@ class TraceScene:
         )
 
     def _rows_of(self, name: str) -> Integers:
-        """Return an object's row in each sample of the whole trace, (T,); `ABSENT` for an unknown object."""
+        """Return an object's row in each sample of the whole trace, (T,); `ABSENT` for an unknown name."""
         if name in self._column:
             return self.trace.rows[:, self._column[name]]
         return np.full(len(self.trace), ABSENT, np.int64)
@@ -463,7 +464,7 @@ class TraceScene:
         return np.stack(columns, axis=1)
 
     def _open_rows(self, group: Group) -> tuple[tuple[str, ...], Integers]:
-        """Return possible members and their rows over the whole trace, `ABSENT` where not members."""
+        """Return possible members and their rows in the whole trace, `ABSENT` for non-members."""
         left_out = left_out_of(group)
         names = tuple(name for name in self.trace.names if name not in left_out)
         rows = self.trace.rows[:, [self._column[name] for name in names]]
@@ -471,7 +472,7 @@ class TraceScene:
             return names, rows
         group_class = (group.class_name or "").casefold()
         fits = np.array([(name or "").casefold() == group_class for name in self.trace.classes], np.bool_)
-        # a row below `ABSENT` is -2 - the observation of an object whose position is unknown
+        # a row below `ABSENT` stands for observation -2 - row, an object with unknown position
         observation = np.where(rows < ABSENT, -2 - rows, np.maximum(rows, 0))
         if len(self.trace.class_code) == 0:
             return names, rows
@@ -485,7 +486,7 @@ def footprint_from_outline(outline: Outline) -> Footprint:
     """Return the shape of a region; a polygon that is not convex is decomposed.
 
     Raises:
-        GeometryError: an outline that makes no footprint.
+        GeometryError: the outline is not a valid footprint.
     """
     if len(outline.vertices) == 1 and outline.radius > 0.0:
         (x, y), *_ = outline.vertices
@@ -494,7 +495,7 @@ def footprint_from_outline(outline: Outline) -> Footprint:
 
 
 def seam_texts(formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> list[str]:
-    """Return a sentence for each region of several convex parts in which formulas want objects enclosed."""
+    """Return a sentence for each region of several convex parts that `enclosedin` refers to."""
     atoms = (part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom))
     names = dict.fromkeys(
         getattr(base_of(atom.terms[1]), "name", "") for atom in atoms if atom.relation == "enclosedin"
