@@ -1,9 +1,9 @@
 """Operation codes and table columns shared by programs and kernels, and the channels of numbers.
 
-Every number has up to four channels: the ends of the interval with every uncertainty at 0 (nominal low and
-high), and the ends with uncertainty (wide low and high). While everything is known they are equal and only
-the first is stored; the second appears with the first unknown, the others with the first uncertainty. A
-negation swaps low and high: channel ^ 1.
+Every number has up to four channels: the ends of its interval with every uncertainty at 0 (nominal low and
+high), and the ends with uncertainty (wide low and high). Channels that are equal for the whole run are not
+stored: one is enough without unknown values, and two without uncertainty. A negation swaps low and high:
+channel ^ 1.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ SAMPLES, NANOSECONDS = 0, 1
 
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
-SIGNAL_IS_KEPT = 7  # whether it is also read behind the newest sample
+SIGNAL_IS_KEPT = 7  # whether it is also read at earlier samples
 SIGNAL_WIDTH = 8
-OFFLINE_TARGET = 6  # of offline rows: the column that a row writes, instead of the window
+OFFLINE_TARGET = 6  # in offline rows instead of SIGNAL_WINDOW: the column that the row writes
 OFFLINE_WIDTH = 7
 # codes of signals
 LEAF = 0  # leaf a
 CONSTANT = 1  # low times infinity
 NOT, AND, OR = 2, 3, 4
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
-WINDOW_MAX, WINDOW_MIN = 10, 11  # of a, over [low, high] back
-DELAY = 12  # a, low back; high times infinity where there is none
-# high times infinity once the first sample is at least low behind, the negative of that before
+WINDOW_MAX, WINDOW_MIN = 10, 11  # extremum of a over [low, high] back
+DELAY = 12  # a at low back; high times infinity before the first sample
+# high times infinity from distance low after the first sample on; before, the opposite infinity
 ELAPSED = 31
-RINGS = (WINDOW_MAX, WINDOW_MIN)  # keep positions in a ring
-AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `offline`)
+RINGS = (WINDOW_MAX, WINDOW_MIN)  # store positions in a ring
+AHEAD = 16  # added to a code from ONCE on: the operator in reversed time (see `offline`)
 
 # columns of parts' nodes
-# a = -1 for the left operand of an until that is `true`, of a release that is `false`
+# a = -1 if the left operand is missing: `true` in an until, `false` in a release
 NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
-NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
-NODE_TIMED = 10  # the number, in its part, of a window or shift in seconds, -1 for none
+NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # variable and table are -1 for none
+NODE_TIMED = 10  # number of a window or shift in seconds within its part, -1 for none
 NODE_WIDTH = 11
 # codes of parts' nodes
 LITERAL = 0  # signal a
 PART_AND, PART_OR = 2, 3
 # max(b, min(a, next)); min(b, max(a, next))
 UNTIL, RELEASE = 4, 5
-PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # of a, over [low, high] ahead
-SHIFT = 8  # a, low ahead; positions of a up to high ahead are needed
+PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # extremum of a over [low, high] ahead
+SHIFT = 8  # a at low ahead; positions of a up to high ahead are needed
 AHEAD_OF = (PART_WINDOW_MAX, PART_WINDOW_MIN, SHIFT)
 PAST_SINCE, PAST_TRIGGER = 9, 10  # max(b, min(a, previous)); min(b, max(a, previous))
 PAST_WINDOW_MAX, PAST_WINDOW_MIN = 11, 12
@@ -56,22 +56,22 @@ PAST_WINDOWS = (PAST_WINDOW_MAX, PAST_WINDOW_MIN)
 PAST = (PAST_SINCE, PAST_TRIGGER, *PAST_WINDOWS, PAST_DELAY)
 BINARY_NODES = (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER)
 
-# columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run,
-# and where the table begins in each channel (of parts without windows)
+# columns of parts: rows of the nodes, the kind, numbers of variables and tables, the corner that ends a run,
+# and the begin of the table in each channel (for parts without windows)
 PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
-# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: whether the bound follows from the table alone, because later
+# one bit each for `OPEN_LOW` and `OPEN_HIGH`: whether the bound follows from the table alone, because later
 # samples may exceed every pending position
 PART_KNOWN = 7
 PART_HAS_NOW = 8  # whether it also reports its value at the newest sample
-PART_IS_MONOTONE = 9  # whether the operand that the root joins by the minimum never falls (maximum: rises)
+PART_IS_MONOTONE = 9  # whether the operand of a root by the minimum never falls (maximum: never rises)
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 
-# columns of reports: the index is of the signal or part, the rule is for now
+# columns of reports: index of the signal or part; rule for the number `now`
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)
 REPORT_WIDTH = 5
-# codes of reports: a row is a node as written, so that here, alone, `xor`, `->` and `<->` have codes;
-# rows for their expansions would cost eight numbers a sample each
+# codes of reports. A row is a node as written, so only these have codes for `xor`, `->` and `<->`; rows for
+# their expansions would cost eight numbers per sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
@@ -87,18 +87,18 @@ REPORT_OF_BOOLEAN = MappingProxyType(
 )
 NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
 
-# columns of the first row of a program: where its rows stand, and how many there are
+# columns of the first row of a program: begins of its tables, and their numbers of rows
 HEAD_SIGNALS_AT, HEAD_SIGNALS, HEAD_PARTS_AT, HEAD_PARTS, HEAD_REPORTS_AT, HEAD_REPORTS = range(6)
 HEAD_OPERANDS_AT = 6
 
-# how a run over the recent samples treats what lies beyond the last one
+# treatment of the values beyond the last sample: end of the run, lowest values, highest values
 OPEN_END, OPEN_LOW, OPEN_HIGH = 0, 1, 2
 
 CHANNELS = 4
-"""Nominal low and high, wide low and high."""
+"""Number of channels: nominal low and high, wide low and high."""
 
 _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3)})
-"""Which channel of so many each of all stands for."""
+"""Stored channel that holds each of the four channels, by the number of stored channels."""
 
 
 def in_channels(numbers: Floats, channels: int) -> Floats:
@@ -107,14 +107,14 @@ def in_channels(numbers: Floats, channels: int) -> Floats:
 
 
 def distinct_channels(numbers: Floats) -> Floats:
-    """Return numbers (C, …) in as few channels as hold them: one where the ends are equal, two if sure."""
+    """Return numbers (C, …) in as few channels as possible: one for equal ends, two without uncertainty."""
     if len(numbers) == CHANNELS and np.array_equal(numbers[:2], numbers[2:]):
         numbers = numbers[:2]
     return numbers[:1] if len(numbers) == 2 and np.array_equal(numbers[0], numbers[1]) else numbers
 
 
 def joined_channels(parts: Sequence[Floats], axis: int) -> Floats:
-    """Concatenate arrays (C, …) in as many channels as the widest has, into a `roomy` one."""
+    """Concatenate arrays (C, …) into a `roomy` array with the largest number of channels among them."""
     channels = max(map(len, parts))
     return join_arrays([in_channels(part, channels) for part in parts], axis)
 

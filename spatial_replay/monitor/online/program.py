@@ -1,18 +1,18 @@
-"""Compile formulas for the step kernels: flat tables of what to do with each sample.
+"""Compile formulas for the step kernels: flat tables of instructions for each sample.
 
 A formula becomes three tables, each with operands first:
 
-- *signals*: every subformula without a future operator. Its robustness at a sample is final with that
-  sample, so it is computed forwards, with a little state for past operators.
-- *parts*: one for each node that is a temporal operator and looks ahead, in negation normal form over
-  signals, so that its robustness is monotone in all its operands.
+- *signals*: every subformula without a future operator. Its robustness at a sample is final once that
+  sample has come, so it is computed forwards, with a little state for past operators.
+- *parts*: one for each temporal operator that looks ahead. A part is in negation normal form over signals,
+  so its robustness is monotone in all its operands.
 - *reports*: the tree as the user wrote it; Boolean nodes combine the numbers of their operands.
 
 `OnlineRun` runs samples through them.
 
-Some bounds of a part follow from the rows of its root alone. A root that joins by the minimum, such as `G`,
-cannot exceed the least of its closed positions, and later samples may always be worse. For the maximum, as in
-`F`, it is the reverse.
+Some bounds of a part follow from its root's rows alone. A root that joins by the minimum, such as `G`, cannot
+exceed the least value of its closed positions, and later samples may always be worse. The reverse holds for a
+root that joins by the maximum, such as `F`.
 """
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import leaf_key, looks_ahead, nodes_with_operands
 
 Row = tuple[int, ...]
-"""A row of a table, its columns as `codes` lists them."""
+"""A row of a table, with the columns that `codes` lists."""
 
 NOTHING = -1
-"""Stands where a row has no operand, no upper end, no variable, no table or no window."""
+"""Entry of a row without an operand, upper end, variable, table or window."""
 
 
 def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
-    """Return the unit, the lower and the upper end (None: unbounded) of an operator's window."""
+    """Return the unit, the lower end and the upper end (None: unbounded) of an operator's window."""
     if bound is None:
         return codes.SAMPLES, 0, None
     return (codes.SAMPLES if bound.unit == "samples" else codes.NANOSECONDS), bound.lower, bound.upper
 
 
 def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
-    """Return rows as an array (R, width), also for R = 0; zeros follow a shorter row."""
+    """Return rows as an array (R, width), even for R = 0; shorter rows are padded with zeros."""
     padded = [(*row, *(0,) * (width - len(row))) for row in rows]
     return np.array(padded, np.int64).reshape(len(rows), width)
 
 
 def _operands_of_row(row: Row) -> tuple[int, ...]:
-    """Return the rows of a `SignalTable` that one of them is computed from."""
+    """Return the operand rows of a row in a `SignalTable`."""
     code, a, b, *_ = row
     if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
         return ()
@@ -71,41 +71,41 @@ def _operands_of_row(row: Row) -> tuple[int, ...]:
 
 
 class SignalTable:
-    """Collects rows; equal subformulas share one, and operands come before what they are operands of.
+    """Collects rows of signals, operands first; equal subformulas share a row.
 
     Attributes:
-        leaves: atoms and open quantifiers, by the number that their rows refer to.
+        leaves: atoms and open quantifiers, in the order of their numbers.
     """
 
     def __init__(self, leaves: Sequence[Atom | Quantified] = ()) -> None:
-        """Begin with leaves that are numbered already."""
+        """Start with numbered leaves."""
         self.leaves: list[Atom | Quantified] = []
         self._leaf_numbers: dict[object, int] = {}
         self._rows: dict[Row, int] = {}
-        # an expansion holds an operand more than once; without this, nested ones would take 2**depth steps
+        # an expansion repeats an operand; without this, nested expansions would take 2**depth steps
         self._row_by_id: dict[int, tuple[Formula, int]] = {}
         for leaf in leaves:
             self._leaf_number(leaf)
 
     def __len__(self) -> int:
-        """Return how many rows there are."""
+        """Return the number of rows."""
         return len(self._rows)
 
     @property
     def windows(self) -> int:
-        """How many rings of positions the rows keep."""
+        """Number of rings of positions that the rows need."""
         return sum(row[0] in codes.RINGS for row in self._rows)
 
     @property
     def keeps_history(self) -> bool:
-        """Whether any row looks at more than the newest sample."""
+        """Whether any row reads more than the newest sample."""
         return any(row[0] in (*codes.RINGS, codes.DELAY) for row in self._rows)
 
     def array(self, kept_rows: Iterable[int]) -> Integers:
         """Return the table (S, SIGNAL_WIDTH), with its rings numbered.
 
         Args:
-            kept_rows: those that parts look at behind the newest sample.
+            kept_rows: rows that parts read at earlier samples.
         """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
         looked_at = set(kept_rows)
@@ -123,7 +123,7 @@ class SignalTable:
         formula = expand(formula)
         if id(formula) not in self._row_by_id:
             operands = [self.add(operand) for operand in operands_of(formula)]
-            # the formula is stored to stay alive: a freed one would leave its id to another
+            # the formula is stored to stay alive: a new formula could reuse the id of a freed one
             self._row_by_id[id(formula)] = formula, self._added_row(formula, operands)
         return self._row_by_id[id(formula)][1]
 
@@ -139,7 +139,7 @@ class SignalTable:
                 return self._temporal(formula.operator, operands, formula.bound)
 
     def row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
-        """Return the place of a row, which is added unless there is one like it."""
+        """Return the number of a row; it is added unless an equal row exists."""
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
 
     def _leaf_number(self, formula: Atom | Quantified) -> int:
@@ -158,7 +158,7 @@ class SignalTable:
         return first
 
     def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
-        """Add a past operator; with `codes.AHEAD`, the future operator that mirrors it in time."""
+        """Add a past operator; with `codes.AHEAD`, the future operator that it equals in reversed time."""
         unit, low, high = window_of(bound)
         match operator:
             case "Y":
@@ -174,8 +174,11 @@ class SignalTable:
         return running if low == 0 else self.delay(running, unit, low, ahead, is_weak=is_weak)
 
     def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
-        """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and phi S
-        psi before. Min distributes over max, so both are exact for robustness too."""
+        """Add a since over a window, phi S[a,b] psi.
+
+        It is rewritten as O[a,b] psi and phi S[a,inf] psi. The latter is phi on the last a, and phi S psi
+        before. Both are exact for robustness, because min distributes over max.
+        """
         row = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
             delayed = self.delay(row, unit, low, ahead)
@@ -187,19 +190,19 @@ class SignalTable:
         return row
 
     def infinity_after(self, unit: int, distance: int, sign: int) -> int:
-        """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
+        """Add an infinity that has this sign from a distance after the first sample on, else the other."""
         return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
 
     def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
-        """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
+        """Add an operand delayed by a distance; before the first sample it is +inf (weak) or -inf."""
         return self.row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
 
 
 MAX_VARIABLES = 12
-"""How many unbounded future operators one part may nest: its table has 2**variables entries."""
+"""Limit on unbounded future operators in a part, because its table has 2**variables entries."""
 
 LAST = (1 << 63) - 1
-"""No sample comes later, in samples or in ns."""
+"""Largest distance of a sample, in samples or ns."""
 
 _RUNNING = (codes.UNTIL, codes.RELEASE)
 _RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
@@ -209,7 +212,7 @@ def part_of(signals: SignalTable, node: Temporal) -> PartRows:
     """Return the part of a node that looks ahead.
 
     Raises:
-        UsageError: more than `MAX_VARIABLES` unbounded future operators.
+        UsageError: the part has more than `MAX_VARIABLES` unbounded future operators.
     """
     part = PartRows(signals, node)
     if part.variables > MAX_VARIABLES:
@@ -221,11 +224,11 @@ def part_of(signals: SignalTable, node: Temporal) -> PartRows:
 
 
 class PartRows:
-    """The rows of a node that looks ahead, in negation normal form: operands first, equal ones once.
+    """The rows of a node that looks ahead, in negation normal form: operands first, equal rows once.
 
     Attributes:
-        variables: how many operators take a value from the next sample on.
-        tables: 1, and one for each past operator that carries a table of its own.
+        variables: number of operators that need their value at the next sample.
+        tables: number of tables: one of the part, and one for each past operator with its own table.
     """
 
     def __init__(self, signals: SignalTable, root: Temporal) -> None:
@@ -243,7 +246,7 @@ class PartRows:
             self._add(root, True)
 
     def rows(self) -> tuple[Row, ...]:
-        """Return rows with the numbers of their variable and table, and whether they depend on either."""
+        """Return the rows with the numbers of their variable and table, and whether they depend on any."""
         variable = 0
         table = 1  # 0 is the part's own table
         numbered_rows: list[Row] = []
@@ -264,9 +267,9 @@ class PartRows:
 
     @property
     def is_flat(self) -> bool:
-        """Whether one sample settles everything but the variables: no window, shift or past operator."""
+        """Whether the part has no window, shift or past operator, so that only variables are pending."""
         flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR)
-        # `H[0,5] G G x` has flat rows alone, but a past root also reports its value at the newest sample
+        # all rows of `H[0,5] G G x` are flat, but a past root also reports its value at the newest sample
         is_flat = all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
         return is_flat and not self._is_past
 
@@ -287,7 +290,7 @@ class PartRows:
         high: int = 0,
         variable: bool = False,
     ) -> int:
-        """Return the place of a row, which is added unless there is one like it."""
+        """Return the number of a row; it is added unless an equal row exists."""
         key = (code, a, b, weak, unit, low, high, int(variable))
         if key not in self._rows:
             self._rows[key] = len(self._rows)
@@ -298,7 +301,7 @@ class PartRows:
     def _add(self, formula: Formula, positive: bool) -> int:
         """Return the row of a formula, or of its negation, in negation normal form.
 
-        Each is built once in either polarity: the expansion of `xor` holds its operands in both.
+        Each polarity is built once: the expansion of `xor` has its operands in both.
         """
         formula = expand(formula)
         while isinstance(formula, Boolean) and formula.operator == "not":
@@ -323,14 +326,14 @@ class PartRows:
 
     def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
         left, right, bound = _as_until(operator, operands, bound)
-        # under a negation an until is a release, and the other way round
+        # negation turns an until into a release, and a release into an until
         is_until = (operator != "G") == positive
         return self._bounded_until(left, right, *window_of(bound), is_until=is_until)
 
     def _bounded_until(
         self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
     ) -> int:
-        """Add until or release over a window, by the identity that `SignalTable` uses for since."""
+        """Add until or release over a window, by the identity of `SignalTable.since`."""
         weak = int(not is_until)
         right_code, left_code = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
         window_row = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
@@ -365,10 +368,10 @@ class PartRows:
         return since_row if window_row is None else self._join(window_row, since_row, is_both=is_since)
 
     def _ending(self, formula: Formula, positive: bool) -> int:
-        """Return the row of a bounded operator of which only the value at the first sample is needed.
+        """Return the row of a bounded operator that is needed only at the first sample.
 
-        Its window is a fixed stretch of the run. In an until, positions outside the window are -inf. From
-        the window's end on, the left operand is -inf, too: later samples are out of reach.
+        Its window is a fixed interval of the run. In an until, positions outside the window are -inf. From
+        the window's end on, the left operand is -inf, too, so later samples have no effect.
         """
         formula = expand(formula)
         if isinstance(formula, Boolean) and formula.operator == "not":
@@ -393,19 +396,19 @@ class PartRows:
         return self.row(code, left, right, int(not is_until), variable=True)
 
     def _infinity_after(self, unit: int, distance: int, sign: int) -> int:
-        """Return the row of an infinity that changes its sign a distance from the first sample on."""
+        """Return the row of an infinity that changes its sign at a distance after the first sample."""
         return self.row(codes.LITERAL, self._signals.infinity_after(unit, distance, sign))
 
 
 def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[int, int, Bound | None]:
-    """Return the operands and bound of U for a future operator: X is F[1,1]; F and G have no left operand."""
+    """Return a future operator's operands and bound as for U; X is F[1,1], F and G have no left operand."""
     if operator == "U":
         return operands[0], operands[1], bound
     return NOTHING, operands[0], Bound(1, 1, "samples") if operator == "X" else bound
 
 
 def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
-    """Which extremum an until or since takes of its right operand, and which of its left one."""
+    """Return the extrema that an until or since takes of its right and of its left operand."""
     return (greatest, least) if is_strong else (least, greatest)
 
 
@@ -419,13 +422,14 @@ def operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
 
 
 class _Direction(NamedTuple):
-    """Operands of a root that joins by the minimum; for the maximum it is the reverse.
+    """Codes of nodes below a root that joins by the minimum; for the maximum they are mirrored.
 
     Attributes:
-        either, both: the nodes that are as great as the greater, and as the smaller one of their operands.
-        until: those that are great once their operand is.
-        release: those that are great as long as it is.
-        worst, best: the bounds of the smallest, and of the greatest continuation.
+        either: nodes that are great if one operand is great.
+        both: nodes that are great if all operands are great.
+        until: nodes that are great once their operand is great.
+        release: nodes that are great while their operand is great.
+        worst, best: bounds over the smallest and the greatest continuation.
     """
 
     either: int
@@ -448,23 +452,23 @@ _DIRECTIONS: Mapping[int, _Direction] = MappingProxyType(
 
 
 def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
-    """Return what a part's root is in, if it is a variable: one that never ends, or not before its window."""
+    """Return the direction of a part's root if it is a variable, an operator without an end; else None."""
     if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
         return None
     return _DIRECTIONS.get(rows[-1][codes.NODE_CODE])
 
 
 def known_bounds(rows: tuple[Row, ...]) -> int:
-    """Return which bounds follow from a part's table, whatever is open, a bit for each.
+    """Return the bounds that follow from a part's table regardless of open positions, one bit each.
 
-    Later samples may always violate `G x`, so its lower bound is -inf. Its upper one is as
-    great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
-    The table then says what follows from what has closed, if the same holds for all of its variables.
+    Later samples may always violate `G x`, so its lower bound is -inf. Its upper bound follows from the table
+    if later samples can satisfy x at every open position, as for `F y` and `F y or z`. The table then bounds
+    the closed positions, if the same holds for all its variables.
     """
     direction = _direction_of(rows)
     if direction is None:
         return 0
-    # whether a node is infinite in the best continuation
+    # whether a node is infinitely great in the best continuation
     outdone: list[bool] = []
     for code, a, b, *_ in rows:
         if code == direction.either:
@@ -483,9 +487,9 @@ def known_bounds(rows: tuple[Row, ...]) -> int:
 
 
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
-    """Return for each node whether what it is never falls, and whether it never rises, as samples come.
+    """Return for each node whether its numbers never fall, and whether they never rise, as samples come.
 
-    That is as if the run ended with the newest sample: an operator that looks ahead finds nothing after it.
+    The numbers are those of a run that ends with the newest sample.
     """
     node_directions = list[tuple[bool, bool]]()
     for code, a, b, weak, *_ in rows:
@@ -500,7 +504,7 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
 
 
 def is_monotone(rows: tuple[Row, ...]) -> bool:
-    """Return whether what a root joins by the minimum never falls, or the other way round."""
+    """Return whether the operand of a root by the minimum never falls (maximum: never rises)."""
     direction = _direction_of(rows)
     if (
         direction is None
@@ -513,19 +517,19 @@ def is_monotone(rows: tuple[Row, ...]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A formula as tables (see `codes` for what the columns mean).
+    """A formula as tables (see `codes` for their columns).
 
     Attributes:
-        leaves: atoms and open quantifiers, whose values in each sample are given to the kernel.
+        leaves: atoms and open quantifiers, the inputs of the kernels at each sample.
         signals: (S, SIGNAL_WIDTH).
         parts: (P, NODE_WIDTH).
-        part_rows: for each part (D + 1, NODE_WIDTH), its nodes and itself.
+        part_rows: for each part (D + 1, NODE_WIDTH), its nodes, then the part itself.
         reports: (N, REPORT_WIDTH), in the order of node ids.
-        rows: (…, NODE_WIDTH), all tables in one: a row with their offsets, signals, parts, reports, the ids
-            of the nodes below each node of the tree, and the parts' nodes.
-        windows: how many rings of positions the signals keep.
-        table_size: how many numbers the tables of parts without windows hold for one channel.
-        keeps_history: whether any window, delay or part looks at more than the newest sample.
+        rows: (…, NODE_WIDTH), all tables joined: a row with their offsets, signals, parts, reports, operand
+            ids of the nodes of the tree, and nodes of the parts.
+        windows: number of rings of positions that the signals need.
+        table_size: total size of the tables of parts without windows, numbers per channel.
+        keeps_history: whether any window, delay or part reads more than the newest sample.
     """
 
     leaves: tuple[Atom | Quantified, ...]
@@ -543,7 +547,7 @@ def compile_formula(formula: Formula) -> Program:
     """Compile a formula to tables.
 
     Raises:
-        UsageError: more than `MAX_VARIABLES` unbounded future operators under one node.
+        UsageError: a node has more than `MAX_VARIABLES` unbounded future operators below it.
     """
     signals, parts = SignalTable(), _Parts()
     reports: list[Row] = []
@@ -595,11 +599,11 @@ def _join_rows(
 
 
 class _Parts:
-    """The parts of a formula, one after the other; equal ones share a place.
+    """The parts of a formula; equal parts are stored once.
 
     Attributes:
-        literals: the signals that parts with windows look at.
-        rows: of each part, those of its nodes and its own.
+        literals: signals that parts with windows read.
+        rows: rows of each part: its nodes, then the part itself.
     """
 
     def __init__(self) -> None:
@@ -642,7 +646,7 @@ class _Parts:
 
 
 def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
-    """Yield rows with the numbers of their windows in seconds."""
+    """Yield the rows; windows in seconds are numbered."""
     timed = 0
     for row in nodes:
         code, unit = row[codes.NODE_CODE], row[codes.NODE_UNIT]
@@ -652,7 +656,7 @@ def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
 
 
 def _with_signal_row(row: Row, signals: SignalTable) -> Row:
-    """Return a row whose numbers, if it is a literal, are those of a signal."""
+    """Return a row; a negated literal becomes a literal of the negated signal."""
     code, signal, is_negated, *fields = row
     if code != codes.LITERAL or not is_negated:
         return row
@@ -660,9 +664,9 @@ def _with_signal_row(row: Row, signals: SignalTable) -> Row:
 
 
 def _now_rule(node: Temporal) -> int:
-    """Return where an operator's number on the newest sample alone (`now`) comes from.
+    """Return the rule for an operator's number on the newest sample alone (`now`).
 
-    That of a future operator follows from its operands' own, that of a past one is kept in its part.
+    A future operator's number follows from its operands' numbers; a past operator's is stored in its part.
     """
     if node.operator not in FUTURE_OPERATORS:
         return codes.NOW_OF_PART

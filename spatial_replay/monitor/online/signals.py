@@ -1,15 +1,16 @@
-"""Signals, and tables: all of a formula that takes no window ahead.
+"""Signals and tables: the nodes of a formula without windows into the future.
 
-A signal is a subformula without future operators. Its robustness is final with its sample. So it is computed
-forwards, once, with a little state for past operators.
+A signal is a subformula without future operators. Its robustness at a sample is final once that sample has
+come. So it is computed once, forwards, with a little state for past operators.
 
-A table is the value of a formula at the first sample as a function of what is still to come. Let x_1 … x_m
-be the values that the unbounded temporal subformulas of a part will have at the next sample. In negation
-normal form the part's value is a monotone lattice polynomial of them (minima and maxima only). Its values
-at the corners x in {-inf, +inf}^m therefore determine it: they are its table of 2^m numbers. A new sample
-substitutes for each x_j the formula that it expands to (max(psi, min(phi, x)) for an until) and reads the
-old table at that point. The first and the last entry bound the value over every continuation. The corner
-with strong operators at -inf and weak ones at +inf is the value if the run ends here.
+A table is the value of a formula at the first sample as a function of later values. Let x_1 … x_m be the
+values of a part's unbounded temporal subformulas at the next sample. In negation normal form, the part's
+value is a monotone lattice polynomial of them (minima and maxima only). Its values at the corners x in
+{-inf, +inf}^m determine it: they are its table of 2^m numbers.
+
+A new sample replaces each x_j by its expansion (max(psi, min(phi, x)) for an until), and reads the old table
+at that point. The first and the last entry bound the value over every continuation. The corner with strong
+operators at -inf and weak ones at +inf is the value if the run ends here.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 
-# columns of a sliding window's ring: how many positions ever left and entered it, the next one to enter, and
-# then the positions that can still attain its extremum
+# columns of a sliding window's ring: number of positions that ever left it and that ever entered it, the next
+# position to enter, then the positions that can still attain the extremum
 HEAD, TAIL, ENTERING, RING = range(4)
 
 
 @inlined
 def _delay_place(times: Integers, unit: int, place: int, distance: int) -> int:
-    """Return the last place at least a distance behind another; a negative one if there is none.
+    """Return the last place that is at least `distance` before `place`; negative if there is none.
 
-    Times are compared by their differences, which fit where a time plus the distance might not.
+    Times are compared by their differences, because a time plus the distance could exceed 64 bits.
     """
     if unit == codes.SAMPLES:
         return place - distance
@@ -45,7 +46,7 @@ def _delay_place(times: Integers, unit: int, place: int, distance: int) -> int:
 
 @inlined
 def past_value(code: int, first: float, second: float, before: float) -> float:
-    """Return an unbounded once, historically or since at a sample, from its value at the one before."""
+    """Return an unbounded once, historically or since at a sample, from its value at the previous sample."""
     if code == codes.ONCE:
         return max(first, before)
     if code == codes.HISTORICALLY:
@@ -55,7 +56,7 @@ def past_value(code: int, first: float, second: float, before: float) -> float:
 
 @inlined
 def _distance(times: Integers, unit: int, place: int, later: int) -> int:
-    """Return how far a place is ahead of another, in the unit of a window."""
+    """Return the distance from a place to a later one, in the unit of a window."""
     return later - place if unit == codes.SAMPLES else times[0, later] - times[0, place]
 
 
@@ -64,7 +65,10 @@ def _slide(
     rows: Integers, row: int, history: Floats, channel: int, target: int, times: Integers, offset: int,
     begin: int, count: int,
 ) -> None:  # fmt: skip
-    """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it."""
+    """Compute an extremum over a sliding window.
+
+    The ring is a monotonic queue: it holds the positions that can still attain the extremum.
+    """
     operand, unit = rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_UNIT]
     near, far = rows[row, codes.SIGNAL_LOW], rows[row, codes.SIGNAL_HIGH]
     sign = 1.0 if rows[row, codes.SIGNAL_CODE] == codes.WINDOW_MAX else -1.0
@@ -84,7 +88,7 @@ def _slide(
         oldest = 0
         while tail > head:
             oldest = times[ring, RING + head % size] - offset
-            # positions dropped from the history are farther back than any window reaches
+            # a negative place was dropped from the history: it is further back than any window reaches
             if oldest >= 0 and _distance(times, unit, oldest, place) <= far:
                 break
             head += 1
@@ -97,13 +101,13 @@ def run_signals(
     rows: Integers, leaves: Floats, first_leaf: int, t: int, count: int, position: int, begin: int,
     start_ns: int, history: Floats, times: Integers, memory: Floats,
 ) -> None:  # fmt: skip
-    """Add signals over the samples t … t + count - 1 of `leaves`, in every channel, to the history.
+    """Compute the signals at samples t … t + count - 1 of `leaves`, in every channel, into the history.
 
     Args:
-        first_leaf: where the leaves of these begin.
-        position: of the first of these samples in the run; it stands at `begin` in the history.
-        times: of the recent samples, and then a ring for each sliding window and channel.
-        memory: (4, …), every signal at the last sample, and then at the first one, by channel.
+        first_leaf: index of the program's first leaf in `leaves`.
+        position: number of the first of these samples in the run; its place in the history is `begin`.
+        times: times of the recent samples, then a ring for each sliding window and channel.
+        memory: (4, …), every signal at the last sample, then at the first sample, by channel.
     """
     offset, channels, signal_count, end = (
         position - begin,
@@ -158,7 +162,7 @@ def run_signals(
                 memory[c, signal_count + s] = history[c, s, begin]
 
 
-# rows that a part works with, after one for each of its nodes; its results come after them
+# work rows of a part, after one row for each of its nodes; its results follow
 VALUES, FRESH, POINT, RESULTS = range(4)
 EXTRA_ROWS = 6
 
@@ -168,8 +172,8 @@ def read_table(tables: Floats, row: int, first: int, variables: int, points: Flo
     """Read a table at a point: walk its corners in descending order of the coordinates.
 
     Args:
-        tables, row, first: where the table begins.
-        points, point: the row of the point.
+        tables, row, first: array, row and column of the table's begin.
+        points, point: array and row of the point.
     """
     # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
     value, corner = tables[row, first], 0
@@ -188,7 +192,7 @@ def _start(
     rows: Integers, first: int, end: int, corners: int, memory: Floats, channel: int, table: int,
     work: Floats, values: int,
 ) -> None:  # fmt: skip
-    """Fill the table before the first sample: each operator as it is there."""
+    """Fill the table before the first sample: each operator equals its value at the next sample."""
     for corner in range(corners):
         for d in range(end - first):
             variable, a, b = rows[first + d, codes.NODE_VARIABLE], rows[first + d, codes.NODE_A], 0
@@ -205,7 +209,7 @@ def _fill_columns(
     rows: Integers, first: int, end: int, history: Floats, channel: int, begin: int, count: int,
     work: Floats, top: int,
 ) -> None:  # fmt: skip
-    """Compute the nodes that depend on no variable, over some samples."""
+    """Compute the nodes that depend on no variable, at `count` samples."""
     for d in range(end - first):
         row, target = first + d, top + d
         code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], top + rows[row, codes.NODE_B]
@@ -226,7 +230,7 @@ def _run_simple(
     rows: Integers, root: int, end_corner: int, memory: Floats, channel: int, table: int, work: Floats,
     top: int, first_result: int, count: int,
 ) -> None:  # fmt: skip
-    """Run a part that is a single until or release: a table of two numbers."""
+    """Run a part that is a single until or release, with a table of two numbers."""
     low, high = memory[channel, table], memory[channel, table + 1]
     has_left, a, b = rows[root, codes.NODE_A] >= 0, rows[root, codes.NODE_A], rows[root, codes.NODE_B]
     is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
@@ -250,13 +254,13 @@ def run_table(
     """Substitute samples into the table of a part without windows, in one channel.
 
     Args:
-        part: its row.
-        table: where it begins in the `memory` of the channel.
-        top: the first row of `work` that there is room in.
-        position: of the first of the `count` samples; they stand at `begin` in the history.
+        part: row of the part.
+        table: begin of its table in the `memory` of the channel.
+        top: first free row of `work`.
+        position: number of the first of the `count` samples; its place in the history is `begin`.
 
     Returns:
-        The first of the rows of `work` with its value, its lower and its upper bound.
+        the row of `work` with its value; the rows of its lower and upper bound follow.
     """
     first, end = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
     variables, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]

@@ -1,13 +1,13 @@
-"""One program on one stream of samples: what monitors and replays share.
+"""The evaluation of one program over one stream of samples, for monitors and replays.
 
-Samples are run in tiles: first the signals of a tile (subformulas without future operators, final at each
+Samples run in tiles: first the signals of a tile (subformulas without future operators, final at each
 sample), then each part, then the tree as the user wrote it. A tile of one sample and a tile of many give the
 same bits, because the only arithmetic is minima, maxima and negation.
 
-Where everything is known a node has four numbers for each sample: value, now, lower and upper. In more
-channels (see `codes`) it has eight, the low and high ends of four values: value, `now`, value over
-every continuation, value if the run ends there. A number is made of those of the operands in the same
-row and in its mirror, which negation takes it from.
+In one channel, a node has four numbers for each sample: value, now, lower and upper. In more channels (see
+`codes`) it has eight numbers, the low and high ends of four values. These are the value, `now`, the value
+over every continuation, and the value if the run ends there. A number depends on its operands' numbers in the
+same row, and in the mirror row, from which negation reads.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from spatial_replay.monitor.online.signals import (
 from spatial_replay.monitor.online.windows import run_windows
 
 NUMBERS = 8
-"""Rows of numbers of a node, or of a part."""
+"""Number of rows of a node, and of a part."""
 SERIES = 4
-"""Rows of results of a node: value, now, lower and upper."""
+"""Number of result rows of a node: value, now, lower and upper."""
 
 
 @inlined
@@ -46,7 +46,7 @@ def _mirror(row: int, channels: int) -> int:
 
 @inlined
 def _channel(row: int, channels: int) -> int:
-    """Return the channel that a row is in."""
+    """Return the channel of a row."""
     if channels == 1:
         return 0
     return row & 1 if row < 4 or channels == 2 else 2 + (row & 1)
@@ -101,10 +101,10 @@ def report(
     """Compute the numbers of every node over `count` samples, operands first.
 
     Args:
-        rows: of a program (see `Program`).
-        history, memory: of the signals (see `run_signals`).
-        work: receives the numbers of the nodes, after those of the parts, and then the series.
-        begin: where these samples stand in the history.
+        rows: rows of a program (see `Program`).
+        history, memory: history and memory of the signals (see `run_signals`).
+        work: numbers of the parts; then output: numbers of the nodes and the series.
+        begin: place of these samples in the history.
     """
     first, number = rows[0, codes.HEAD_REPORTS_AT], rows[0, codes.HEAD_REPORTS]
     operands, width = rows[0, codes.HEAD_OPERANDS_AT], rows.shape[1]
@@ -126,7 +126,7 @@ def report(
             if is_now and code == codes.REPORT_SIGNAL:
                 for k in range(count):
                     work[target, k] = history[channel, index, begin + k]
-            elif code == codes.REPORT_SIGNAL:  # settled by the first sample
+            elif code == codes.REPORT_SIGNAL:  # a signal is final at the first sample
                 _fill(work, target, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
             elif code == codes.REPORT_PART:
                 if not is_now or rule == codes.NOW_OF_PART:
@@ -161,7 +161,7 @@ def report(
 def _write_series(work: Floats, first: int, series: int, number: int, channels: int, count: int) -> None:
     """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
 
-    Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
+    Adding zero turns -0.0 into 0.0, so that equal numbers have equal bits.
     """
     for n in range(number):
         for r in range(SERIES):
@@ -178,16 +178,15 @@ def _write_series(work: Floats, first: int, series: int, number: int, channels: 
 
 
 TILE = 1024
-"""How many samples are taken in together: enough to amortise the calls of kernels, few enough to stay in the
-processor's cache."""
+"""Number of samples in a tile: enough to amortise kernel calls, few enough for the CPU cache."""
 
 ROOM = 256
-"""Recent samples a live run has room for at first: few, so that they stay in the processor's cache."""
+"""Initial capacity of a live run, recent samples; small enough for the CPU cache."""
 
 BEGIN, FINISH = 1, 2
-"""Tasks of `run_samples`: parts without windows, and the numbers of all nodes."""
+"""Phases of `run_samples`: signals with parts without windows, and the numbers of all nodes."""
 _UNKNOWN = -2
-"""Stands for the newest sample that a set of columns knows, before it knows any."""
+"""Newest sample of a set of columns before its first sample."""
 
 
 @kernel
@@ -195,16 +194,16 @@ def run_samples(
     rows: Integers, leaves: Floats, history: Floats, times: Integers, memory: Floats, work: Floats,
     first_leaf: int, t: int, count: int, position: int, begin: int, start_ns: int, phases: int,
 ) -> None:  # fmt: skip
-    """Run samples through a program, but for its windows under parts.
+    """Run samples through a program, except for its parts with windows.
 
     Args:
-        rows: the program's.
-        leaves: (C, A, T), of which the run's own begin at `first_leaf`, and these samples at `t`.
-        history: (4, S, room), the signals at the recent samples, by channel.
-        times: (1 + 4 W, room + RING), the times of these, and the rings of sliding windows, by channel.
-        memory: (4, …), each signal at the last and at the first sample, and then the parts' tables.
-        work: the numbers of parts and nodes, the series, and room to work in, row by row.
-        position: of the first of these `count` samples; they stand at `begin` in the history.
+        rows: rows of the program.
+        leaves: (C, A, T); the leaves of this program begin at `first_leaf`, and these samples at `t`.
+        history: (4, S, room), signals at the recent samples, by channel.
+        times: (1 + 4 W, room + RING), times of the recent samples, then rings of sliding windows, by channel.
+        memory: (4, …), each signal at the last and at the first sample, then the tables of parts.
+        work: rows for the numbers of parts and nodes, for the series, and for intermediate numbers.
+        position: number of the first of these `count` samples; its place in the history is `begin`.
     """
     channels, signals, parts = leaves.shape[0], rows[0, codes.HEAD_SIGNALS], rows[0, codes.HEAD_PARTS]
     if phases & BEGIN:
@@ -238,13 +237,13 @@ def run_sample(
     """Measure the leaves of one sample and run it through a program, as `run_samples` does.
 
     Args:
-        whole, real, sample, end, leaves: as `measure_sample` takes them.
-        numbers: (N, 4), receives value, now, lower and upper of each node.
-        channels: in how many the leaves are; 0 if they are not measured yet.
-        run_channels: in how many the state is. In fewer than the leaves, nothing is run.
+        whole, real, sample, end, leaves: arguments of `measure_sample`.
+        numbers: (N, 4), output: value, now, lower and upper of each node.
+        channels: number of channels of the leaves; 0 if they are not measured yet.
+        run_channels: number of channels of the state. If it is less than that of the leaves, nothing runs.
 
     Returns:
-        In how many channels the leaves are.
+        the number of channels of the leaves.
     """
     if channels == 0:
         channels = measure_sample(whole, real, sample, end, leaves)
@@ -269,7 +268,7 @@ def run_sample(
 
 
 class _OpenPart:
-    """State of `run_windows` between samples, for one part in one channel."""
+    """State of one part with windows in one channel, for `run_windows`."""
 
     def __init__(self, rows: Integers, room: int) -> None:
         nodes, part, timed = len(rows) - 1, rows[-1], int(rows[:-1, codes.NODE_TIMED].max()) + 1
@@ -283,7 +282,7 @@ class _OpenPart:
         self.state[windows.STATE, :nodes] = -1
 
     def copy(self, room: int) -> _OpenPart:
-        """Return a part of the same state, with columns that are not known yet."""
+        """Return a copy of the state; its columns have to be computed again."""
         part = _OpenPart(self.rows, room)
         part.tables[:] = self.tables
         part.state[windows.HEAD, : windows.ENTERED] = self.state[windows.HEAD, : windows.ENTERED]
@@ -293,7 +292,7 @@ class _OpenPart:
         return part
 
     def forget(self, drop_count: int) -> None:
-        """Have positions count from a later sample."""
+        """Drop the oldest samples: positions count from a later sample."""
         head = self.state[windows.HEAD]
         head[windows.OFFSET] += drop_count
         head[windows.BASE] -= drop_count
@@ -306,7 +305,7 @@ class _OpenPart:
 
     @property
     def kept_from(self) -> int | None:
-        """The first position that it may still look at; None if there is none."""
+        """The first position that it may still read; None if there is none."""
         is_begun, last = (
             self.state[windows.HEAD, windows.IS_BEGUN],
             (1 << self.rows[-1, codes.PART_VARIABLES]) - 1,
@@ -319,20 +318,20 @@ class _OpenPart:
 
 
 class OnlineRun:
-    """The state that a compiled formula carries from sample to sample.
+    """The state of a compiled formula between samples.
 
-    Its size depends on the formula and on how many samples its windows span, not on the length of the stream.
+    Its size depends on the formula and on the samples in its windows, not on the length of the stream.
 
     Attributes:
-        room: for how many recent samples there is room.
+        room: capacity, recent samples.
     """
 
     def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
         """Start before the first sample.
 
         Args:
-            room: the number of recent samples there is room for at first (it doubles when needed).
-            tile: how many samples are run together, at most.
+            room: initial capacity, recent samples; it doubles when needed.
+            tile: limit on samples that run together.
         """
         self._program, self._tile = program, tile
         self.room = room = max(room, tile) if program.keeps_history else tile
@@ -354,14 +353,14 @@ class OnlineRun:
         self._begin()
 
     def restart(self) -> None:
-        """Forget all samples; the room stays."""
+        """Drop all samples; the capacity stays."""
         for state in (self._history, self._times, self._memory):
             state.fill(0)
         self._begin()
 
     def _begin(self) -> None:
         self._channels, self._position, self._offset, self._start_ns = 1, 0, 0, 0
-        self._newest = 0  # where the numbers of the newest sample stand
+        self._newest = 0  # place of the newest sample's numbers
         self._open = [
             (number, [_OpenPart(rows, self.room)])
             for number, rows in enumerate(self._program.part_rows)
@@ -370,7 +369,7 @@ class OnlineRun:
         self._refresh_views()
 
     def __len__(self) -> int:
-        """Return how many samples were added."""
+        """Return the number of added samples."""
         return self._position
 
     @property
@@ -384,16 +383,16 @@ class OnlineRun:
         """Add samples.
 
         Args:
-            leaves: (C, A, T), the program's leaves. C = 1: exact values. C = 2: the ends of the interval with
+            leaves: (C, A, T), leaves of the program. C = 1: exact values. C = 2: the interval's ends with
                 unknown values. C = 4: also the same ends with uncertainty.
             times_ns: (T,), increasing and after the previous samples.
-            empty: gives memory for what is returned.
+            empty: allocator of the result.
 
         Returns:
             (N, 4, T): value, now, lower and upper of each node.
 
         Raises:
-            ValueError: the shapes do not fit; kernels would read beyond the arrays.
+            ValueError: the shapes do not match; kernels would read beyond the arrays.
         """
         shape = len(self._program.leaves), len(times_ns)
         if leaves.shape[1:] != shape or len(leaves) not in (1, 2, 4):
@@ -410,7 +409,7 @@ class OnlineRun:
         return series
 
     def widen(self, channels: int) -> None:
-        """Have at least so many channels: each begins as the one that it was equal to."""
+        """Extend the state to `channels`; each new channel starts as a copy of its equal."""
         if channels <= self._channels:
             return
         old_channels, self._channels = self._channels, channels
@@ -428,8 +427,8 @@ class OnlineRun:
         """Add one sample; return value, now, lower and upper of each node, (N, 4).
 
         Args:
-            room: the sample; its leaves are measured if need be, and those of the program begin at
-                `first_leaf`.
+            room: the sample; its leaves are measured if needed.
+            first_leaf: index of the program's first leaf.
         """
         program, position = self._program, self._position
         if not program.keeps_history:
@@ -458,10 +457,10 @@ class OnlineRun:
         return numbers
 
     def _add(self, leaves: Floats, times_ns: Integers, t: int, count: int) -> None:
-        """Add samples for which there is room, of leaves in as many channels as the run has.
+        """Add samples within the capacity; the leaves have as many channels as the run.
 
         Args:
-            times_ns: of the samples; their leaves stand from `t` on.
+            times_ns: times of the samples; their leaves begin at `t`.
         """
         if not self._program.keeps_history:
             self._offset = self._position
@@ -505,7 +504,7 @@ class OnlineRun:
             rows[4 + is_high], rows[6 + is_high] = results[2 + is_high], results[0]
 
     def _refresh_views(self) -> None:
-        """Take views of the recent samples, and all arrays that `run_sample` takes."""
+        """Renew the views of the recent samples, and the arrays for `run_sample`."""
         self._stamps = self._times[0, : self.room]
         self._arrays = self._program.rows, self._history, self._times, self._memory, self._work
         self._channel_history = [self._history[channel] for channel in range(CHANNELS)]
@@ -515,7 +514,7 @@ class OnlineRun:
         return self._times[1:].reshape(-1, CHANNELS, self._times.shape[1])
 
     def _make_room(self, requested: int) -> int:
-        """Make room for at least one of the wanted samples; return for how many."""
+        """Make room for at least one of the requested samples; return the number that fits."""
         if not self._program.keeps_history:
             return min(requested, self.room)
         used = self._position - self._offset
@@ -529,7 +528,7 @@ class OnlineRun:
         return min(requested, self.room - used)
 
     def _kept_from(self) -> int:
-        """Return the first of the recent samples that anything may still look at after the newest one."""
+        """Return the first of the recent samples that may still be read after the newest one."""
         last = self._position - self._offset - 1
         first_needed, stamps = last, self._stamps[: last + 1]
         for code, _, _, unit, low, high, *_ in self._program.signals.tolist():
@@ -548,7 +547,7 @@ class OnlineRun:
         return max(first_needed, 0)
 
     def _forget(self, drop_count: int, keep_count: int) -> None:
-        """Drop the oldest samples, which nothing looks at again."""
+        """Drop the oldest samples, which are not read again."""
         self._stamps[:keep_count] = self._stamps[drop_count : drop_count + keep_count].copy()
         signals = np.flatnonzero(self._program.signals[:, codes.SIGNAL_IS_KEPT])
         for signal in signals.tolist():
@@ -560,7 +559,7 @@ class OnlineRun:
         self._offset += drop_count
 
     def _grow(self) -> None:
-        """Have room for twice as many recent samples."""
+        """Double the capacity."""
         old_room, self.room = self.room, 2 * self.room
         history = np.zeros((*self._history.shape[:2], self.room))
         history[: self._channels, :, :old_room] = self._history[: self._channels]

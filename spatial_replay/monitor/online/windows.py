@@ -1,18 +1,16 @@
 """Windows below unbounded operators: the nodes of a part at every position that is still open.
 
-A part runs in one channel at a time. Each of its nodes is a row of numbers, its *column*, one number for each
-recent sample. A sample changes a column only where a window opens or closes with it, or where an operand has
-changed. Columns are updated operands first, and each says between which positions it
-has changed.
+A part runs in one channel at a time. Each of its nodes has a row of numbers, its *column*, with one number
+for each recent sample. A sample changes a column only where a window opens or closes with it, or where an
+operand has changed. Columns are updated operands first, and each records the positions that have changed.
 
-Positions of the root whose windows have all closed are absorbed into a table (see `signals`). It belongs to
-the *base*, the first position of the root that is not absorbed. It gives the root's value at the first sample
-as a function of each variable's value at the end of the table, its *boundary*. A past operator over one that
-looks ahead has a table of its own, which says what it is at one position, its *state*.
+Positions of the root whose windows have all closed are absorbed into a table (see `signals`). The *base* is
+the first position of the root that is not absorbed. The table gives the root's value at the first sample, as
+a function of each variable's value at the end of the table, its *boundary*. A past operator over an operator
+that looks ahead has its own table, with its value at one position, its *state*.
 
-Columns exist in up to three sets: for a run that ends with the newest sample, and with the lowest and highest
-values that later samples can give. Positions are places among the recent samples; `last` is the newest of
-them.
+Columns exist in up to three sets: for a run that ends with the newest sample, and for the lowest and the
+highest values of later samples. Positions are indices of the recent samples; `last` is the newest one.
 """
 
 from __future__ import annotations
@@ -25,34 +23,34 @@ from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.signals import read_table
 
 CLOSING = 16
-"""So many samples together are looked at for positions that have closed."""
+"""Number of samples between two searches for closed positions."""
 BLOCK = 64
-"""So many numbers of what the root joins are joined together, and again only if one has changed."""
+"""Number of positions in a block of the root's operand; a block is joined again only after a change."""
 STRIDE = 16
-"""So many numbers are filled with one at a time."""
+"""Number of positions that are filled with one number at a time."""
 _NEVER = 1 << 62
 
 SETS = 3
-"""`OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`; the columns of a corner of the table come after those."""
+"""Sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. Columns of a table's corner follow."""
 SEEN = SETS + 1
-"""Sets of columns before the copies that windows keep of their operands' columns."""
+"""Sets of columns before the copies of operands' columns for windows."""
 EXTRA = SEEN + SETS
 """Sets of columns before the extra rows."""
-# rows of columns after those of the nodes: joined blocks, room for `_slide`, and the results of a part
+# rows after the columns of the nodes: joined blocks, work space of `_slide`, and the results of a part
 JOINED, BEFORE, RESULTS = 0, SETS, SETS + 1
 RESULT_NOW = 1
-"""The row of a part's value at the newest sample, after its value at the first one and before its bounds."""
+"""Result row of a part's value at the newest sample; the value at the first sample is row 0."""
 EXTRA_ROWS = SETS + 5
 
-# rows of the state: the first holds single numbers, the others one number for each node. The newest sample
-# changed its own position, and those from CHANGED to before CHANGED_END (newest sample and 0: no others)
+# rows of the state: HEAD has single numbers, the others one number for each node. The newest sample changed
+# its own position, and positions from CHANGED to before CHANGED_END (newest sample and 0: no others)
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
-STARTS = 9  # then two rows a window in seconds: its first position, and the one after its last
-# columns of the first row: forgotten samples, the base, whether anything is absorbed, and the samples that
-# are entered into windows in seconds
+STARTS = 9  # then two rows per window in seconds: its first position, and its last position plus one
+# columns of HEAD: number of dropped samples, the base, whether any position is absorbed, and the number of
+# samples entered into windows in seconds
 OFFSET, BASE, IS_BEGUN, ENTERED = range(4)
-KNOWN = 4  # for each set, the newest sample that its columns include
-NEXT = KNOWN + SETS  # of each window in seconds, the next positions to begin and to close
+KNOWN = 4  # for each set, the newest sample in its columns
+NEXT = KNOWN + SETS  # for each window in seconds, the next positions whose windows begin and close
 
 
 @inlined
@@ -70,7 +68,7 @@ def _outdoes(is_greatest: bool, value: float, rival: float) -> bool:
 
 @inlined
 def beyond(mode: int, weak: int) -> float:
-    """Return the value an operator that is still open takes from beyond the last sample."""
+    """Return the value of an open operator beyond the last sample."""
     if mode == codes.OPEN_END:
         return np.inf if weak else -np.inf
     return np.inf if mode == codes.OPEN_HIGH else -np.inf
@@ -78,13 +76,13 @@ def beyond(mode: int, weak: int) -> float:
 
 @inlined
 def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int, start: float) -> float:
-    """Return the greatest or least of some numbers of a row and `start`.
+    """Return the greatest or least of `start` and the numbers of a row from `begin` to before `end`.
 
-    Eight are joined side by side: one after the other, each would wait for the one before.
+    Eight chains run side by side; in a single chain, each step would wait for the previous one.
     """
     sign = 1.0 if is_greatest else -1.0
     v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = sign * start
-    # numba wraps negative indices around; where it knows that there are none, the loop is vectorised
+    # the loop is vectorised only if numba knows that no index is negative, because it wraps those around
     k = max(begin, 0)
     while k + 8 <= end:
         v0, v1 = max(v0, sign * columns[row, k]), max(v1, sign * columns[row, k + 1])
@@ -103,7 +101,7 @@ def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int,
 
 @inlined
 def window_of(rows: Integers, d: int) -> tuple[bool, int, int, int, int]:
-    """Return whether a node looks ahead, its unit and its ends, and the row of its times."""
+    """Return whether a node looks ahead, the unit and ends of its window, and the row of its times."""
     is_ahead = codes.PART_WINDOW_MAX <= rows[d, codes.NODE_CODE] <= codes.SHIFT
     times = STARTS + 2 * rows[d, codes.NODE_TIMED]
     return is_ahead, rows[d, codes.NODE_UNIT], rows[d, codes.NODE_LOW], rows[d, codes.NODE_HIGH], times
@@ -111,7 +109,7 @@ def window_of(rows: Integers, d: int) -> tuple[bool, int, int, int, int]:
 
 @inlined
 def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the first position that a window holds, that after the last sample if it is still to come."""
+    """Return the first position in a window; last + 1 if the window has not begun."""
     is_ahead, unit, near, far, times = window
     if unit != codes.SAMPLES:
         return int(min(state[times, position], last + 1))
@@ -120,7 +118,7 @@ def _start(state: Integers, window: tuple[bool, int, int, int, int], position: i
 
 @inlined
 def _after(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the position that comes after a window, at most that after the last sample."""
+    """Return the last position in a window plus one, at most last + 1."""
     is_ahead, unit, near, far, times = window
     if unit != codes.SAMPLES:
         return int(min(state[times + 1, position], last + 1))
@@ -129,7 +127,7 @@ def _after(state: Integers, window: tuple[bool, int, int, int, int], position: i
 
 @inlined
 def _first_holding(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the first position whose window does not end before another one."""
+    """Return the first position whose window ends at `position` or later."""
     is_ahead, unit, near, far, times = window
     if unit == codes.SAMPLES:
         return max(position - far, 0) if is_ahead else position + near
@@ -147,7 +145,7 @@ def _first_holding(state: Integers, window: tuple[bool, int, int, int, int], pos
 def _first_starting(
     state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int
 ) -> int:
-    """Return the first position whose window ahead starts at another one, or after it."""
+    """Return the first position whose window ahead starts at `position` or later."""
     _, unit, near, _, times = window
     if unit == codes.SAMPLES:
         return max(position - near, 0)
@@ -163,7 +161,7 @@ def _first_starting(
 
 @inlined
 def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last: int) -> int:
-    """Return the first position whose window ahead a later sample may fall into."""
+    """Return the first position whose window ahead may get a later sample."""
     _, unit, _, far, times = window
     if unit == codes.SAMPLES:
         return max(last - far + 1, 0)
@@ -173,7 +171,7 @@ def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int,
 
 @inlined
 def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None:
-    """Note which windows in seconds begin with the newest samples, and which have ended before them."""
+    """Record the windows in seconds that begin with the newest samples, or have ended before them."""
     for d in range(len(rows) - 1):
         if rows[d, codes.NODE_TIMED] < 0:
             continue
@@ -207,10 +205,13 @@ def _slide(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
     child: int, column: int, scratch: int, begin: int, end: int, last: int,
 ) -> int:  # fmt: skip
-    """Compute extrema over windows at begin … end - 1; return the first that changes, last + 1 for none.
+    """Compute extrema over the windows of positions begin … end - 1.
 
-    Their common positions are scanned once, then the positions before them for the first windows, and those
-    after them for the last ones.
+    The common positions of several windows are scanned once. Positions before them are scanned backwards for
+    the first windows, and positions after them forwards for the last windows.
+
+    Returns:
+        the first position whose number changes; last + 1 for none.
     """
     nothing, changed = -np.inf if is_greatest else np.inf, last + 1
     while begin < end:
@@ -247,9 +248,12 @@ def _run_open(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
     child: int, column: int, begin: int, changed: int, last: int, is_fresh: bool,
 ) -> int:  # fmt: skip
-    """Bring windows up that reach to the last sample, backwards as far as they change; return the first.
+    """Update the windows that reach to the last sample, backwards until one does not change.
 
-    The later one of these begins, the less it holds.
+    Later windows are parts of earlier ones, so no earlier window changes either.
+
+    Returns:
+        the first position whose number changes.
     """
     value, is_same = -np.inf if is_greatest else np.inf, False
     for position in range(begin if is_fresh else last, last + 1):
@@ -260,7 +264,7 @@ def _run_open(
         stop = max(position - STRIDE, begin)
         first = _start(state, window, stop, last)
         if at <= last and extremum(is_greatest, columns, child, first, at, value) == value:
-            # none of these numbers exceeds the extremum, so all these windows have it
+            # no number of these windows exceeds the extremum, so it is theirs, too
             start = _start(state, window, position - 1, last)
             is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
             for k in range(position if is_same else stop, position):
@@ -283,10 +287,10 @@ def _changing_windows(
     is_greatest: bool, columns: Floats, child: int, column: int, seen: int, changed: int, changed_end: int,
     begin: int, end: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Leave windows out that hold something better than all that has changed, before and after it did.
+    """Skip windows with a better number than all changed numbers, old and new.
 
     Returns:
-        The first of the windows at begin … end - 1 that may change, and what comes after the last one.
+        the bounds of the windows among begin … end - 1 that may change: first, last plus one.
     """
     nothing = -np.inf if is_greatest else np.inf
     if changed >= changed_end:
@@ -315,13 +319,13 @@ def _run_window(
     rows: Integers, d: int, stamps: Integers, state: Integers, columns: Floats, mode: int, last: int,
     is_fresh: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Bring the column of a bounded operator up; return between which positions it changes."""
+    """Update the column of a bounded operator; return the bounds of the changed positions."""
     code, window, lowest, nodes = rows[d, codes.NODE_CODE], window_of(rows, d), state[LOWS, d], len(rows) - 1
     child, column = mode * nodes + rows[d, codes.NODE_A], mode * nodes + d
     changed, changed_end = state[CHANGED, rows[d, codes.NODE_A]], state[CHANGED_END, rows[d, codes.NODE_A]]
     seen, is_ahead = SEEN * nodes + column, window[0]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-    # whether the bound of an open window is infinite, whatever the window holds so far
+    # whether the bound of an open window is infinite, regardless of its numbers so far
     is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
     tail = last + 1
     if is_decided:
@@ -364,7 +368,7 @@ def _run_since(
     strong: bool, has_left: bool, columns: Floats, left: int, right: int, column: int, value: float,
     begin: int, last: int,
 ) -> int:  # fmt: skip
-    """Run a since or trigger forwards from a value before `begin`; return the first position that changes."""
+    """Run a since or trigger forwards from the value before `begin`; return the first changed position."""
     changes, is_same = begin, True
     for k in range(begin, last + 1):
         if has_left:
@@ -378,7 +382,7 @@ def _run_since(
 
 @inlined
 def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> float:
-    """Return the value that a since or trigger starts from, by its table, which ends at its state."""
+    """Return the start value of a since or trigger: its value at its state, from its table."""
     value, part = beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK]), len(rows) - 1
     if state[STATE, d] >= 0:
         variables, point = rows[part, codes.PART_VARIABLES], 2 * rows[part, codes.PART_TABLES]
@@ -390,7 +394,7 @@ def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> f
 def _set_point(
     rows: Integers, d: int, state: Integers, columns: Floats, row: int, mode: int, last: int, tables: Floats
 ) -> None:
-    """Enter into the point what the variable of a node is where the part's table ends."""
+    """Set the point's coordinate of a node's variable to its value at the boundary."""
     boundary = state[BOUNDARY, d]
     value = columns[row, boundary] if boundary <= last else beyond(mode, rows[d, codes.NODE_WEAK])
     tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[d, codes.NODE_VARIABLE]] = value
@@ -398,7 +402,7 @@ def _set_point(
 
 @inlined
 def has_column(rows: Integers) -> bool:
-    """Return whether the root has a column. One that joins all its operand from the base on needs none."""
+    """Return whether the root has a column; a root that joins all positions from the base on needs none."""
     root = len(rows) - 2
     return bool(rows[root, codes.NODE_A] >= 0 or rows[root, codes.NODE_VARIABLE] < 0)
 
@@ -408,7 +412,7 @@ def _bring_up(
     rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
     mode: int, last: int, is_fresh: bool,
 ) -> None:  # fmt: skip
-    """Bring the columns of one set up to the last sample: by that one alone, or all of them."""
+    """Update the columns of one set to the last sample; compute them anew if `is_fresh`."""
     nodes, first = len(rows) - 1, mode * (len(rows) - 1)
     for d in range(nodes if has_column(rows) else nodes - 1):
         code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
@@ -460,7 +464,7 @@ def _bring_up(
             value, begin = _start_of_past(rows, d, state, tables), min(state[CHANGED, b], last)
             if a >= 0:
                 begin = min(begin, state[CHANGED, a])
-            # the start value is read from a table: it depends on later samples if the operands do
+            # the start value comes from a table, so it may depend on later samples
             if start >= 0 and (is_fresh or columns[column, start] != value):
                 columns[column, start], begin = value, start
             begin = start + 1 if is_fresh else max(begin, start + 1)
@@ -505,7 +509,7 @@ def _bring_up(
 def _join_blocks(
     is_until: bool, columns: Floats, body: int, joined: int, value: float, begin: int, end: int
 ) -> float:
-    """Join a number with those at begin … end - 1, most of which are joined in blocks."""
+    """Join a number with the numbers at begin … end - 1, by whole blocks where possible."""
     first_block, block_end = begin // BLOCK + 1, end // BLOCK
     blocks_begin = min(first_block * BLOCK, end)
     value = extremum(is_until, columns, body, begin, blocks_begin, value)
@@ -517,7 +521,7 @@ def _join_blocks(
 def _at_first(
     rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, last: int
 ) -> float:
-    """Return what the root is at the first sample, by the columns of a set."""
+    """Return the root's value at the first sample, from the columns of a set."""
     nodes, base = len(rows) - 1, state[HEAD, BASE]
     first, root = mode * nodes, nodes - 1
     value = beyond(mode, rows[root, codes.NODE_WEAK])
@@ -550,14 +554,14 @@ def run_windows(
     """Run a part over the recent samples begin … begin + count - 1, in one channel.
 
     Args:
-        rows: (D + 1, NODE_WIDTH), the part's nodes, and the part itself.
-        history: (S, room), the signals in the channel.
-        stamps: (room,), the times of the recent samples.
-        columns: (EXTRA * D + EXTRA_ROWS, room); the last four rows receive the results of the part.
-        state: see `HEAD`.
-        tables: (2 T + 2, …): the part's table and those of its past operators, room for the next ones, a
-            point at which tables are read, and what past operators start from.
-        bounds: 1 to compute the lower bound, 2 for the upper one, 3 for both.
+        rows: (D + 1, NODE_WIDTH), nodes of the part, then the part itself.
+        history: (S, room), signals in the channel.
+        stamps: (room,), times of the recent samples.
+        columns: (EXTRA * D + EXTRA_ROWS, room); the last four rows are output, the results of the part.
+        state: state of the part (see `HEAD`).
+        tables: (2 T + 2, …), tables of the part and of its past operators, space for the next tables, a
+            point at which tables are read, and start values of past operators.
+        bounds: 1 to compute the lower bound, 2 for the upper bound, 3 for both.
     """
     nodes = len(rows) - 1
     root, first_result = nodes - 1, EXTRA * nodes + RESULTS
@@ -606,10 +610,13 @@ def run_windows(
 def _reach(
     rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last: int
 ) -> bool:
-    """Find which positions of the nodes matter for the root at root_low … root_high.
+    """Find the positions of each node that the root needs at root_low … root_high.
 
-    Returns whether every window that they look through has closed. `PLAIN` holds the lower ends before they
-    are widened to where the tables end.
+    `LOW` and `HIGH` receive them. `PLAIN` receives the lower ends before they are widened to the ends of the
+    tables.
+
+    Returns:
+        whether all windows on the way have closed.
     """
     nodes, is_closed = len(rows) - 1, True
     for d in range(nodes):
@@ -621,7 +628,7 @@ def _reach(
         if rows[d, codes.NODE_VARIABLE] >= 0 and state[HEAD, IS_BEGUN]:
             state[LOW, d] = min(state[LOW, d], state[BOUNDARY, d])
         if rows[d, codes.NODE_TABLE] >= 0:
-            # the column also holds the value that the operator starts from
+            # the column also has the start value of the operator
             state[LOW, d] = min(state[LOW, d], max(state[STATE, d], 0))
         low, high = state[LOW, d], state[HIGH, d]
         if code == codes.LITERAL:
@@ -651,7 +658,7 @@ def _reach(
 
 @piece
 def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> None:
-    """Enter the first position of each node that still matters."""
+    """Store the first position of each node that is still needed."""
     _reach(rows, state, stamps, min(state[HEAD, BASE], last), last, last)
     for d in range(len(rows) - 1):
         state[LOWS, d] = state[LOW, d]
@@ -661,7 +668,7 @@ def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> N
 def _run_corner(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, corner: int, last: int
 ) -> None:
-    """Run what depends on a variable or a table, at `LOW` … `HIGH`, at one corner of the table."""
+    """Compute the nodes that depend on a variable or a table, at `LOW` … `HIGH`, for one corner."""
     nodes = len(rows) - 1
     point, corner_columns = 2 * rows[nodes, codes.PART_TABLES], SETS * nodes
     for d in range(nodes):
@@ -710,7 +717,7 @@ def _run_corner(
 def _renew_tables(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
-    """Renew the tables of a part after adding positions from its base on."""
+    """Compute the tables of a part anew, with more positions from its base on."""
     nodes = len(rows) - 1
     count, variables = rows[nodes, codes.PART_TABLES], rows[nodes, codes.PART_VARIABLES]
     for corner in range(1 << variables):
@@ -735,10 +742,10 @@ def _renew_tables(
 
 @inlined
 def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floats, last: int) -> None:
-    """Move the base over positions whose windows are open, but which cannot change the table any more.
+    """Move the base over positions with open windows that cannot change the root any more.
 
-    `G x` is never more than its table says, so that x matters no more where it is at least that, if it cannot
-    fall.
+    The table bounds `G x` from above. A position does not matter once x is at least this bound, because x
+    never falls there.
     """
     root, base = len(rows) - 2, state[HEAD, BASE]
     is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, rows[root, codes.NODE_B]
@@ -752,8 +759,8 @@ def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floa
 def _absorb(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
-    """Move the base over every position whose windows have all closed, many at a time."""
-    # the largest closed run first: a table is renewed once for many positions
+    """Move the base over all positions whose windows have all closed."""
+    # large runs first: the tables are then computed once for many positions
     size, old_base = CLOSING, state[HEAD, BASE]
     while size > 0:
         base = state[HEAD, BASE]
