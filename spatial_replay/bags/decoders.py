@@ -1,4 +1,4 @@
-"""Topics of a log, and decoders of their payloads by their encoding."""
+"""Topics of a log, and decoders of their messages by encoding."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from spatial_replay.bags.ros_decoders import failure_text, ros_decoder, ros_defi
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Channel, Schema
 
+# early releases of ROS 2 write the number of a policy, later ones its name
 _LATCHED = re.compile(r"durability: *(1|transient_local)\b")
 
 
@@ -37,14 +38,14 @@ class Topic:
     """A topic of a log, of one type and encoding.
 
     Attributes:
-        type: as rosbags names ROS types (`turtlesim/msg/Pose`), else the schema's name
-            (`foxglove.SceneUpdate`); empty where the log does not say.
-        encoding: of the messages: ros1, cdr, protobuf, json.
-        count: how many messages the log declares, or None.
-        schema: the definition as the log has it, or None.
-        latched: whether its last message before a window still counts (latched, transient local).
-        unreadable: why its messages cannot be decoded, or None.
-        metadata: of its channel, as an MCAP log has it.
+        type: full ROS type (`turtlesim/msg/Pose`), or name of the schema (`foxglove.SceneUpdate`); "" if the
+            log does not say.
+        encoding: encoding of the messages: ros1, cdr, protobuf or json.
+        count: number of messages that the log declares, or None.
+        schema: definition in the log, or None.
+        latched: whether the last message before a window is valid in the window (latched, transient local).
+        unreadable: reason why its messages cannot be decoded, or None.
+        metadata: metadata of its channel, as in an MCAP log.
     """
 
     name: str
@@ -63,10 +64,10 @@ def is_latched(qos: str) -> bool:
 
 
 _MOST_FILES = 1_000
-"""Files that one descriptor set may hold."""
+"""Most files in a descriptor set."""
 
 _WELL_KNOWN = (any_pb2, duration_pb2, empty_pb2, field_mask_pb2, struct_pb2, timestamp_pb2, wrappers_pb2)
-"""None of these imports another."""
+"""Modules of well-known types, which do not import each other."""
 
 ENCODINGS = ("ros1", "cdr", "protobuf", "json")
 
@@ -75,10 +76,10 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
     """Return a decoder for the messages of a topic.
 
     Args:
-        distribution: the release of ROS that the log names, for types that it does not define.
+        distribution: ROS release that the log names, for types that it does not define.
 
     Raises:
-        LogError: the definition is missing or cannot be understood, or the encoding is not known.
+        LogError: the definition is missing or invalid, or the encoding is unknown.
     """
     try:
         match topic.encoding:
@@ -94,7 +95,7 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
 
 
 def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
-    """Return why the messages of a topic cannot be decoded, or None."""
+    """Return the reason why the messages of a topic cannot be decoded, or None."""
     start = f"topic {topic.name!r}: "
     try:
         if topic.encoding in ("ros1", "cdr"):
@@ -108,7 +109,7 @@ def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
 
 
 def same_definition(first: Topic, second: Topic) -> bool:
-    """Return whether one decoder serves two topics of the same type; texts may differ in comments."""
+    """Return whether two topics of one type have equal definitions, except for comments."""
     if first.schema == second.schema or first.encoding == "json":
         return True
     if first.encoding not in ("ros1", "cdr"):
@@ -142,7 +143,7 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
         for file in _in_order(_add_well_known_types(FileDescriptorSet.FromString(schema.data))):
             pool.AddSerializedFile(file.SerializeToString())
         return GetMessageClass(pool.FindMessageTypeByName(type_name))
-    # descriptors that contradict themselves or each other end in TypeError, and names without one in KeyError
+    # contradictory descriptors raise TypeError, and unknown names KeyError
     except (DecodeError, TypeError, ValueError, KeyError, UnicodeError, RecursionError) as error:
         raise LogError(
             f"the definition of {type_name!r:.100} cannot be used: {failure_text(error)}"
@@ -150,7 +151,7 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
 
 
 def _add_well_known_types(described: FileDescriptorSet) -> FileDescriptorSet:
-    """Add the files of well-known types, such as timestamps, that a set imports without having them."""
+    """Add the files of well-known types, such as timestamps, that a set imports but does not contain."""
     file_names = {file.name for file in described.file}
     imported = {name for file in described.file for name in file.dependency} - file_names
     for module in _WELL_KNOWN:
@@ -160,7 +161,7 @@ def _add_well_known_types(described: FileDescriptorSet) -> FileDescriptorSet:
 
 
 def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
-    """Return the files, each after those that it imports."""
+    """Return the files in an order in which each follows its imports, as the descriptor pool requires."""
     if len(described.file) > _MOST_FILES:
         raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
     files = {file.name: file for file in described.file}
@@ -181,10 +182,10 @@ def _decode_json(payload: bytes) -> object:
 
 
 def topics_by_name(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:
-    """Return one topic for each name, in order; those that cannot be decoded say why.
+    """Return one topic for each name, sorted by name, with `unreadable` set.
 
     Args:
-        distribution: the release of ROS that the log names.
+        distribution: ROS release that the log names.
     """
     named: dict[str, Topic] = {}
     for topic in described:
@@ -197,7 +198,7 @@ def topics_by_name(described: Iterable[Topic], distribution: str | None = None) 
 
 
 def topic_of(channel: Channel, count: int | None = None) -> Topic:
-    """Return the topic of a channel, of whose messages a log declares so many."""
+    """Return the topic of a channel; `count` is the declared number of messages."""
     schema = channel.schema
     is_ros = channel.encoding in ("ros1", "cdr")
     name = schema.name if schema else ""
@@ -214,10 +215,10 @@ def topic_of(channel: Channel, count: int | None = None) -> Topic:
 
 
 def channel_of(topic: Topic, distribution: str | None = None) -> Channel:
-    """Return the channel on which a copy of a log has the messages of a topic, as they are.
+    """Return the channel of a topic in a copy of the log, where messages are unchanged.
 
     Args:
-        distribution: the release of ROS that the log names, for types that it does not define.
+        distribution: ROS release that the log names, for types that it does not define.
     """
     schema = topic.schema
     if topic.encoding in ("ros1", "cdr") and (schema is None or not schema.data.strip()):

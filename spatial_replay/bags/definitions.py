@@ -1,6 +1,6 @@
-"""Definitions of message types: texts in MSG form in, fields with bounded sizes out.
+"""Parse definitions of message types in MSG form to fields with bounded sizes.
 
-A definition comes with the log and is not trusted: it gets through only if names are plain identifiers,
+A definition comes with the log and is not trusted. It is accepted only if names are plain identifiers,
 references resolve without a cycle, and sizes are bounded.
 """
 
@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 from spatial_replay.errors import LogError
 
 Decoder = Callable[[bytes], object]
-"""A payload to an object with fields: attributes of ROS and protobuf messages, keys of a JSON object."""
+"""Function from a payload to a message with fields: attributes in ROS and protobuf, keys in JSON."""
 
 
 Kind: TypeAlias = Literal["scalar", "array", "sequence"]
@@ -23,9 +23,9 @@ LONGEST_TEXT = 2**18
 MOST_TYPES = 1_000
 MOST_FIELDS = 4_000
 MOST_VALUES = 4_000
-"""Values in one message that its definition alone, not its bytes, asks for: each becomes lines of code."""
+"""Most values that a definition requires in every message; each value becomes lines of generated code."""
 MOST_VALUES_IN_ALL = 12_000
-"""The same, over a type and all those that it uses."""
+"""Most values of a type and of all types that it uses."""
 
 BASE_BYTES: Mapping[str, int] = {
     **dict.fromkeys(("bool", "byte", "char", "octet", "int8", "uint8"), 1),
@@ -33,7 +33,7 @@ BASE_BYTES: Mapping[str, int] = {
     **dict.fromkeys(("int32", "uint32", "float32", "string"), 4),
     **dict.fromkeys(("int64", "uint64", "float64"), 8),
 }
-"""The least number of bytes that a value takes; a string has at least its length."""
+"""Least size of a value by base type, bytes; a string has at least its length field."""
 _NOT_READ = frozenset({"wstring", "wchar", "char16", "float128"})
 """Base types of ROS that are not read."""
 
@@ -55,9 +55,9 @@ class Field:
     """A field of a message type.
 
     Attributes:
-        type: a base type, or the full name of a message type.
-        size: of an array; the bound of a sequence, 0 for none.
-        longest: bound of a string's length, 0 for none.
+        type: base type, or full name of a message type.
+        size: length of an array, or bound of a sequence; 0 for no bound.
+        longest: bound of a string's length; 0 for no bound.
     """
 
     name: str
@@ -78,12 +78,12 @@ def full_type_name(name: str) -> str:
 
 
 def definitions_from_msg(text: str, type_name: str) -> Definitions:
-    """Parse the types in a .msg text: its own, and those that it uses, after lines of equals signs.
+    """Parse the types in a .msg text: its own type, and used types after lines of equals signs.
 
-    Constants and default values are left out: no message depends on them.
+    Constants and default values are ignored, because messages do not depend on them.
 
     Raises:
-        LogError: a line that is not a field, a malformed name.
+        LogError: a line is not a field, or a name is malformed.
     """
     sections = list(iter_sections(text, type_name))
     section_names = {name for name, _ in sections}
@@ -110,10 +110,10 @@ def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
 
 
 def checked_type_name(name: str) -> str:
-    """Return the name, if it is one that a message type may have.
+    """Return a valid name of a message type unchanged.
 
     Raises:
-        LogError: it is not.
+        LogError: the name is invalid.
     """
     if len(name) > 256 or not _TYPE_NAME.fullmatch(name):
         raise LogError(f"{name!r:.100} is not a name of a message type, such as geometry_msgs/msg/Pose")
@@ -122,7 +122,7 @@ def checked_type_name(name: str) -> str:
 
 def _iter_fields(body: str, owner: str, type_names: set[str]) -> Iterator[Field]:
     for number, line in enumerate(body.splitlines(), 1):
-        # an annotation may stand on the line of its field; no encoding of ROS depends on it so far
+        # an annotation may be on the line of its field; no encoding of ROS depends on annotations
         bare = _ANNOTATIONS.sub("", line.partition("#")[0])
         if not bare.strip():
             continue
@@ -151,13 +151,13 @@ def _resolve(name: str, owner: str, type_names: set[str]) -> str:
 
 
 def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: int) -> Definitions:
-    """Return the type and those that it uses, if it is safe to generate decoders from them.
+    """Return a type and the types that it uses, after checking that generating decoders is safe.
 
     Args:
-        empty_bytes: what a message without fields takes: 0 in ROS 1, 1 in ROS 2.
+        empty_bytes: size of a message without fields, bytes: 0 in ROS 1, 1 in ROS 2.
 
     Raises:
-        LogError: a type that is missing, contains itself, or asks for too much; a name that is none.
+        LogError: a type is missing, contains itself or is too large, or a name is invalid.
     """
     walk = _Walk(definitions, empty_bytes)
     walk.measure(type_name, ())
@@ -165,7 +165,7 @@ def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: 
 
 
 class _Walk:
-    """Visits each type that is used; knows how many values it asks for, and how few bytes they may take."""
+    """Visits all used types, and measures their numbers of values and least sizes."""
 
     def __init__(self, definitions: Definitions, empty_bytes: int) -> None:
         self._definitions = definitions
@@ -175,7 +175,7 @@ class _Walk:
         self.used: dict[str, tuple[Field, ...]] = {}
 
     def measure(self, name: str, above: tuple[str, ...]) -> tuple[int, int]:
-        """Return how many values and at least how many bytes a type takes."""
+        """Return the number of values of a type, and its least size in bytes."""
         if name in self._measured:
             return self._measured[name]
         if name not in self._definitions:
@@ -209,6 +209,7 @@ class _Walk:
         if field.type in _NOT_READ:
             raise LogError(f"{field.name!r} of {owner!r} is a {field.type}, which is not read")
         if field.type in BASE_BYTES:
+            # generated code reads an array of numbers as one block, but strings one by one
             values, least = 1, BASE_BYTES[field.type]
             by_block = field.type != "string"
         else:
@@ -238,7 +239,7 @@ def _used_by(above: tuple[str, ...]) -> str:
 
 
 def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
-    """Write a .msg text of a type and those that it uses, as `definitions_from_msg` reads it."""
+    """Write a .msg text of a type and the types that it uses; `definitions_from_msg` reads it back."""
     lines: list[str] = []
     for name in sorted(definitions, key=lambda name: name != type_name):
         if name != type_name:

@@ -1,8 +1,8 @@
-"""Open a log of messages: the content of the file or folder decides which reader; those of MCAP and folders.
+"""Open a log of messages with a reader for its content; readers of MCAP files and of bag folders.
 
-The reader of MCAP is our own for two reasons. The MCAP library fails 112 of the 416 files of the format's
-conformance suite. It gives up on truncated and unindexed files, which crashed recorders leave behind. It also
-yields columns of a chunk at a time rather than one object for each message.
+The reader of MCAP is our own for three reasons. The MCAP library fails 112 of the 416 files of the format's
+conformance suite. It gives up on truncated and unindexed files, which crashed recorders leave behind. It
+yields an object for each message, but our reader yields the messages of a chunk as columns.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class McapLog(MessageReader):
         statistics = self._directory.statistics
         counts = statistics.channel_message_counts if statistics else None
         if statistics and not counts and statistics.message_count:
-            # the format leaves counts of channels out at will
+            # the format lets writers leave out the counts of channels
             counts = None
         if statistics and counts and sum(counts.values()) != statistics.message_count:
             self._faults.add(
@@ -107,12 +107,12 @@ class McapLog(MessageReader):
 
     @cached_property
     def _declared(self) -> Mapping[int, Channel]:
-        # reading may come across channels that the index lacks
+        # a copy, because reading may find channels that the index lacks
         return dict(self._walk.channels)
 
     @property
     def channel_topics(self) -> frozenset[str]:
-        """The topics of its channels, without a look at their definitions."""
+        """Topics of its channels, whose definitions are not checked."""
         return frozenset(channel.topic for channel in self._declared.values())
 
     @property
@@ -136,7 +136,7 @@ class McapLog(MessageReader):
             walk = copy(self._walk)
             walk.stream = stream
             statistics = directory.statistics
-            # where the log counts no channels, all messages are compared with its total
+            # without counts of channels, all messages are read to compare them with the total
             is_total = statistics is not None and not statistics.channel_message_counts
             messages_of_places = walk.iter_messages(
                 [place for _, place in places], lambda topic: is_total or topic in topics
@@ -154,7 +154,7 @@ class McapLog(MessageReader):
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         yield from super()._count(columns, topics, name)
         statistics = self._directory.statistics
-        # without counts of channels, the total is all there is to compare
+        # without counts of channels, only the total can be compared
         if statistics and not statistics.channel_message_counts and self._walked_all:
             total = statistics.message_count
             if total != self._walked:
@@ -173,7 +173,7 @@ class McapLog(MessageReader):
     def _columns(
         self, rank: int, place: ChunkPlace, messages: Messages, wanted: list[int], first: int, last: int
     ) -> MessageColumns:
-        """Return the wanted messages in a place; those of channels that the index lacks go to the faults."""
+        """Return the wanted messages in a place; report messages of channels that the index lacks."""
         self._walked += len(messages)
         unknown = np.setdiff1d(messages.channel, self._numbers)
         if len(unknown):
@@ -189,16 +189,16 @@ class McapLog(MessageReader):
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 _CDR_BEGIN = b"\x00"
-"""How every message of ROS 2 begins, and none that is compressed."""
+"""First byte of every plain message of ROS 2, but of no compressed message."""
 
 _MOST_UNPACKED = 2**26
-"""Bytes of messages that are decompressed at a time, and one message more."""
+"""Size at which a batch of decompressed messages is closed, bytes."""
 
 _File: TypeAlias = McapLog | SqliteBag
 
 
 def files_of_bag_around(path: Path) -> tuple[str, ...]:
-    """Return the names of all files of the bag that a file is in; none where no metadata lists it."""
+    """Return the names of all files in the bag of a file; () if no metadata lists the file."""
     try:
         with path.with_name(BAG_METADATA).open("rb") as stream:
             files = bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1)).files
@@ -250,7 +250,7 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _unpacked_files(self) -> Path:
-        """A folder for decompressed files."""
+        """Temporary folder for decompressed files."""
         return temporary_folder(self)
 
     @cached_property
@@ -293,6 +293,7 @@ class BagFolder(MessageReader):
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         def read(number: int, file: _File) -> Columns:
+            # bits of a place: file from 48 on, chunk from 28 on, then the row
             for columns_of_file in file.iter_columns(topics, first, last, as_recorded=as_recorded):
                 place, first_channel = np.int64(number) << 48, self._first_channels[number]
                 channel = first_channel + columns_of_file.channel
@@ -314,10 +315,10 @@ class BagFolder(MessageReader):
         return columns
 
     def _unpack_all(self, columns: Columns) -> Columns:
-        """Decompress messages; a topic with messages that are plain is remarked once."""
+        """Decompress messages; remark once on each topic with plain messages."""
         plain = set[str]()
         for packed in columns:
-            # some at a time, however much they decompress to
+            # in batches of bounded size after decompression
             begin = size = 0
             for number, payload in enumerate(packed.payloads, 1):
                 size += unpacked_size(payload)
@@ -337,7 +338,7 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _first_channels(self) -> tuple[int, ...]:
-        """The number of the first channel of each file."""
+        """Dense number of the first channel of each file."""
         return tuple(accumulate((len(file._channels) for file in self._files[:-1]), initial=0))
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
@@ -356,7 +357,7 @@ class BagFolder(MessageReader):
         return super()._count(columns, topics, name)
 
     def _open(self, path: Path) -> _File | None:
-        """Open a file by its content; None, and a fault, where nothing in it can be read."""
+        """Open a file by its content; return None and report a fault if it is unreadable."""
         try:
             with path.open("rb") as stream:
                 head = stream.read(len(SQLITE_MAGIC))
@@ -413,7 +414,7 @@ def _rank(name: str) -> tuple[str | int, ...]:
 
 
 READERS: dict[bytes, type[MessageReader]] = {BAG_MAGIC: Ros1Bag, SQLITE_MAGIC: SqliteBag, MAGIC: McapLog}
-"""The reader of a file, by its first bytes."""
+"""Readers by the first bytes of a file."""
 
 
 def is_log(path: LogFile) -> bool:
@@ -443,7 +444,7 @@ def open_messages(path: LogFile) -> MessageReader:
 
 
 def _head(path: LogFile) -> bytes | None:
-    """Return the first bytes of a file; None of a folder.
+    """Return the first bytes of a file; None for a folder.
 
     Raises:
         MissingFileError: there is no such file, or it cannot be opened.

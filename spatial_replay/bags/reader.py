@@ -1,10 +1,10 @@
-"""Logs of messages: messages as columns, and the interface of every log.
+"""Messages as columns, and the interface of all logs of messages.
 
-Columns, because a million small objects that live for a while make Python's garbage collection look through
-all of them again and again, which costs more than reading them.
+Columns replace a million small objects, which Python's garbage collection would scan repeatedly. The scans
+would take longer than reading the log.
 
-Chunks and files of a log may overlap in time, so their messages are merged. Logs whose clock jumped back, as
-when a simulation restarts, are refused: sorted by time, both passes would look like one.
+Chunks and files of a log may overlap in time, so their messages are merged. Logs whose clock jumps back, such
+as after a restart of a simulation, are refused: sorted by time, both runs would look like one.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from spatial_replay.text import Instant, encodable
 from spatial_replay.trace.trace import LATEST_NS
 
 _TOGETHER = 512
-"""Messages made at once: fewer than the garbage collector lets pass before it runs."""
+"""Number of `Message` objects that are made at once, below the threshold of Python's garbage collection."""
 
 
 class Message(NamedTuple):
     """One message of a log.
 
     Attributes:
-        log_time_ns: when it was recorded.
-        publish_time_ns: when it was sent; the log time where the container does not know.
-        sequence: number within its topic as in the log, 0 where the log has none; of messages of one topic
-            and time, the later one has the greater number.
-        payload: in its topic's encoding.
+        log_time_ns: time of recording.
+        publish_time_ns: time of sending; the log time if the log does not store it.
+        sequence: number within its topic, as in the log; 0 if the log has none. It orders the messages of one
+            topic and time.
+        payload: message in the encoding of its topic.
     """
 
     topic: str
@@ -56,32 +56,32 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessageColumns(Messages):
-    """M messages, on the channels of `MessageReader.channels`: several publishers of one topic have several.
+    """M messages on the channels of `MessageReader.channels`; each publisher of a topic may have a channel.
 
     Attributes:
-        place: (M,) int64, numbers that increase in the order in which the messages were recorded.
+        place: (M,) int64, numbers that increase in the order of recording.
     """
 
     place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def sort_by_time(self) -> MessageColumns:
-        """Return the same messages by log time, topic and sequence; equal ones keep their order."""
+        """Sort the messages by log time, topic and sequence; equal ones stay in their order."""
         times = self.log_time_ns
         if (times[1:] > times[:-1]).all():
             return self
         return select(self, np.lexsort((self.sequence, self.topic_ranks, times)))
 
     def count_before(self, time_ns: int) -> int:
-        """Count the messages, which are in order, before a time."""
+        """Count the messages before a time; the messages must be sorted by time."""
         return int(np.searchsorted(self.log_time_ns, time_ns, side="left"))
 
     def raw(self, channels: Mapping[int, Channel]) -> Messages:
-        """Return the messages as a copy of the log has them, on these channels."""
+        """Return the messages of a copy of the log, on these channels."""
         columns = self.channel, self.sequence, self.log_time_ns, self.publish_time_ns, self.payloads
         return Messages(channels, *columns)
 
     def messages(self) -> list[Message]:
-        """Return the messages one by one."""
+        """Return the messages as objects."""
         return [
             Message(topic, row.log_time_ns, row.publish_time_ns, row.sequence, row.payload)
             for topic, row in zip(self.topics, self.rows(), strict=True)
@@ -99,7 +99,7 @@ def in_pieces(columns: Columns) -> Columns:
 
 
 def places_in(part: int, within: Integers) -> Integers:
-    """Return places in a log of several parts, such as chunks, in the order of the parts."""
+    """Return places in a log of several parts, such as chunks; they increase from part to part."""
     return (np.int64(part) << 28) + within
 
 
@@ -108,15 +108,15 @@ def in_order(
 ) -> Columns:
     """Yield the messages of several chunks by log time, topic and sequence.
 
-    It holds no more messages than overlap.
+    Only messages of chunks that overlap in time are held in memory.
 
     Args:
-        starts_ns: when each chunk begins, in order; a message before that comes late.
-        name: of the log.
-        most_bytes: of the messages that it may hold.
+        starts_ns: sorted start times of the chunks; a message before the start of its chunk is yielded late.
+        name: name of the log.
+        most_bytes: most bytes of messages in memory.
 
     Raises:
-        LogError: it would hold more.
+        LogError: the messages in memory exceed `most_bytes`.
     """
     waiting = MessageColumns()
     held = 0
@@ -137,14 +137,14 @@ def in_order(
 
 
 _Active = list[tuple[int, int, MessageColumns, Columns]]
-"""A heap: time of the first message, number of the file, messages, and those that follow them."""
+"""Heap of open files: time of the first message, number of the file, messages, and later messages."""
 
 
 def merge_files(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
-    """Merge the messages of several files by log time; a file is opened when its time has come.
+    """Merge the messages of several files by log time; a file is opened when its first message is due.
 
     Args:
-        files: of each, the time of its first message, and what opens it.
+        files: for each file, the time of its first message, and a function that opens it.
     """
     waiting = sorted(files, key=itemgetter(0), reverse=True)
     active: _Active = []
@@ -157,7 +157,7 @@ def merge_files(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
             continue
         _, number, columns, following = heapq.heappop(active)
         limits = [start_ns for start_ns, _ in waiting[-1:]] + [entry[0] for entry in active[:1]]
-        # equal times come in the order of the files
+        # messages of equal times are yielded in the order of the files
         ready = columns.count_before(min(limits) + 1) if limits else len(columns)
         yield select(columns, slice(ready))
         if ready < len(columns):
@@ -175,7 +175,7 @@ def _push_next(active: _Active, number: int, following: Columns) -> None:
 
 
 DISORDER_NS = 10**9
-"""How far messages may be out of order by default: recorders write topics from several threads."""
+"""Default disorder of messages that is allowed, nanoseconds; recorders write topics from several threads."""
 JUMP_REMEDY = (
     "max_lateness='5s' (--read max_lateness=5s) takes messages that come later, 'all' sorts the whole log;"
     " on_time_jump='split' (--read on_time_jump=split) ends it where its clock jumps"
@@ -185,18 +185,18 @@ JUMP_REMEDY = (
 def without_jumps(
     columns: Columns, name: str, checked: Collection[str], disorder_ns: int = DISORDER_NS
 ) -> Columns:
-    """Yield the messages as they are, which are in the order of time.
+    """Yield messages, which are sorted by time, and check the order of their recording.
 
     Args:
-        checked: the topics to check; others are only copied, in any order.
-        disorder_ns: how far they may have been recorded out of order.
+        checked: topics to check; messages of other topics may have been recorded in any order.
+        disorder_ns: largest disorder of recording that is allowed.
 
     Raises:
-        LogError: those of a topic were not recorded in that order: some of them come more than that before
-            others that were recorded earlier.
+        LogError: a message was recorded before another one of its topic that is earlier by more than the
+            disorder.
     """
     first_ns: int | None = None
-    # logs put together topic by topic are in order all the same, so each topic counts by itself
+    # logs that were merged topic by topic are in order too, so each topic is checked separately
     topics = dict[str, _Recorded]()
     for message_columns in columns:
         if first_ns is None and len(message_columns):
@@ -216,7 +216,7 @@ def without_jumps(
 
 
 class _Recorded:
-    """How far the recording had come at each message of the last moments, as long as the disorder."""
+    """The furthest place of recording at each message within the last `disorder_ns`."""
 
     def __init__(self, disorder_ns: int) -> None:
         self._disorder_ns = disorder_ns
@@ -224,11 +224,14 @@ class _Recorded:
         self._before = self._furthest = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
-        """Return the first message recorded before one that is earlier by more than the disorder, or None.
+        """Return the first message recorded before a message that is earlier by more than the disorder.
 
         Args:
-            times_ns, places: (M,) of messages in the order of time, at least one, after those of the call
-                before.
+            times_ns, places: (M,) times and places of at least one message, sorted by time, later than the
+                messages of the previous call.
+
+        Returns:
+            the index of the message; None if there is none.
         """
         furthest = np.maximum.accumulate(np.append(self._furthest, places))[1:]
         self._latest.append((times_ns, furthest))
@@ -246,13 +249,13 @@ class MessageReader(ABC):
     """A log of messages in a file or folder, which is read again for each iteration.
 
     Attributes:
-        kind: the format, in a word.
+        kind: name of the format.
     """
 
     kind: str
 
     def __init__(self, path: LogFile) -> None:
-        # readers that open paths get none of a remote file
+        # only a name for a remote file, because readers that open `_path` get local files only
         self._path = path if isinstance(path, Path) else Path(path.name)
         self._faults, self._remarks = FaultList(), FaultList()
         self._parts: Sequence[MessageReader] = ()
@@ -260,16 +263,17 @@ class MessageReader(ABC):
     @property
     @abstractmethod
     def _topics(self) -> tuple[Topic, ...]:
-        """The topics that the log declares, by name."""
+        """The topics that the log declares, sorted by name."""
 
     @property
     def profile(self) -> str:
-        """Return how an MCAP log with its messages names their origin."""
+        """Return the profile of an MCAP log with its messages."""
+        # https://mcap.dev/spec/registry#well-known-profiles
         return {"ROS 1 bag": "ros1", "ROS 2 bag": "ros2"}.get(self.kind, "")
 
     @property
     def _distribution(self) -> str | None:
-        """The ROS release that the log names, for types that it does not define."""
+        """ROS release that the log names, for types that it does not define."""
         return None
 
     @property
@@ -279,25 +283,25 @@ class MessageReader(ABC):
 
     @abstractmethod
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        """Yield the messages of some topics logged from `first` up to, not including, `last`."""
+        """Yield the messages of some topics with log times in [first, last)."""
 
     @property
     @abstractmethod
     def _declared(self) -> Mapping[int, Channel]:
-        """The channels, by the numbers that the log gives them."""
+        """The channels by their numbers in the log."""
 
     @cached_property
     def _numbers(self) -> Integers:
-        """The numbers that the log gives channels, in order."""
+        """The sorted numbers of channels in the log."""
         return np.array(sorted(self._declared), np.int64)
 
     @cached_property
     def _channels(self) -> Mapping[int, Channel]:
-        """The channels, by dense numbers."""
+        """The channels by dense numbers from 0 on."""
         return {rank: self._declared[number] for rank, number in enumerate(self._numbers.tolist())}
 
     def _channel_numbers(self, topics: Collection[str]) -> list[int]:
-        """Return the numbers that the log gives the channels of some topics."""
+        """Return the numbers in the log of the channels of some topics."""
         return [number for number, channel in self._declared.items() if channel.topic in topics]
 
     def _make_columns(
@@ -308,24 +312,24 @@ class MessageReader(ABC):
         payloads: Sequence[bytes],
         place: Integers,
     ) -> MessageColumns:
-        """Return messages, given the numbers that the log gives their channels, and log and publish times."""
+        """Return messages, given the numbers of their channels in the log, and log and publish times."""
         channel = np.searchsorted(self._numbers, numbers)
         return MessageColumns(self._channels, channel, sequence, *times_ns, payloads, place)
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        """Return the channels of some topics by the numbers of `MessageColumns.channel`, which are dense.
+        """Return the channels of some topics by their numbers in `MessageColumns.channel`.
 
-        A copy of a log declares them: their schema, encoding and metadata are those of the log. ROS types
-        without a definition in the log get that of the standard type, if there is one.
+        A copy of the log declares these channels, with the schema, encoding and metadata of the log. A ROS
+        type without a definition in the log gets the standard definition, if there is one.
         """
         return {number: channel for number, channel in self._channels.items() if channel.topic in topics}
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """Return the files in the log; those that are damaged are left out."""
+        """Return the attachments of the log; damaged attachments are left out."""
         return ()
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """Return the metadata records of the log, with their names; those that are damaged are left out."""
+        """Return the metadata records of the log with their names; damaged records are left out."""
         return ()
 
     @property
@@ -334,7 +338,7 @@ class MessageReader(ABC):
         return encodable(self._path.name or self._path.absolute().name)
 
     def topics(self) -> tuple[Topic, ...]:
-        """Return the topics, by name.
+        """Return the topics, sorted by name.
 
         Raises:
             LogError: the log is too damaged, or declares no topic.
@@ -345,12 +349,12 @@ class MessageReader(ABC):
         return self._topics
 
     def decoder(self, topic: str | Topic) -> Decoder:
-        """Return a decoder for the messages of a topic, by its name or as given.
+        """Return a decoder for the messages of a topic, which is a name or a `Topic`.
 
-        The decoder raises LogError for a payload that does not fit, with the reason.
+        For a payload that does not fit, the decoder raises LogError with the reason.
 
         Raises:
-            LogError: the topic's definition is missing or cannot be understood.
+            LogError: the topic's definition is missing or invalid.
         """
         if isinstance(topic, str):
             topic = next(candidate for candidate in self._topics if candidate.name == topic)
@@ -359,10 +363,10 @@ class MessageReader(ABC):
     def iter_messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of their log time, as far as the log keeps it.
+        """Yield the messages of some topics by log time; a message before its chunk's start comes late.
 
         Args:
-            start_ns, end_ns: only those logged from `start_ns` up to, not including, `end_ns`.
+            start_ns, end_ns: window of log times, [start_ns, end_ns).
 
         Raises:
             LogError: nothing can be read.
@@ -378,37 +382,37 @@ class MessageReader(ABC):
         *,
         as_recorded: bool = False,
     ) -> Columns:
-        """Yield what `iter_messages` gives, as columns.
+        """Yield the messages of `iter_messages` as columns.
 
         Args:
-            as_recorded: in the order of recording instead, which may jump back in time.
+            as_recorded: whether to yield them in the order of recording, which may jump back in time.
         """
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
         columns = self._read(topics, first, last, as_recorded=as_recorded)
         yield from self._count(columns, topics) if (first, last) == (0, LATEST_NS + 1) else columns
 
     def take_faults(self) -> tuple[str, ...]:
-        """Return what was lost since the last call, each with its place, on the topics that were read."""
+        """Return the losses on the read topics since the last call, each with its place."""
         self._gather_parts()
         return self._faults.take()
 
     def move_faults(self, target: FaultList) -> None:
-        """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
+        """Move the faults of `take_faults` to another list; add the count of faults beyond the limit."""
         self._gather_parts()
         self._faults.move_to(target)
 
     def take_remarks(self) -> tuple[str, ...]:
-        """Return what is wrong since the last call without a loss on the topics that were read."""
+        """Return the remarks since the last call: irregularities without a loss on the read topics."""
         of_parts = (remark for part in self._parts for remark in part.take_remarks())
         return (*self._remarks.take(), *of_parts)
 
     def _gather_parts(self) -> None:
-        """Take the faults of the files of the log that were opened."""
+        """Collect the faults of the opened files of the log."""
         for part in self._parts:
             part.move_faults(self._faults)
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
-        """Yield all messages of some topics, then compare their number with what the log declares."""
+        """Yield all messages of some topics, then compare their numbers with the declared ones."""
         read = Counter[str]()
         for message_columns in columns:
             read.update(message_columns.topics)

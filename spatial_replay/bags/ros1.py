@@ -1,7 +1,7 @@
 """ROS 1 bags, whole or damaged.
 
-The reader is our own because rosbags refuses a whole bag at its first damage, and bags without an index,
-which interrupted recorders leave behind. Here only the damaged chunks are lost, and each is reported.
+The reader is our own because rosbags refuses bags with any damage, and bags without an index. Interrupted
+recorders leave such bags behind. Our reader loses only the damaged chunks, and reports each of them.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ BAG_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 LONGEST_HEAD = 2**20
 _SECOND_NS = 1_000_000_000
-# op=, conn=, time= begin with these
+# first letters of the fields op, conn and time
 _C, _I, _O, _P, _T = b"ciopt"
+# a definition whose first field is a header; blank lines, comments and constants may come before it
 _HEADER_FIRST = re.compile(rb"(?:[ \t]*(?:#[^\n]*)?\n|[^\n=#]*=[^\n]*\n)*[ \t]*(?:std_msgs/)?Header[ \t]")
 
 
@@ -45,9 +46,9 @@ class RecordTable(NamedTuple):
     """N records of a chunk, in their order.
 
     Attributes:
-        opcode, connection, time_ns: (N,) int64; -1 where the head has none.
-        head: (N,) int64, where the head's fields begin.
-        begin, end: (N,) int64, where the data are.
+        opcode, connection, time_ns: (N,) int64; -1 if the head lacks the field.
+        head: (N,) int64, offset of the head's fields.
+        begin, end: (N,) int64, bounds of the data.
     """
 
     opcode: Integers
@@ -62,7 +63,7 @@ def fields_of(head: bytes) -> dict[str, bytes]:
     """Parse the fields of a record's head, or of a connection's data, by name.
 
     Raises:
-        DamageError: they do not fill it exactly.
+        DamageError: the fields do not fill the bytes exactly.
     """
     fields: dict[str, bytes] = {}
     position = 0
@@ -79,10 +80,10 @@ def fields_of(head: bytes) -> dict[str, bytes]:
 
 
 def number(fields: dict[str, bytes], name: str, size: int = 4) -> int:
-    """Return a field that is a little-endian number of some bytes.
+    """Return the little-endian number of `size` bytes in a field.
 
     Raises:
-        DamageError: it is missing, or of another size.
+        DamageError: the field is missing, or has another size.
     """
     value = fields.get(name, b"")
     if len(value) != size:
@@ -91,7 +92,7 @@ def number(fields: dict[str, bytes], name: str, size: int = 4) -> int:
 
 
 def time_from(value: int) -> int:
-    """Return nanoseconds from seconds in the lower and nanoseconds in the upper half of a word."""
+    """Convert a time to nanoseconds: seconds in the lower half of a word, nanoseconds in the upper."""
     return (value & 0xFFFFFFFF) * _SECOND_NS + (value >> 32)
 
 
@@ -122,8 +123,9 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
 
 
 def record_table(content: bytes) -> tuple[RecordTable, bool]:
-    """Return the records in a chunk's content, and whether the last of them breaks off."""
+    """Return the records in a chunk's content, and whether the last record breaks off."""
     view = np.frombuffer(content, np.uint8)
+    # a table without room, to count the records first
     count, _ = _walk(view, np.empty((6, 0), np.int64))
     table = np.empty((6, count), np.int64)
     _, end = _walk(view, table)
@@ -141,7 +143,7 @@ def _u32(content: NDArray[np.uint8], at: int) -> int:
 
 @piece
 def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, int]:
-    """Return opcode, connection and time in the fields of a head, each -1 where it is missing."""
+    """Return opcode, connection and time in the fields of a head; a missing field is -1."""
     opcode = connection = time_ns = -1
     at = head
     while at + 4 <= data:
@@ -162,7 +164,7 @@ def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, i
 
 @kernel
 def _walk(content: NDArray[np.uint8], table: NDArray[np.int64]) -> tuple[int, int]:
-    """Fill in the records that there is room for; return their number, and where the last whole one ends."""
+    """Fill the table as far as it has room; return the number of complete records, and their end."""
     size = content.shape[0]
     position = 0
     count = 0
@@ -190,10 +192,10 @@ _STRIDE = 2**20
 # the field op of a chunk's head, with its length: http://wiki.ros.org/Bags/Format/2.0
 _CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
 _BEFORE_MARK = (4, 17, 23, 24, 36, 37)
-"""Where a chunk's head may begin before its opcode: its length, then its other fields in any order."""
+"""Possible distances from the beginning of a chunk's head to its opcode; other fields may come before it."""
 _CHUNK_HEAD_BYTES = range(20, 80)
 _MOST_GAPS, _MOST_MARKS = 1_000, 100_000
-"""Damaged stretches, and bytes that look like a chunk's, after which the rest of a file is not searched."""
+"""Numbers of damaged parts, and of possible chunks, after which the rest of a file is not searched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +203,7 @@ class Connection:
     """A publisher of a topic, as the bag describes it.
 
     Attributes:
-        data: the fields that describe it: type, md5sum, message_definition and others.
+        data: fields of its description: type, md5sum, message_definition and others.
     """
 
     number: int
@@ -223,11 +225,11 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class BagChunk:
-    """A chunk: where it is, and what it holds.
+    """Place and content of a chunk.
 
     Attributes:
-        offset: of its record.
-        counts: how many messages of each connection; None where only its content says.
+        offset: offset of its record in the file.
+        counts: number of messages of each connection; None if that takes reading the chunk.
     """
 
     offset: int
@@ -238,7 +240,7 @@ class BagChunk:
 
 @dataclass(slots=True)
 class BagDirectory:
-    """Connections by number, and chunks in the order of the file.
+    """Connections by number, and chunks in file order.
 
     Attributes:
         is_indexed: whether the bag's own index was read.
@@ -251,10 +253,10 @@ class BagDirectory:
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """A record in the file: the fields of its head, and where its data are.
+    """A record in the file: the fields of its head, and the place of its data.
 
     Attributes:
-        missing: bytes that an uncompressed chunk lacks, because the file breaks off in it.
+        missing: number of bytes that are missing in an uncompressed chunk at the end of a truncated file.
     """
 
     fields: dict[str, bytes]
@@ -272,10 +274,10 @@ class _Record:
 
 
 def read_chunk(stream: BinaryIO, offset: int) -> bytes:
-    """Read the content of the chunk at an offset, decompressed.
+    """Read and decompress the chunk at an offset.
 
     Raises:
-        DamageError: it is cut off, no chunk, or does not decompress.
+        DamageError: the record breaks off, is no chunk, or does not decompress.
     """
     record = _record(stream, offset, stream.seek(0, os.SEEK_END))
     if record.opcode != CHUNK:
@@ -287,7 +289,7 @@ def connections_in(content: bytes, table: RecordTable) -> Iterator[Connection]:
     """Yield the connections that a chunk declares.
 
     Raises:
-        DamageError: one cannot be read.
+        DamageError: a connection cannot be read.
     """
     for row in (table.opcode == CONNECTION).nonzero()[0].tolist():
         begin, end = int(table.begin[row]), int(table.end[row])
@@ -379,14 +381,14 @@ def _content(stream: BinaryIO, record: _Record) -> bytes:
     size = number(record.fields, "size") - record.missing
     content = decompress_chunk(compression, _data(stream, record), size)
     if record.missing:
-        # the fault of the file names the loss
+        # the scan of the file reports the loss
         table, _ = record_table(content)
         content = content[: int(table.end.max(initial=0))]
     return content
 
 
 class _Scan:
-    """One pass over the records of a file; chunks are read for their times and connections."""
+    """A scan of the records of a file, which reads chunks for their times and connections."""
 
     def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
         self._stream = stream
@@ -415,7 +417,7 @@ class _Scan:
         self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost} bytes cannot be read")
 
     def _take_in(self, position: int) -> int:
-        """Take in the record at a position; return where the next one begins."""
+        """Read the record at a position; return the position of the next record."""
         record = _record(self._stream, position, self._size)
         if record.opcode == CHUNK:
             self._chunk(position, record)
@@ -442,7 +444,7 @@ class _Scan:
             self._directory.chunks.append(BagChunk(position, int(times.min()), int(times.max()), counts))
 
     def _next_chunk(self, position: int) -> int | None:
-        """Return where the next chunk begins whose head is consistent, from a position on."""
+        """Return the offset of the next chunk with a consistent head, from a position on."""
         overlap = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
         while position < self._size:
             self._stream.seek(position)
@@ -523,9 +525,9 @@ class Ros1Bag(MessageReader):
 
     @cached_property
     def _is_in_parts(self) -> bool:
-        """Whether no chunk overlaps another in time: then their order in the file means nothing.
+        """Whether chunks do not overlap in time; then they are sorted by time, not by place in the file.
 
-        Bags are played by their index, and tools that merge or repair them write chunks in any order.
+        Bags are played by their index. Tools that merge or repair bags write chunks in any order.
         """
         ordered = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
         return all(before.end_ns <= after.start_ns for before, after in pairwise(ordered))
@@ -544,7 +546,7 @@ class Ros1Bag(MessageReader):
         first: int,
         last: int,
     ) -> MessageColumns:
-        """Read the messages of a chunk; what is lost of them goes to the faults."""
+        """Read the messages of a chunk; report losses."""
         span = Sentence("messages between ", Instant(chunk.start_ns, 0), " and ", Instant(chunk.end_ns, 0))
         try:
             content = read_chunk(stream, chunk.offset)
@@ -568,7 +570,7 @@ class Ros1Bag(MessageReader):
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
         payloads = [content[begin:end] for begin, end in bounds]
         numbers = table.connection[rows].tolist()
-        # a header begins with the number that its publisher has given it; those of two mean nothing together
+        # a header begins with a number that its publisher counts; numbers of two publishers have no order
         publishers = Counter(connection.topic for connection in wanted.values())
         headed = {
             number

@@ -1,7 +1,7 @@
-"""Decoders of ROS messages, from the definition in the log or the standard one.
+"""Decoders of ROS messages, from the definition in the log or the standard definition.
 
-The decoders are Python code that rosbags generates from names and sizes and then runs, so a definition is
-checked before (see `definitions`).
+Decoders are Python code that rosbags generates from the names and sizes in a definition. So a definition is
+checked before rosbags gets it (see `definitions`).
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
 RosEncoding = Literal["ros1", "cdr"]
 
 _DISTRIBUTIONS = ("jazzy", "kilted", "lyrical", "iron", "humble", "galactic", "foxy", "eloquent", "dashing")
-# representations of plain CDR, little and big endian, of the OMG's DDSI-RTPS (section 10); messages with
-# parameter lists or of XCDR 2 have other numbers, and another layout
+# representation identifiers of plain CDR, little and big endian, in the OMG's DDSI-RTPS (section 10);
+# parameter lists and XCDR 2 have other identifiers and another layout
 _PLAIN = (b"\x00\x01", b"\x00\x00")
 _MOST_AROUND = 7
-"""Bytes of a message that hold no field: four before them, and up to three that fill it up."""
+"""Most bytes of a message outside its fields: a head of four bytes, and up to three bytes of padding."""
 _LONGEST_IDL = 2**17
 _MOST_ANNOTATIONS = 500
 _IDL_ASIDE = re.compile(r'"(?:\\"|[^"])*"|\'(?:[^\'\\\n]|\\.)*\'|//[^\n]*|/\*.*?\*/', re.DOTALL)
-"""Strings and comments, as the parser takes them."""
+"""Strings and comments, as the parser of rosbags reads them."""
 _IDL_ANNOTATION = re.compile(r"@[A-Za-z_][\w:]*\s*\(")
 _IDL_ENUM = re.compile(r"\benum\s+([A-Za-z]\w*)\s*\{", re.ASCII)
 _IDL_NESTED_TYPE = re.compile(r"<[^<>]*<[^<>]*<")
@@ -54,15 +54,15 @@ _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 def ros_definitions(
     type_name: str, encoding: RosEncoding, schema: Schema | None, distribution: str | None = None
 ) -> tuple[Definitions, ...]:
-    """Return the definitions that messages of a type may have: one, or those of each release of ROS.
+    """Return the possible definitions of a type: one from the log, or the standards of the ROS releases.
 
     Args:
-        type_name: in full, such as geometry_msgs/msg/Pose.
-        schema: None where the log has none; then the type must be a standard one.
-        distribution: the ROS release that the log names.
+        type_name: full name, such as geometry_msgs/msg/Pose.
+        schema: definition in the log; None if the log has none, which only standard types allow.
+        distribution: ROS release that the log names.
 
     Raises:
-        LogError: none, or one that cannot be understood.
+        LogError: there is no definition, or it is invalid.
     """
     empty_bytes = 1 if encoding == "cdr" else 0
     if not type_name:
@@ -95,7 +95,7 @@ def ros_decoder(
     """Return a decoder for the messages of a type.
 
     Raises:
-        LogError: its definition is missing or cannot be understood.
+        LogError: its definition is missing or invalid.
     """
     choices = ros_definitions(type_name, encoding, schema, distribution)
     decoders = [_decoder(type_name, encoding, definitions) for definitions in choices]
@@ -138,7 +138,7 @@ def _cdr_decoder(store: Typestore, type_name: str) -> Decoder:
 
     def decode(payload: bytes) -> object:
         try:
-            # alignment counts from behind the four bytes that say how the rest is encoded
+            # alignment counts from the end of the head, four bytes that name the encoding
             deserialize = little if payload[1] else big
             message, end = deserialize(payload[4:], 0, message_class, store)
         except Exception as error:
@@ -200,15 +200,15 @@ def _from_idl(text: str, type_name: str) -> Definitions:
 
 
 def _without_enum(field: Field, definitions: Definitions, enums: Collection[str]) -> Field:
-    """Return a field with an enum as the integer of four bytes that CDR writes for it."""
+    """Return a field with its enum replaced by uint32, the integer that CDR writes for an enum."""
     is_enum = field.type not in definitions and field.type.rpartition("/")[2] in enums
     return replace(field, type="uint32") if is_enum else field
 
 
 def _check_idl(text: str, type_name: str) -> None:
-    """Check that a text in IDL can be parsed in seconds.
+    """Check that rosbags can parse a text in IDL within seconds.
 
-    The parser's time grows fast with the depth of parentheses. It needs milliseconds for each annotation.
+    The time of its parser grows fast with the depth of parentheses, and by milliseconds per annotation.
     """
     bare = _IDL_ASIDE.sub(" ", text) if len(text) <= _LONGEST_IDL else ""
     what = None
@@ -227,7 +227,7 @@ def _check_idl(text: str, type_name: str) -> None:
 
 
 def _standards(encoding: RosEncoding, distribution: str | None) -> Iterator[Definitions]:
-    """Yield the standard types of each release, first of the release that is named, else of the likeliest."""
+    """Yield the standard types of each ROS release: the named release first, then the likeliest releases."""
     if encoding == "ros1":
         yield _standard("ros1_noetic")
         return
@@ -243,7 +243,7 @@ def _standard(store: str) -> Definitions:
 
 
 def _fields(types: Typesdict) -> dict[str, tuple[Field, ...]]:
-    """Return types from the form that rosbags describes them in."""
+    """Convert types from the form of rosbags."""
     return {
         full_type_name(name): tuple(_field(field, description) for field, description in fields)
         for name, (_, fields) in types.items()
@@ -252,7 +252,7 @@ def _fields(types: Typesdict) -> dict[str, tuple[Field, ...]]:
 
 def _field(name: str, description: FieldDesc) -> Field:
     kind = _KINDS.get(int(description[0]))
-    # rosbags nests its tuples in a way that its types do not say
+    # the type hints of rosbags do not describe its nested tuples
     base: Any = description
     size = 0
     if kind:
@@ -263,7 +263,7 @@ def _field(name: str, description: FieldDesc) -> Field:
 
 
 def _describe(definitions: Definitions, store: Typestore) -> Typesdict:
-    """Describe the types that a store does not know yet, in the form of rosbags."""
+    """Convert the types that a store lacks to the form of rosbags."""
     return {
         name: ([], [(field.name, _description(field)) for field in fields])
         for name, fields in definitions.items()

@@ -1,7 +1,7 @@
-"""`.db3` files of ROS 2 bags: opened without trust, and read around what is damaged.
+"""Read `.db3` files of ROS 2 bags, untrusted and possibly damaged.
 
-A log is input from outside, so nothing in the database may compute, and whatever SQLite says about a
-damaged file becomes a fault of the log.
+A log is untrusted input, so no function in the database may run. An error of SQLite about a damaged file
+becomes a fault of the log.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ class BagMetadata:
 
     Attributes:
         files: names of its files, without folders, in order.
-        types: of each topic.
-        counts: messages of each topic.
-        compression: of whole files, of each message, or none.
-        distribution: the ROS release that wrote it, if it is named.
+        types: type of each topic.
+        counts: number of messages of each topic.
+        compression: "file" or "message" for what is compressed; "" for nothing.
+        distribution: ROS release that wrote it; None if it is not named.
     """
 
     files: tuple[str, ...]
@@ -62,7 +62,7 @@ class BagMetadata:
 
 
 def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
-    """Parse a metadata.yaml; of a file, `LARGEST_METADATA` bytes and one more are enough.
+    """Parse the first `LARGEST_METADATA` + 1 bytes of a metadata.yaml; a longer file is refused.
 
     Raises:
         LogError: it is not YAML, or does not describe a bag.
@@ -87,7 +87,7 @@ def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
 
 
 def _plain(text: str) -> Any:
-    """Parse a YAML text without aliases, with which a short text could stand for a very long one."""
+    """Parse a YAML text; refuse aliases, because they can expand a short text to a very long one."""
     import yaml
 
     if len(text) > LARGEST_METADATA:
@@ -101,7 +101,7 @@ def _plain(text: str) -> Any:
             if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
                 raise LogError("it refers to parts of itself, or is nested too deep; no recorder writes that")
         return yaml.load(text, Loader=loader)  # the loader makes plain values only
-    # malformed numbers and dates raise ValueError and its kin
+    # malformed numbers and dates raise errors of all these types
     except (yaml.YAMLError, ValueError, OverflowError, TypeError, KeyError) as error:
         raise LogError(f"it is no YAML ({' '.join(str(error).split()):.200})") from None
 
@@ -142,7 +142,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _base_name(path: str) -> str:
-    """Return the last part of a path; early releases wrote the folder too, and no path may lead out of it."""
+    """Return the name in a path, without the folder of early releases; no path may leave the bag."""
     name = PureWindowsPath(PurePosixPath(path).name).name
     if name in ("", "..") or "\x00" in name:
         raise LogError(f"{path!r:.100} in it is not a file name")
@@ -152,16 +152,16 @@ def _base_name(path: str) -> str:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE = 2**20
 _PACKED_PIECE = 2**12
-"""Compressed bytes at a time: few, since each may stand for 32,000."""
+"""Compressed bytes that are read at a time; few, because one may decompress to 32,000 bytes."""
 _LEFT_FREE = 2**26
-"""Bytes of a disk that are never filled; of a small one, a tenth."""
+"""Free space that stays free, bytes; at most a tenth of the free space."""
 
 
 def temporary_folder(owner: object) -> Path:
-    """Make a folder that is removed with its owner.
+    """Create a folder that is removed with its owner.
 
     Raises:
-        OutputError: the machine cannot make it.
+        OutputError: the folder cannot be created.
     """
     try:
         folder = tempfile.mkdtemp(prefix="spatial-replay-")
@@ -185,10 +185,10 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
     """Decompress a file into a folder.
 
     Returns:
-        its path there, without the suffix of the compression; where it breaks off, or "".
+        the path of the decompressed file, without the suffix of the compression; a fault, or "".
 
     Raises:
-        LogError: it does not decompress, or to something absurdly large.
+        LogError: nothing decompresses, or the content is implausibly large.
         OutputError: the folder has no room for it.
     """
     target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
@@ -220,7 +220,7 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
 
 
 def _decompress(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
-    """Yield what the frames of a file decompress to, and whether the last frame so far is whole."""
+    """Yield the decompressed pieces of a file, each with whether it completes a frame."""
     frame, rest = None, b""
     while piece := rest or source.read(_PACKED_PIECE):
         frame = frame or zstandard.ZstdDecompressor().decompressobj()
@@ -232,7 +232,7 @@ def _decompress(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
 
 
 def unpacked_size(payload: bytes) -> int:
-    """Return how many bytes a message that may be compressed decompresses to, at most."""
+    """Return the largest decompressed size of a message, which may be plain, in bytes."""
     try:
         size = zstandard.frame_content_size(payload)
     except zstandard.ZstdError:
@@ -241,10 +241,10 @@ def unpacked_size(payload: bytes) -> int:
 
 
 def decompress_message(payload: bytes) -> bytes:
-    """Decompress a message that was compressed by itself.
+    """Decompress a single message.
 
     Raises:
-        LogError: it does not decompress, or to more than a chunk of an MCAP log may.
+        LogError: it does not decompress, or exceeds the limits of a chunk of an MCAP log.
     """
     try:
         size = zstandard.frame_content_size(payload)
@@ -259,13 +259,13 @@ def decompress_message(payload: bytes) -> bytes:
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _MOST_TOPICS = 100_000
 _STEPS = 10_000
-"""Steps of SQLite's virtual machine between two looks at how many it has taken."""
+"""Steps of SQLite's virtual machine between two checks of the limit."""
 _STEPS_A_BYTE = 20
-"""The most steps for each byte of a file. The pages of a damaged file can form a cycle."""
+"""Most steps for each byte of a file; the limit is needed since pages of a damaged file can form a cycle."""
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
 _MOST_PROBES = 10_000
-"""Parts of a damaged table that are tried; what is left then counts as lost."""
+"""Most parts of a damaged table that are tried; the other parts count as lost."""
 
 Row = tuple[int, int, Any, Any]
 """Id, topic, time and content of a message."""
@@ -274,7 +274,7 @@ _TYPES = (int, int, int, bytes)
 RowHead = tuple[int, int, int]
 """Id, topic and time of a message."""
 _Span = tuple[int, int]
-"""The first and the last of some ids."""
+"""First and last id of a range."""
 
 
 class SqliteBag(MessageReader):
@@ -284,7 +284,7 @@ class SqliteBag(MessageReader):
 
     @cached_property
     def _whole(self) -> Path:
-        """The file; if it was cut, a copy of its whole pages: the rest of a page would read as zeros."""
+        """The file, or a copy of the complete pages of a truncated file; a partial page would read as 0."""
         path = self._with_log
         missing, whole = _bytes_missing(path)
         if not missing:
@@ -294,7 +294,8 @@ class SqliteBag(MessageReader):
 
     @cached_property
     def _with_log(self) -> Path:
-        """The file; if a write-ahead log is next to it, a copy of both, brought together."""
+        """The file, or a copy merged with the write-ahead log next to it."""
+        # https://www.sqlite.org/wal.html
         log = self._path.with_name(f"{self.name}-wal")
         if not log.is_file() or not log.stat().st_size:
             return self._path
@@ -302,7 +303,7 @@ class SqliteBag(MessageReader):
         copy, _ = (copy_beginning(file, file.stat().st_size, folder) for file in (self._path, log))
         most = copy.stat().st_size + log.stat().st_size
         try:
-            # in a folder of its own: nothing but the copies is read or written
+            # in a separate folder, so that only the copies are read and written
             with closing(sqlite3.connect(copy, isolation_level=None)) as database:
                 database.execute("PRAGMA trusted_schema=OFF")
                 (_, frames, _) = database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
@@ -330,7 +331,7 @@ class SqliteBag(MessageReader):
         with _opened(self._whole) as database:
             described, distribution = _read_tables(database, self.name)
         if self._with_log != self._path:
-            # the counts are those of a file that was closed before
+            # counts in the file do not include the write-ahead log
             described = {number: replace(topic, count=None) for number, topic in described.items()}
         return described, distribution
 
@@ -397,7 +398,7 @@ class SqliteBag(MessageReader):
         self._report_losses(damage, intact, lost)
 
     def _report_losses(self, damage: str, intact: Sequence[RowHead], lost: Collection[_Span]) -> None:
-        """Report what a damaged database has lost, with the times of the messages around it."""
+        """Report the lost rows of a damaged database, with the times of the messages around them."""
         damaged = f"{self.name}: the database is damaged ({damage})"
         spans = _joined_spans(lost)
         if not spans:
@@ -411,12 +412,12 @@ class SqliteBag(MessageReader):
             if not (before and behind):
                 when = (" after ", *before) if before else (" before ", *behind) if behind else ()
             rows = f"row {begin}" if begin == end else f"rows {begin} to {end}"
-            # where nothing is behind, how many there were is not known
+            # if no message follows, the number of lost rows is not known
             rows = rows if behind or not before else f"rows from {begin} on"
             self._faults.add(Sentence(f"{damaged}; messages", *when, f" are lost: {rows}"))
 
     def _sound(self, batches: Iterable[list[Row]]) -> Iterator[list[Row]]:
-        """Yield rows without those that a damaged file has filled with anything else."""
+        """Yield the rows with valid types, and report the other rows."""
         for rows in batches:
             sound = [row for row in rows if tuple(map(type, row)) == _TYPES]
             if len(sound) < len(rows):
@@ -433,35 +434,38 @@ class SqliteBag(MessageReader):
 
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open the database in a file, read only: no file beside it is read, no function in it is trusted.
+    """Open the database in a file, read-only; no other file is read, and no function in it is trusted.
 
     Raises:
-        LogError: it cannot be opened.
+        LogError: the database cannot be opened.
     """
     size = path.stat().st_size
     try:
+        # immutable: no locks, and no file next to it: https://www.sqlite.org/uri.html#uriimmutable
         uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
         # one thread reads, but garbage collection in another may close it
         connected = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
         with closing(connected) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, size))
             database.text_factory = lambda text: text.decode("utf-8", "replace")
-            # a file that was cut is refused without this; nothing is ever written
+            # without this, SQLite refuses a truncated file; nothing is ever written
             database.execute("PRAGMA writable_schema=ON")
+            # as advised for untrusted files: https://www.sqlite.org/security.html
             database.execute("PRAGMA trusted_schema=OFF")
             database.execute("PRAGMA cell_size_check=ON")
             steps = count(1)
             most = 1_000 + size * _STEPS_A_BYTE // _STEPS
-            # a damaged tree of pages may lead in circles
+            # pages of a damaged file can form a cycle, so the number of steps is limited
             database.set_progress_handler(lambda: next(steps) > most, _STEPS)
             yield database
-    # names of columns come as text, whatever bytes they are
+    # sqlite3 decodes names of columns as UTF-8, whatever their bytes are
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise LogError(f"{path.name}: the database is damaged ({error})") from None
 
 
 def _bytes_missing(path: Path) -> tuple[int, int]:
-    """Return the bytes missing from a file's end, by its head, and the bytes that are in whole pages."""
+    """Return how many bytes are missing at a file's end, and the length of its complete pages, in bytes."""
+    # https://www.sqlite.org/fileformat.html#the_database_header
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(100)
@@ -471,16 +475,17 @@ def _bytes_missing(path: Path) -> tuple[int, int]:
     page = 65536 if page == 1 else page
     pages = int.from_bytes(head[28:32], "big")
     if page < 512 or head[24:28] != head[92:96]:
-        # damaged, or written by a version that does not count pages
+        # damaged, or written by an old version, whose number of pages is not valid:
+        # https://www.sqlite.org/fileformat.html#in_header_database_size
         return 0, size
     return max(0, pages * page - size), size - size % page
 
 
 def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Topic], str | None]:
-    """Read what a file says about itself: its topics by number, and the ROS release that wrote it.
+    """Read the topics of a file by number, and the ROS release that wrote it.
 
     Raises:
-        LogError: it is not a bag.
+        LogError: the file is not a bag.
     """
     kinds = dict(
         database.execute(
@@ -507,7 +512,7 @@ def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Top
 
 
 def _batches(cursor: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield the rows of a query in lists of at most some megabytes; those before an error come before it."""
+    """Yield the rows of a query in lists of bounded size; the rows before an error are yielded first."""
     rows: list[Row] = []
     held = 0
     try:
@@ -526,11 +531,11 @@ def _batches(cursor: Iterable[Row]) -> Iterator[list[Row]]:
 
 
 def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span]]:
-    """Return the rows of a damaged database that can be found by their ids, in order, and the ids of others.
+    """Return the readable rows of a damaged database, sorted by id, and the ranges of unreadable ids.
 
-    A part of the ids that cannot be read is halved until what is damaged is found.
+    An unreadable range of ids is halved until single unreadable ids are found.
     """
-    # where the file describes its table wrongly, `id` may be anything
+    # rowid, because `id` can be another column if the definition of the table is damaged
     query = (
         "SELECT rowid, topic_id, timestamp FROM messages NOT INDEXED"
         " WHERE rowid BETWEEN ? AND ? ORDER BY rowid"
@@ -560,7 +565,7 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
 
 
 def _all_ids(database: sqlite3.Connection) -> _Span:
-    """Return the ids that messages may have."""
+    """Return the range of ids that messages can have."""
     try:
         ((first, last),) = database.execute(
             "SELECT (SELECT min(rowid) FROM messages NOT INDEXED),"
@@ -570,7 +575,7 @@ def _all_ids(database: sqlite3.Connection) -> _Span:
             return first, last
     except sqlite3.Error:
         pass
-    # recorders number messages from 1 on, and none takes fewer bytes than this
+    # recorders number messages from 1 on, and a message takes at least 8 bytes
     (pages,), (page,) = (
         database.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size")
     )
@@ -578,7 +583,7 @@ def _all_ids(database: sqlite3.Connection) -> _Span:
 
 
 def _contents(database: sqlite3.Connection, heads: Sequence[RowHead], lost: set[_Span]) -> Iterator[Row]:
-    """Yield rows with their contents; the ids of those that cannot be read go to `lost`."""
+    """Yield rows with their contents; ids of unreadable rows go to `lost`."""
     for place, (row_id, *_) in enumerate(heads):
         try:
             yield from database.execute(
@@ -592,7 +597,7 @@ def _contents(database: sqlite3.Connection, heads: Sequence[RowHead], lost: set[
 
 
 def _joined_spans(spans: Collection[_Span]) -> list[_Span]:
-    """Return spans of ids in order, those that follow each other as one."""
+    """Return sorted ranges of ids; adjacent ranges are merged."""
     joined: list[_Span] = []
     for first, last in sorted(spans):
         if joined and first <= joined[-1][1] + 1:
