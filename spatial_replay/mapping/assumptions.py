@@ -1,7 +1,8 @@
-"""The assumptions by which a mapped log is read, and what in the log contradicts them.
+"""Assumptions about mapped logs, and their contradictions in a log.
 
-`ASSUMPTIONS` is the table: what is assumed, which measurement contradicts it, and which key settles it. A new
-assumption is one entry and one function. `contradictions` compares the table with the evidence of a log.
+Each row of the table `ASSUMPTIONS` has an assumption, the measurement that contradicts it, and the key that
+resolves the contradiction. A new assumption is one row and one function. `contradictions` compares the table
+with the evidence of a log.
 """
 
 from __future__ import annotations
@@ -30,13 +31,14 @@ class Assumption:
     """An assumption about the messages of a topic.
 
     Attributes:
-        name: as `accept` in a mapping takes it.
-        assumed: for readers.
-        measured: what is measured, and when that contradicts the assumption, for readers.
-        check: returns what contradicts it, as a clause after the topic and a colon; None if nothing does.
-        remedy: the key that settles it.
-        is_remark: whether data that are only odd look like this, so that verdicts are not doubtful.
-        is_about_signals: whether signals of the topic rest on it, too.
+        name: name for `accept` in a mapping.
+        assumed: the assumption, for the documentation.
+        measured: the measurement, and its limit, for the documentation.
+        check: function that returns the contradiction as a clause, to follow the topic and a colon; None
+            without a contradiction.
+        remedy: key that resolves the contradiction.
+        is_remark: whether sound but unusual data look the same, so that verdicts are not doubtful.
+        is_about_signals: whether signals of the topic depend on the assumption, too.
     """
 
     name: str
@@ -49,10 +51,9 @@ class Assumption:
 
 
 def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
-    """Yield contradictions of the assumptions: doubts, and remarks where the data may be only odd.
+    """Yield contradictions of the assumptions: doubts, or remarks if the data may be sound but unusual.
 
-    A contradiction in many topics is one sentence. A name that the mapping accepts without a contradiction
-    is remarked.
+    A contradiction in many topics is one sentence. Accepted names without a contradiction are remarks, too.
     """
     uncontradicted = dict.fromkeys(mapping.accept)
     for evidence in log.values():
@@ -97,7 +98,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
 
 
 def _group_topics(clauses: Mapping[str, str]) -> list[list[str]]:
-    """Return the topics of each sentence: many of them share one, and so do those with equal clauses."""
+    """Return groups of topics, one per sentence: all topics if there are many, otherwise by equal clauses."""
     if len(clauses) >= _MANY_TOPICS:
         return [list(clauses)]
     groups: dict[str, list[str]] = {}
@@ -107,9 +108,11 @@ def _group_topics(clauses: Mapping[str, str]) -> list[list[str]]:
 
 
 _MANY_TOPICS: Final = 3
+"""Topics from which a contradiction is one sentence."""
 _MOST_NAMED: Final = 8
+"""Names at most in a sentence."""
 _FEW: Final = 3
-"""Messages or reports from which on a measurement says something."""
+"""Least number of messages or reports for a measurement."""
 
 
 def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
@@ -117,7 +120,7 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
     first_ns, last_ns = arrivals.first_ns, arrivals.last_ns
     if evidence.planned.clock == "header" or arrivals.messages <= _FEW or first_ns is None or last_ns is None:
         return None
-    # the mean, since messages of one burst are close in any unit
+    # the mean period, because messages within a burst are close in any unit
     period_ns = arrivals.mean_period_s * 1e9
     for unit, ns in list(UNITS_NS.items())[1:]:
         year = _year(first_ns * ns)
@@ -133,7 +136,7 @@ _FIRST_YEAR, _LAST_YEAR = 2005, 2100
 
 
 def _year(time_ns: int) -> int | None:
-    """Return the year of a time at which robots are recorded; None for another one."""
+    """Return the year of a time; None outside the years in which robots are recorded."""
     if time_ns > 2**62:
         return None
     year = datetime.fromtimestamp(time_ns / 1e9, UTC).year
@@ -144,7 +147,7 @@ def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, clock = evidence.arrivals, evidence.planned.clock
     varies = {"log": arrivals.log_varies, "publish": arrivals.publish_varies}
     others = [name for name, is_varying in varies.items() if is_varying and name != clock]
-    # what is latched may all arrive at once
+    # latched messages may all arrive at the same time
     is_latched = evidence.planned.is_latched or evidence.planned.is_lasting
     if varies.get(clock, True) or arrivals.messages < _FEW or not others or is_latched:
         return None
@@ -155,7 +158,7 @@ def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, planned = evidence.arrivals, evidence.planned
     if planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays):
         return None
-    # what is sent again with its first stamp only needs another one in a frame that moves
+    # messages repeated with their first stamp are wrong only if objects are in frames that move
     if not evidence.uses_stamps or not (arrivals.stamps_vary or evidence.uses_frames):
         return None
     still_s, usual_s = arrivals.longest_still_s, arrivals.log_period_s.median
@@ -179,7 +182,7 @@ def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     passed_s, log_s = arrivals.stamps_passed_s, arrivals.log_passed_s
     if not (evidence.uses_stamps and evidence.has_moving_stamps and passed_s > 0 and log_s > 0):
         return None
-    # a simulation runs at any rate, but not at that of another unit
+    # a simulation may run at any rate, except by exactly the factor of a unit
     factor = passed_s / log_s
     if not any(abs(factor * ns - 1) < _UNIT_ERROR or abs(factor / ns - 1) < _UNIT_ERROR for ns in _FACTORS):
         return None
@@ -195,14 +198,14 @@ _FACTORS: Final = (1e3, 1e6, 1e9)
 
 def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
     lateness_s = [topic.arrivals.lateness_s for topic in log.values() if topic.has_moving_stamps]
-    # of two clocks, the one nearer to that of the log is right
+    # sorted by distance from the log's clock, because the nearer of two clocks is taken as right
     medians_s = sorted((late_s.median for late_s in lateness_s), key=abs)
     late_s = evidence.arrivals.lateness_s
     if not (evidence.uses_stamps and evidence.has_moving_stamps):
         return None
     usual_s = medians_s[(len(medians_s) - 1) // 2]
     off_s = late_s.median - usual_s
-    # messages that take long to compute come late, but by times that differ
+    # results of long computations are late, too, but by varying delays
     is_steady = late_s.quantile(0.9) - late_s.quantile(0.1) < _STEADY_S
     if abs(off_s) < _OTHER_CLOCK_S or (0 < off_s < _SLOWEST_S and not is_steady):
         return None
@@ -226,7 +229,7 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
     upright, other_upright = evidence.upright, evidence.upright_otherwise
     if other_upright < _MOST_UPRIGHT * count or upright > _FEW_UPRIGHT * count:
         return None
-    # a tag on a table, seen from above, is upside down, and as if upright and not turned in the other order
+    # a tag on a table, seen from above, is upside down; in the other order it seems upright and not turned
     if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * count):
         return None
     other_order = "xyzw" if layout.order == "wxyz" else "wxyz"
@@ -258,7 +261,7 @@ _LENGTH_ERROR, _OUTLIERS = 0.05, 0.02
 
 
 def _is_unwrapped(evidence: TopicEvidence, turn: float) -> bool:
-    """Whether angles may count turns: they begin within one, and never step by half of one or more."""
+    """Return whether angles may be unwrapped: they begin within a turn, and steps are below half a turn."""
     return evidence.first_turn <= turn and evidence.motions.turn_step < turn / 2
 
 
@@ -267,7 +270,7 @@ def _radians(evidence: TopicEvidence, log: Log) -> str | None:
     most = max(turn.greatest, -turn.least)
     if layout is None or abs(layout.angle_scale) != 1.0 or not most > MANY_TURNS:
         return None
-    # degrees stay below a turn of them; few robots turn more than once a second
+    # degrees stay within 360; read as radians, they would turn more than once a second, which few robots do
     is_fast = evidence.motions.turn_rate.quantile(0.9) > 2 * pi and most <= _A_TURN
     if _is_unwrapped(evidence, 2 * pi) and not is_fast:
         return None
@@ -307,7 +310,7 @@ _A_TURN: Final = 360.5
 
 
 def _heading(evidence: TopicEvidence, log: Log) -> str | None:
-    """Compare where objects head with where they go, for each reading of their angle."""
+    """Compare the yaw of objects with the course of their motion, for each interpretation of the angle."""
     motions, layout = evidence.motions, evidence.planned.layout
     if layout is None or motions.steps < _FEW_STEPS or evidence.has_given_heading or _radians(evidence, log):
         return None
@@ -317,7 +320,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG}
     keys = max(fits, key=lambda keys: fits[keys].real, default=None)
-    # on one straight way, a robot may go sideways; but headings of satellite receivers count from north
+    # a straight path is no evidence, because a robot may go sideways; a heading next to fixes is from north
     is_straight = abs(motions.course) > _STRAIGHT
     is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
     if keys is None or (is_straight and not ("north" in keys and is_compass)):
@@ -330,7 +333,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _compass(evidence: TopicEvidence, log: Log) -> str | None:
-    """Say from where an angle beside fixes counts, where no motion does."""
+    """Remark the zero of an angle next to fixes, if motions do not confirm it."""
     yaw = None if evidence.planned.mapping is None else evidence.planned.mapping.yaw
     courses = evidence.motions.courses
     goes_along = abs(courses["read"]) > _STEADY and abs(phase(courses["read"])) < _ASKEW
@@ -361,7 +364,7 @@ def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     if not (abs(evidence.low[:2]).max() <= 360 and abs(evidence.high[:2]).max() <= 360):
         return None
-    # a radar may call its metres lat and lon; no degrees a second are so many
+    # a radar may name lateral and longitudinal metres lat and lon; 0.01 degrees a second are 1.1 km a second
     if evidence.motions.speed.quantile(0.9) > _FAST_DEGREES:
         return None
     low, high = (", ".join(map(number_text, corner[:2].tolist())) for corner in (evidence.low, evidence.high))
@@ -444,7 +447,7 @@ def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, extractor, layout = evidence.arrivals, evidence.reader.extractor, evidence.planned.layout
-    # files of one bag have channels of their own, and a publisher may take over from one that ends
+    # few returns are sound: each file of a bag has its own channels, and one publisher may replace another
     if arrivals.returns < max(_FEW, _IN_TURN * arrivals.messages):
         return None
     shares_names = extractor is None or extractor.namer.is_constant or evidence.motions.returns > 0
@@ -519,7 +522,7 @@ def _corners(evidence: TopicEvidence, log: Log) -> str | None:
     left, low, count = extractor.leftward, extractor.downward, extractor.boxes
     if left < count / 5 and not count / 5 < low < count * 4 / 5:
         return None
-    # the second of opposite corners goes as far as the first, but a size does not
+    # opposite corners in the other order have similar ranges, but sizes do not reach as far as positions
     reach = extractor.corner_high - extractor.corner_low
     if min(left, low) == count and (reach[1] > reach[0] / 2).all():
         return None
@@ -543,15 +546,15 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
     speeds = [topic.motions.speed.quantile(0.9) for topic in others]
     speeds = [speed for speed in speeds if speed > 0]
     size, arrivals = evidence.size.median, evidence.arrivals
-    # messages that are recorded in bursts only seem to be fast
+    # objects in messages recorded in bursts only seem fast, because times within a burst are close
     burst = min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
     usual, speed = (evidence.motions.speed.quantile(share) * burst for share in (0.5, 0.9))
-    # a size that the mapping gives has the unit of the mapping, and a place that of the log
+    # a size from the mapping is in another unit than the places if an object moves 1,000 sizes a second
     if usual > max(_SOUND, _SIZES_A_SECOND * size) and size > 0:
         return f"its objects are {number_text(size)} long and move at {number_text(usual)} a second"
     if not (sizes and speeds and speed > _THOUSAND * max(speeds)):
         return None
-    # a shape in the mapping has the unit of the mapping; no robot is faster than sound
+    # a shape from the mapping shows no unit of the log, so that speed decides: no robot is faster than sound
     if not (size > _THOUSAND * max(sizes) or speed > _SOUND):
         return None
     return (
@@ -890,4 +893,4 @@ ASSUMPTIONS: Final = (
 )
 
 NAMES: Final = tuple(assumption.name for assumption in ASSUMPTIONS)
-"""Names that `accept` takes."""
+"""Names for `accept` in a mapping."""

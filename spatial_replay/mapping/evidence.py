@@ -1,7 +1,7 @@
-"""Evidence of how a log was read: arrivals and objects of each topic in, measurements out.
+"""Measurements of a log while it is read: arrivals and objects of each topic in, statistics out.
 
-Measurements cover every message and object, in columns, while the log is read. Medians come from a sample of
-the values. `assumptions` compares the measurements with what a mapping assumes.
+Every message and object is measured, in columns. Medians come from a subset of the values. `assumptions`
+compares the measurements with the assumptions of a mapping.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from spatial_replay.mapping.reading_plan import PlannedTopic
 from spatial_replay.mapping.topic_reader import TopicReader
 
 _HEADING: Final = re.compile(r"heading|course|bearing|azimuth|cog$", re.I)
-"""Names of fields that hold angles from north, clockwise."""
+"""Names of fields with angles from north, clockwise."""
 
 _ANGLE: Final = re.compile(r"(^|[._])(bearing|azimuth|heading|theta|phi|yaw|angle)(_?(deg|rad)\w*)?$", re.I)
-"""Names of fields that hold angles."""
+"""Names of fields with angles."""
 
 _MOST_VALUES: Final = 4_096
-"""Values that a `Spread` holds for its median."""
+"""Values at most that a `Spread` keeps for its median."""
 
 _ROWS_AT_ONCE: Final = 4_096
-"""Objects that wait until they are measured, because a column of few costs as much as one of many."""
+"""Objects that are measured together, because a short column costs as much as a long one."""
 
 _LONGEST_GAP: Final = 9
-"""Messages from one report of an object to the next; longer gaps count as this one."""
+"""Longest counted gap between two reports of an object, messages; longer gaps are counted as this one."""
 
 _MOST_LEAPS: Final = 4
-"""Reports by which an object counts as back where it was."""
+"""Reports at most after which a return of an object to its place is searched for."""
 
 _MOST_ROWS: Final = 32_768
-"""Last reports of objects that wait for the next one; those of the oldest messages are dropped."""
+"""Last reports of objects at most that wait for the next one; the oldest are dropped."""
 
 FAR_LEAP: Final = 5.0
-"""Sizes of an object: a longer step is worth a look."""
+"""Least length of a suspicious step, sizes of the object."""
 
 _FAST: Final = 100.0
-"""Footprint units a second: what leaps there and back faster is not one robot."""
+"""Speed from which a leap there and back cannot be one robot, footprint units per second."""
 
 
 class Spread:
-    """The least, the median and the greatest of values, and when the greatest came.
+    """Statistics of values: least, median, greatest, and the time of the greatest.
 
-    Values that are not finite are left out. The median is that of evenly spaced values.
+    Values that are not finite are ignored. The median is taken from every n-th value.
     """
 
     __slots__ = ("_held", "_stride", "count", "greatest", "greatest_ns", "least")
@@ -85,12 +85,12 @@ class Spread:
         return float(np.median(self._held)) if len(self._held) else nan
 
     def quantile(self, share: float) -> float:
-        """Return the value below which a share of the values lies; NaN without values."""
+        """Return the quantile at a share from 0 to 1; NaN without values."""
         return float(np.quantile(self._held, share)) if len(self._held) else nan
 
 
 class Moment(NamedTuple):
-    """Something that happened to an object: its name, when, and by how much."""
+    """An event of an object: name, time, and amount in footprint units."""
 
     name: str
     time_ns: int
@@ -107,20 +107,21 @@ class ClassChange(NamedTuple):
 
 
 class Arrivals:
-    """When the messages of a topic came, from whom, and what their clocks say.
+    """Arrivals of a topic's messages: times, publishers and clocks.
 
     Attributes:
-        messages: their number.
-        first_ns, last_ns: the first and the last time on the topic's clock.
-        period_s, log_period_s: the intervals between messages, and between their times of recording.
-        lateness_s: how much later messages were recorded than their stamps say.
-        publish_varies, log_varies: whether publish times, and log times, differ at all.
-        publishers: numbers of the channels; `returns` counts messages from another one than the message
-            before, which had come earlier, too.
-        longest_still_s: the longest time for which stamps stood still; `still_ns` is when that began.
-        stamps_vary: whether they differ at all.
-        stamps_passed_s, log_passed_s: the time from the first stamp to the last, and that between their
-            times of recording.
+        messages: number of messages.
+        first_ns, last_ns: first and last time on the topic's clock.
+        period_s, log_period_s: intervals between messages on the topic's clock, and between log times.
+        lateness_s: time from the stamps of messages to their recording.
+        publish_varies, log_varies: whether publish times, and log times, are not all equal.
+        publishers: numbers of the channels.
+        returns: number of changes back to an earlier channel.
+        longest_still_s: longest time without a new stamp.
+        still_ns: log time at which it began.
+        stamps_vary: whether stamps are not all equal.
+        stamps_passed_s: time from the first to the last stamp.
+        log_passed_s: time between the recordings of the first and the last stamp.
     """
 
     def __init__(self) -> None:
@@ -155,7 +156,7 @@ class Arrivals:
             self.settle()
 
     def settle(self) -> None:
-        """Measure the messages and stamps that wait."""
+        """Measure the waiting messages and stamps."""
         self._waiting_messages = 0
         if self._waiting:
             self._measure(*map(np.concatenate, zip(*self._waiting, strict=True)))
@@ -191,13 +192,13 @@ class Arrivals:
 
     @property
     def mean_period_s(self) -> float:
-        """The mean interval between messages; NaN without two at different times."""
+        """Mean interval between messages; NaN without two messages of different times."""
         if self.first_ns is None or self.last_ns is None or self.messages < 2:
             return nan
         return (self.last_ns - self.first_ns) / (self.messages - 1) / 1e9 or nan
 
     def add_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
-        """Add the stamps of some messages, in order, and when these were recorded."""
+        """Add the stamps of some messages, in order, and their log times."""
         self._waiting_stamps.append((stamps_ns, log_ns))
 
     def _measure_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
@@ -224,7 +225,7 @@ class Arrivals:
 
 
 _NAME, _MESSAGE, _SECONDS, _X, _Y, _YAW, _TURN, _SIZE, _CLASS, _IS_NEW = range(10)
-"""Columns of the reports of objects that are measured together."""
+"""Columns of reports of objects."""
 
 HEADINGS: Final[dict[str, tuple[float, float]]] = {
     "unit: rad": (0.0, 1.0),
@@ -234,25 +235,32 @@ HEADINGS: Final[dict[str, tuple[float, float]]] = {
     "unit: rad, zero: east, clockwise: true": (0.0, -1.0),
     "unit: deg, zero: east, clockwise: true": (0.0, -pi / 180),
 }
-"""Readings of a number as a yaw, in the keys of a mapping: the yaw at 0, and that of one unit, in radians."""
+"""Interpretations of a number as a yaw, by keys of a mapping: yaw at 0, and yaw per unit, in radians."""
 
 
 class Motions:
-    """How the objects of a topic move, from one report of each to its next.
+    """Motions of a topic's objects: differences between successive reports of an object.
 
     Attributes:
-        speed, turn_rate: in footprint units, and radians, a second.
-        jump: the longest step of an object; `jump_s` is how long it took.
-        comeback: the longest over a second or more in which messages did not report the object.
-        zeros: how often an object leapt to (0, 0), by more than five of its sizes, but for comebacks.
-        turn_step: the greatest change of the number that is read as yaw.
-        chances: reports of objects that were reported at least twice before. In `returns` of them an object
-            is back where it was two to four reports before. It leapt by more than its size in each step.
-            `return_moment` is the first. `slow_returns` took a second or more, at speeds that are usual.
-        gaps: (10,) how often so many messages passed from one report of an object to its next.
-        changes: the first changes of classes; `change_count` counts all.
-        courses: the mean of exp(i (course - angle)) over the steps of objects that move, for the angle as it
-            is read and for each of `HEADINGS`. `course` is the mean of exp(i course).
+        speed: speeds, footprint units per second.
+        turn_rate: turn rates, radians per second.
+        jump: longest step of an object.
+        jump_s: time of this step.
+        comeback: longest step over an absence, in which messages lacked the object for a second or more.
+        comeback_s: time of this step.
+        zeros: number of leaps to (0, 0) by more than five sizes of the object, without absences.
+        turn_step: greatest change of the number that is read as yaw.
+        chances: number of reports of objects with at least two earlier reports.
+        returns: number of these reports in which an object is back at its place two to four reports earlier,
+            after steps that were all longer than its size.
+        slow_returns: number of returns after a step of a second or more, at a speed of a robot.
+        return_moment: first return; None without one.
+        gaps: (10,) number of steps by the count of messages from one report of the object to the next.
+        changes: first changes of classes.
+        change_count: number of all changes of classes.
+        courses: mean of exp(i (course - angle)) over the steps of moving objects, for the angle as read and
+            for each of `HEADINGS`.
+        course: mean of exp(i course) over these steps.
     """
 
     def __init__(self, names: Codes, classes: Codes) -> None:
@@ -277,16 +285,16 @@ class Motions:
         """Add reports (R, 10) of objects in the order of messages.
 
         Args:
-            begin_ns: the time from which their seconds count.
+            begin_ns: time 0 of the seconds in reports.
             turns_back: whether angles of messages run clockwise in our axes.
-            zero, scale: the angle is read as `zero` radians and `scale` times its number.
+            zero, scale: interpretation of the angle: zero + scale * number, in radians.
         """
         self._begin_ns = begin_ns
         reports = np.concatenate([self._tail, reports])
         name = reports[:, _NAME].astype(np.int64)
         reports = reports[np.argsort(name, kind="stable")]
         is_same_object = reports[1:, _NAME] == reports[:-1, _NAME]
-        # an object is as far from its last report as that one's place says
+        # `behind`: number of later reports of the same object
         last = np.append(np.flatnonzero(~is_same_object), len(reports) - 1)
         behind = np.repeat(last, np.diff(last, prepend=-1)) - np.arange(len(reports))
         self._tail = reports[behind < _MOST_LEAPS].copy()
@@ -334,7 +342,7 @@ class Motions:
         moves = (distance > 0) & np.isfinite(later[:, _TURN])
         if not moves.any():
             return
-        # noise has no course, so short steps are left out
+        # short steps are ignored, because the course of noise is random
         moves &= distance >= self.speed.median / 2 * seconds
         if not moves.any():
             return
@@ -354,11 +362,11 @@ class Motions:
             self.comeback_s = float(seconds[at])
 
     def _add_returns(self, reports: Floats, after: Integers) -> None:
-        """Count the objects that are back where they were some reports before, and leapt in between.
+        """Count returns of objects to an earlier place after leaps.
 
         Args:
-            reports: those of one object after the other.
-            after: the places of those that are new, and not the first of their object.
+            reports: reports, grouped by object.
+            after: indices of new reports that are not the first of their object.
         """
         place, name = reports[:, _X : _Y + 1], reports[:, _NAME]
         step_xy = np.diff(place, axis=0, prepend=place[:1])
@@ -386,7 +394,7 @@ class Motions:
 
     @property
     def steps(self) -> int:
-        """How many steps have a course and an angle."""
+        """Number of steps with a course and an angle."""
         return self._steps
 
     @property
@@ -406,10 +414,15 @@ class Motions:
 
 
 _MOST_CHANGES: Final = 8
+"""Changes of classes at most that are kept."""
 
 
 class _Objects(NamedTuple):
-    """Objects that wait until they are measured; `first` is the number of their first message."""
+    """Objects that wait to be measured.
+
+    Attributes:
+        first: number of their first message.
+    """
 
     first: int
     times_ns: Integers
@@ -423,20 +436,28 @@ class TopicEvidence:
     """Measurements of the messages of one mapped topic, and of their objects and signals.
 
     Attributes:
-        arrivals, motions: of its messages and objects.
-        objects: the number of reports; `most_at_once` in one message.
-        quaternion_length: of the `quaternions` that are not zeros. `upright` counts upright objects in the
-            order that is read. `upright_otherwise` counts them with w at the other end, and
-            `turned_otherwise` those of them that are turned by more than 20 degrees.
-        turn: the numbers that are read as yaw; `first_turn` is the greatest of the first message, without
-            its sign.
-        low, high: (3,) the least and the greatest coordinates, in the numbers of the messages.
-        is_single: whether float32 holds all coordinates, and some are no whole numbers.
-        size: the longer sides of outlines; `shorter` the shorter; `pointlike` counts objects that have none.
+        arrivals: arrivals of its messages.
+        motions: motions of its objects.
+        objects: number of reports of objects.
+        most_at_once: greatest number of objects in one message.
+        quaternion_length: lengths of quaternions other than zeros.
+        quaternions: number of quaternions other than zeros.
+        upright: number of upright objects in the order of the mapping.
+        upright_otherwise: number of upright objects with w at the other end.
+        turned_otherwise: number of the latter that are turned by more than 20 degrees.
+        turn: numbers that are read as yaw.
+        first_turn: greatest absolute value of these numbers in the first message.
+        low, high: (3,) least and greatest coordinates, in the numbers of the messages.
+        is_single: whether all coordinates that are degrees, or far from the origin, are float32 numbers.
+        has_fraction: whether some of these coordinates are not integers.
+        size, shorter: longer and shorter sides of outlines.
+        pointlike: number of objects whose sides are 0.
         bottom, top: heights of the objects.
-        uncertainty: the radii; `zero_covariances` counts covariances of zeros only.
-        signal_chances: messages with signals that follow two others; in `signal_returns` (S,) of them a
-            signal is back at its last but one value.
+        uncertainty: radii of uncertainty.
+        covariances: number of covariances.
+        zero_covariances: number of covariances of zeros.
+        signal_chances: number of messages with signals that follow two others.
+        signal_returns: (S,) number of these messages in which a signal returns to its last but one value.
     """
 
     def __init__(self, reader: TopicReader, names: Codes, classes: Codes) -> None:
@@ -470,22 +491,22 @@ class TopicEvidence:
 
     @property
     def planned(self) -> PlannedTopic:
-        """How the topic is read."""
+        """Plan for the topic."""
         return self.reader.planned
 
     @property
     def uses_frames(self) -> bool:
-        """Whether objects are placed by transforms at their stamps."""
+        """Whether transforms place its objects."""
         return self.reader.needs_frame and self.reader.extractor is not None
 
     @property
     def uses_stamps(self) -> bool:
-        """Whether stamps say when, or where, objects are."""
+        """Whether stamps affect the times or the places of objects."""
         return self.planned.clock == "header" or self.uses_frames
 
     @property
     def has_moving_stamps(self) -> bool:
-        """Whether its stamps are those of things that are reported again and again."""
+        """Whether its stamps vary and its messages repeat, unlike those of latched topics and markers."""
         planned, arrivals = self.planned, self.arrivals
         stays = (
             planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays)
@@ -494,13 +515,13 @@ class TopicEvidence:
 
     @property
     def frames(self) -> frozenset[str]:
-        """The frames of its objects that messages name."""
+        """Names of frames in its messages."""
         extractor = self.reader.extractor
         return frozenset() if extractor is None else frozenset(extractor.noted_frames - {""})
 
     @property
     def turn_path(self) -> str:
-        """The field of the yaw; "" without one."""
+        """Path of the yaw; "" without one."""
         layout = self.planned.layout
         return "" if layout is None else next(iter(layout.yaw), "")
 
@@ -511,26 +532,26 @@ class TopicEvidence:
 
     @property
     def has_given_heading(self) -> bool:
-        """Whether the mapping says from where the yaw counts."""
+        """Whether the mapping gives zero and direction of the yaw."""
         mapping = self.planned.mapping
         return mapping is not None and mapping.yaw is not None and not mapping.yaw.is_plain
 
     @property
     def is_called_degrees(self) -> bool:
-        """Whether positions are fields with the names of latitude and longitude."""
+        """Whether the fields of the position are named latitude and longitude."""
         layout = self.planned.layout
         return layout is not None and any(geodetic_order(paths) is not None for paths in layout.position[:1])
 
     @property
     def angle_path(self) -> str:
-        """The field of a coordinate that has the name of an angle; "" for none."""
+        """Path of a coordinate with the name of an angle; "" without one."""
         position = None if self.planned.mapping is None else self.planned.mapping.position
         paths = position if isinstance(position, tuple) else ()
         return next((path for path in paths if _ANGLE.search(path)), "")
 
     @property
     def object_names(self) -> frozenset[str]:
-        """The names of its objects."""
+        """Names of its objects."""
         return frozenset(str(self.names.by_code[code]) for code in self.name_codes)
 
     def add_objects(
@@ -544,7 +565,7 @@ class TopicEvidence:
         """Add the objects of messages, with their footprints, angles and radii in the fixed frame.
 
         Args:
-            times_ns: (M,) of each message.
+            times_ns: (M,) time of each message.
         """
         first, self._messages = self._messages, self._messages + len(times_ns)
         if not len(detections.name):
@@ -566,7 +587,7 @@ class TopicEvidence:
             self._measure_signals()
 
     def settle(self) -> None:
-        """Measure all that waits, after the last of it."""
+        """Measure all waiting messages, objects and signals, at the end of the log."""
         self.arrivals.settle()
         self._measure()
         self._measure_signals()
@@ -622,13 +643,16 @@ class TopicEvidence:
         self._measure_motions(self._reports_rows // _ROWS_AT_ONCE * _ROWS_AT_ONCE)
 
     def _measure_motions(self, count: int) -> None:
-        """Measure the motions of so many reports, in pieces that do not depend on how messages came."""
+        """Measure the motions of `count` reports, in parts of fixed size.
+
+        The parts do not depend on the division of the log into calls, so that the results do not, either.
+        """
         if not count:
             return
         layout = self.planned.layout
         reports = np.concatenate(self._reports)
         for begin in range(0, count, _ROWS_AT_ONCE):
-            # numbers of a log may be NaN, infinite and equal
+            # no warnings about NaN, infinity, and quotients of equal numbers
             with np.errstate(all="ignore"):
                 self.motions.add(
                     reports[begin : min(begin + _ROWS_AT_ONCE, count)],
@@ -640,7 +664,7 @@ class TopicEvidence:
         self._reports, self._reports_rows = [reports[count:]], len(reports) - count
 
     def _measure_signals(self) -> None:
-        """Count the reports of signals that are back at their last but one value."""
+        """Count the returns of signals to their last but one value."""
         if not self._waiting_values:
             return
         values = np.concatenate([self._last_values, *self._waiting_signals])
@@ -657,7 +681,7 @@ class TopicEvidence:
         self.signal_returns[: values.shape[1]] += np.where(is_switch, 0, is_back.sum(axis=0))
 
     def _measure_numbers(self, detections: Sequence[Detections], message: Integers) -> Floats | None:
-        """Measure the numbers as messages have them, and return them."""
+        """Measure the unchanged numbers of messages; return them, or None without a binding."""
         binding = self._binding
         pieces = [detected.numbers for detected in detections if detected.numbers is not None]
         numbers = np.concatenate(pieces) if binding is not None and len(pieces) == len(detections) else None
@@ -681,7 +705,7 @@ class TopicEvidence:
             low, high = np.fmin.reduce(places, axis=0), np.fmax.reduce(places, axis=0)
         axes = slice(places.shape[1])
         self.low[axes], self.high[axes] = np.fmin(self.low[axes], low), np.fmax(self.high[axes], high)
-        # single precision matters for degrees, and far from the origin
+        # the resolution of float32 matters for degrees, and far from the origin
         is_far = self.planned.is_geodetic or np.fmax.reduce(np.abs([*low, *high])) > _FAR
         if self.is_single and is_far:
             plane = places[:, :2]
@@ -699,10 +723,10 @@ class TopicEvidence:
         self.quaternion_length.add(length)
         self.quaternions += len(length)
         x, y, z, w = (quaternions / length[:, None]).T
-        # the z axis of an object points up where the squares of its x and y are small
+        # the tilt of an object's z axis depends on x * x + y * y, because its cosine is 1 - 2 (x * x + y * y)
         self.upright += int(np.count_nonzero(x * x + y * y < _LEVEL))
         layout = self.planned.layout
-        # in the other order, w, x and y stand for x, y and z, or y, z and w do
+        # in the other order the numbers called w, x, y (or y, z, w) are x, y, z
         is_w_first = layout is not None and layout.order == "wxyz"
         first, second, up = (w, x, y) if is_w_first else (y, z, w)
         is_upright = first * first + second * second < _LEVEL
@@ -711,21 +735,21 @@ class TopicEvidence:
 
 
 _FAR: Final = 1e4
-"""Coordinates from which on the steps of float32 are worth a look."""
+"""Least coordinate at which the resolution of float32 is measured."""
 _LEVEL: Final = 0.0076
-"""Twice this is 1 - cos 10 degrees: objects tilted by less count as upright."""
+"""Limit of x * x + y * y for upright objects, (1 - cos 10 degrees) / 2."""
 _TURNED: Final = 0.174
-"""The sine of half of 20 degrees."""
+"""Limit of z for turned objects, sin(20 degrees / 2)."""
 
 
 def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:
-    """Return the centres and the sides (R, 2) of the boxes around footprints; NaN for unknown ones."""
+    """Return centres and sides (R, 2) of the boxes around footprints; NaN for unknown footprints."""
     count = len(shapes.part_start) - 1
     parts, vertices = shapes.part_start, shapes.vertex_start[shapes.part_start]
     has_parts = vertices[1:] > vertices[:-1]
     low, high = np.full((count, 2), nan), np.full((count, 2), nan)
     if has_parts.any():
-        # rows without vertices begin where the next one does
+        # rows without vertices are skipped, because reduceat would return a vertex of the next row
         starts = vertices[:-1][has_parts]
         radius = np.maximum.reduceat(shapes.radius, parts[:-1][has_parts])[:, None]
         low[has_parts] = np.minimum.reduceat(shapes.vertices, starts, axis=0) - radius

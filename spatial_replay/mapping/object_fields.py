@@ -1,6 +1,6 @@
-"""Fields of messages that look like those of an object: decoded messages in, their paths out.
+"""Fields of objects in messages of unknown types: decoded messages in, paths of likely fields out.
 
-They are found by their names and the types of their values, for messages of unknown types.
+Fields are found by their names and the types of their values.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from spatial_replay.mapping.field_paths import (
 from spatial_replay.mapping.message_types import geodetic_order
 
 _DEEPEST = 4
-"""Levels of nested fields to search."""
+"""Nesting limit of the search for fields."""
 _POSITIONS = ("position", "center", "centre", "translation", "location", "point")
 _TURNS = ("orientation", "rotation", "quaternion", "q", "quat")
 _YAWS = ("yaw", "theta", "heading", "angle", "course", "cog")
@@ -43,24 +43,24 @@ _FOUR_BOUNDS = (
     ("x1", "y1", "x2", "y2"),
     ("x_offset", "y_offset", "width", "height"),
 )
-"""Names of fields of two opposite corners; the last is that of a region in an image, with its size."""
+"""Names of the four fields of a box: two corners; the last are those of sensor_msgs/RegionOfInterest."""
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "mmsi", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
-"""Lists with a name for each element of another list."""
+"""Names of lists that name the elements of another list."""
 _NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
-"""Fields such as `class_id` and `frame_id` are the same for several objects."""
+"""Words in the names of ids that several objects share, such as `class_id` and `frame_id`."""
 _CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
 _GEOMETRIES = ("Polygon", "MultiPolygon", "Feature")
-"""Types of GeoJSON with an outline, which are no classes."""
+"""GeoJSON types with an outline; a `type` with such a value is not a class."""
 _PLANES = ("level_name", "level", "floor", "floor_name", "storey", "map_name", "map_id", "map")
-"""Fields with the name of the floor, or of the map, that an object is on."""
+"""Names of fields that name the floor or the map of an object."""
 _PARTS = frozenset(
     {
         *(*_POSITIONS, *_TURNS, *_YAWS, *_SIZES, *_OUTLINES, *_NAMES, *_CLASSES),
         *("pose", "min", "max", "start", "end", "from", "to", "goal", "offset", "base"),
     }
 )
-"""Keys of parts of one object; other keys of a JSON object may be names of objects."""
+"""Keys that are parts of one object; other keys of a JSON object may be names of objects."""
 _LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
 _PLANS = frozenset(
     {
@@ -68,7 +68,7 @@ _PLANS = frozenset(
         *("waypoint", "waypoints", "node", "nodes", "edge", "edges", "viapoints"),
     }
 )
-"""Words in the names of lists of places to go to, which are no objects."""
+"""Words in the names of lists of planned places, which are not objects."""
 _NOT_PLACES = frozenset(
     {
         *("velocity", "velocities", "vel", "speed", "acceleration", "accel", "twist", "linear", "angular"),
@@ -76,15 +76,15 @@ _NOT_PLACES = frozenset(
         *("mount", "mounting", "sensor", "camera", "extrinsic", "extrinsics", "calibration"),
     }
 )
-"""Words in the names of fields whose points are no places of objects, such as sensors' mounts."""
+"""Words in the names of fields whose points are not positions of objects, such as mounts of sensors."""
 _ELSEWHERE = frozenset(
     {"goal", "target", "desired", "reference", "home", "last", "next", "previous", "initial"}
 )
-"""Words in the names of positions where an object is to be, or was."""
+"""Words in the names of planned or earlier positions."""
 _VECTORS = re.compile(r"twist|vector3|accel|wrench|imu|cmd_vel|velocity", re.IGNORECASE)
-"""Topics and types whose x and y are no place."""
+"""Topics and types whose x and y are not a position."""
 _TIMES = frozenset({"time", "stamp", "timestamp", "sec", "secs", "nsec", "nsecs", "nanosec", "nanos", "seq"})
-"""Words in the names of numbers that say when, and not what."""
+"""Words in the names of times and counters, which are not signals."""
 _UUID_BYTES = 16
 _FIELD = re.compile(r"[A-Za-z_][\w-]*", re.ASCII)
 _KEY = re.compile(r"[^\[\]{}|=\s]{1,100}", re.ASCII)
@@ -92,24 +92,28 @@ _KEY = re.compile(r"[^\[\]{}|=\s]{1,100}", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """Fields of a message that look like those of an object; texts are field paths.
+    """Likely fields of an object in a message; texts are field paths.
 
     Attributes:
-        objects: of the list of objects, or None for a single one.
-        position: of a point, or of x and y.
-        has_order: whether the orientation is a list, in either order.
-        bounds: of two opposite corners of a box, as a list or as four numbers.
-        bounds_have_size: whether the last two of these numbers are width and height.
+        objects: path of the list of objects; None for a single object.
+        position: path of a point, or paths of x and y.
+        orientation: path of a quaternion.
+        has_order: whether the orientation is a list, so that it needs an order.
+        yaw: path of an angle.
+        polygon: path of an outline.
         is_own: whether the outline is in the object's own frame, at its pose.
-        size: of length, width and maybe height; or of a radius.
-        names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
+        bounds: path of a list of two opposite corners of a box, or paths of four numbers.
+        bounds_have_size: whether the last two of these numbers are width and height.
+        size: paths of length, width and maybe height, or of a radius.
+        names: paths of possible names or ids, the likeliest first; `index` for keys of a JSON object.
+        class_name: path of a class.
         is_in_pixels: whether coordinates look like pixels.
-        is_sizeless: whether the numbers of the size are 0 in all objects.
-        other_outline: of the corners of objects whose size is 0, beside others with a size.
-        plane: of the name of the floor or map that an object is on, if these differ.
+        is_sizeless: whether all objects have size 0.
+        other_outline: path of an outline of objects with size 0, if other objects have a size.
+        plane: path of the name of an object's floor or map, if objects have different ones.
         has_zeros_left_out: whether some objects lack coordinates that others have.
-        others: further lists whose elements look like objects.
-        is_plan: whether the places are those to go to.
+        others: guesses for further lists.
+        is_plan: whether the positions are planned ones.
     """
 
     objects: str | None = None
@@ -134,19 +138,19 @@ class Guess:
 
     @property
     def is_body(self) -> bool:
-        """Whether it has a name and a turn, a size or an outline, as objects beside others have."""
+        """Whether it has a name, and an orientation, a size or an outline; required of further lists."""
         has_extent = bool(self.size or self.polygon or self.bounds or self.orientation or self.yaw)
         return bool(self.names) and has_extent and not self.is_plan
 
     @property
     def has_compass(self) -> bool:
-        """Whether the yaw is a heading beside latitude and longitude, and so counts from north."""
+        """Whether the yaw is a heading next to latitude and longitude, which is an angle from north."""
         is_geodetic = isinstance(self.position, tuple) and geodetic_order(self.position) is not None
         return is_geodetic and self.yaw is not None and _words(self.yaw)[-1] in ("heading", "course", "cog")
 
     @property
     def score(self) -> int:
-        """How many fields of an object there are; a place counts most."""
+        """Number of fields of an object; a place (position, outline or bounds) counts ten."""
         parts = (
             self.polygon or self.bounds,
             self.size,
@@ -159,16 +163,16 @@ class Guess:
 
 
 def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | None:
-    """Find an object, or a list of them, in the messages of a topic; None if nothing looks like one.
+    """Find an object, or a list of objects, in the messages of a topic; None without one.
 
     Args:
-        kind: the type of the messages.
+        kind: type of the messages.
     """
     if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
         return None
     best = _best(messages)
     if best is not None and best.objects is not None and not best.names:
-        # places in a list without ids, on a topic or of a type such as nav_msgs/Path
+        # a list of positions without ids is a plan if its topic or type is named so, such as nav_msgs/Path
         words = (_words(re.split(r"[/.]", name)[-1]) for name in (topic, kind))
         best = replace(best, is_plan=best.is_plan or any(map(_PLANS.intersection, words)))
     if any(isinstance(message, dict) for message in messages):
@@ -180,7 +184,7 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
 
 
 def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
-    """Return whether every object has a position, some without x or y."""
+    """Return whether all objects have a position, but some positions lack x or y."""
     counts = set()
     for message in messages:
         try:
@@ -199,7 +203,7 @@ def _best(messages: Sequence[object]) -> Guess | None:
     guesses = [guess for message in messages if (guess := _guess(message)) is not None]
     if not guesses:
         return None
-    # an outline at a pose near the origin may be in either frame, which another message decides
+    # near the origin an outline may be in either frame; another message decides by `is_own`
     best = _with_evidence(max(guesses, key=lambda guess: (guess.score, guess.is_own)), messages)
     if best.objects is None:
         return best
@@ -209,11 +213,11 @@ def _best(messages: Sequence[object]) -> Guess | None:
 
 
 def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
-    """Return a guess after a look at the values of its fields in all messages."""
+    """Return a guess that is corrected by the values of its fields in all messages."""
     if guess.names == (INDEX,):
         return guess
     if isinstance(guess.position, tuple) and geodetic_order(guess.position):
-        # the frame of a fix is that of its receiver
+        # the frame of a fix names its receiver
         guess = replace(guess, names=(*guess.names, "frame_id"))
     names = tuple(name for name in guess.names if _distinguishes(name, guess, messages))
     with suppress(FieldError):
@@ -229,7 +233,7 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
 
 
 def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
-    """Yield paths of lists next to that of the objects, which have a name for each of them."""
+    """Yield paths of lists next to the list of objects that name each object."""
     if guess.objects is None or guess.objects.count("[*]") > 1:
         return
     prefix = guess.objects.rpartition(".")[0]
@@ -249,10 +253,10 @@ def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
 
 
 def signals_in(message: object) -> tuple[str, ...]:
-    """Return the paths of the numbers and truth values in a message, but for times and the header.
+    """Return the paths of numbers and truth values in a message, without times and the header.
 
-    A list is found only next to a list `name`, such as `position[name=elbow]`; a text only where it is the
-    whole message, as of `std_msgs/String`.
+    Elements of a list need a list `name` next to it, as in `position[name=elbow]`. A text is a signal only if
+    it is the field `data`, as in `std_msgs/String`.
     """
     paths: list[str] = []
     for path, value in _iter_fields(message, is_skipped=_is_time):
@@ -272,7 +276,7 @@ def signals_in(message: object) -> tuple[str, ...]:
 
 
 def frame_of(message: object) -> str | None:
-    """Return the frame of a message's coordinates, if the message names it."""
+    """Return the frame of a message's coordinates; None without one."""
     for path, value in _iter_fields(message, is_skipped=lambda name: False):
         if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
             return value.removeprefix("/")
@@ -293,7 +297,7 @@ def _guess(message: object) -> Guess | None:
 
 
 def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
-    """Return whether a field has another value in each object of a message, or in each sender's messages."""
+    """Return whether a field distinguishes the objects of a message or, for single objects, the senders."""
     try:
         texts = [
             [str(walk(FieldPath.of(name), element)) for element in _objects_in(guess, message)]
@@ -307,7 +311,7 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
 
 
 def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None:
-    """Return the path of the corners of objects whose size is 0."""
+    """Return the path of the corners of objects with size 0; None without such objects."""
     with suppress(FieldError):
         for element in (element for message in messages for element in _objects_in(guess, message)):
             if not any(walk(FieldPath.of(path), element) for path in guess.size[:2]):
@@ -316,7 +320,7 @@ def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None
 
 
 def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -> Iterator[object]:
-    """Iterate over the values at some paths in all objects, where they lead somewhere."""
+    """Iterate over the values at some paths in all objects; paths that do not resolve are skipped."""
     for message in messages:
         for path in paths:
             with suppress(FieldError):
@@ -324,9 +328,9 @@ def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -
 
 
 def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> bool:
-    """Return whether most objects of the second list are where some of the first are.
+    """Return whether most objects of the second list are at the places of objects of the first.
 
-    Two lists then have the same objects, such as detections and tracks.
+    Such lists, for example detections and tracks, have the same objects.
     """
     near = count = 0
     with suppress(FieldError, TypeError):
@@ -340,11 +344,11 @@ def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> boo
 
 
 _SAME_PLACE = 0.2
-"""Two objects in two lists are nearer only if they are one."""
+"""Distance within which objects of two lists are the same object, units of the log."""
 
 
 def _place_of(guess: Guess, element: object) -> tuple[float, ...]:
-    """Return the position of an object, or the first number of its outline or bounds."""
+    """Return the position of an object, or the first corner of its outline or bounds."""
     if isinstance(guess.position, tuple):
         return tuple(float(walk(FieldPath.of(path), element)) for path in guess.position)  # type: ignore[arg-type]
     if guess.position is not None:
@@ -358,13 +362,13 @@ def _objects_in(guess: Guess, message: object) -> Iterator[object]:
     """Iterate over the objects in a message.
 
     Raises:
-        FieldError: the message has no such list.
+        FieldError: the message lacks the list.
     """
     return iter([message]) if guess.objects is None else iter_elements(FieldPath.of(guess.objects), message)
 
 
 def takes_turns(texts: Sequence[str]) -> bool:
-    """Return whether successive texts name several things: one returns after another, unlike a counter."""
+    """Return whether a text returns after another one, as names of several senders do, unlike a counter."""
     starts = [text for text, before in zip(texts, (None, *texts), strict=False) if text != before]
     return len(set(starts)) < len(starts)
 
@@ -377,15 +381,15 @@ def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
         elif is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
             last = path.split(".")[-1]
-            # the corners of an outline are points, not objects
+            # corners of an outline are points instead of objects
             if guess is not None and not (last in _OUTLINES and guess.score <= 10):
                 yield f"{path}[*]", replace(guess, is_plan=not _PLANS.isdisjoint(_words(last)))
 
 
 def _table_of_objects(value: object) -> list[object]:
-    """Return the objects that a protobuf map or a JSON object has by their names.
+    """Return the objects in a protobuf map or a JSON object whose keys are names; [] for other values.
 
-    A JSON object that is a map has at least two, and all alike.
+    A JSON object counts as a map if it has at least two objects, all with the same fields.
     """
     if not isinstance(value, Mapping):
         return []
@@ -409,7 +413,7 @@ def _object_in(value: object) -> Guess | None:
         place = _point(fields[position]) or (0.0, 0.0)
         is_own = not _is_around(corners, place) and _is_around(corners, (0.0, 0.0))
         if not is_own and not _is_around(corners, place):
-            # such as pixels beside a pose in metres
+            # the outline is elsewhere, such as pixels next to a pose in metres
             polygon, corners = None, []
     if polygon is not None or position is not None:
         bounds = None
@@ -439,7 +443,7 @@ def _object_in(value: object) -> Guess | None:
 
 
 def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float, ...]]]:
-    """Return the path of an outline and its corners, if there is one."""
+    """Return the path of an outline and its corners; (None, []) without one."""
     for path in _paths_by_name(fields, _OUTLINES):
         value = fields[path]
         if not is_list(value) and "points" in field_names(value):
@@ -447,7 +451,7 @@ def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float
         if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
             return path, [point for corner in value if (point := _point(corner)) is not None]
     for path in _paths_by_name(fields, ("geometry",)):
-        # of GeoJSON
+        # a geometry of GeoJSON
         names = field_names(fields[path])
         if "coordinates" in names and get_field(fields[path], "type") in _GEOMETRIES:
             return path, list(_corners_in(get_field(fields[path], "coordinates")))
@@ -463,7 +467,7 @@ def _corners_in(rings: object) -> Iterator[tuple[float, ...]]:
 
 
 def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
-    """Return the path, or the four paths, of the bounds of a box along the axes."""
+    """Return the path of the bounds of a box, or the paths of their four numbers; None without bounds."""
     for path in _paths_by_name(fields, _BOUNDS):
         if _numbers(fields[path], 4):
             return path
@@ -473,16 +477,16 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
     for names in _FOUR_BOUNDS:
         if all(name in paths for name in names):
             left, low, right, top = (float(fields[paths[name]]) for name in names)  # type: ignore[arg-type]
-            # ends of a line come in any order
+            # in another order they are the ends of a line, not corners of a box
             return tuple(paths[name] for name in names) if left <= right and low <= top else None
     return None
 
 
 def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]:
-    """Return the four numbers of the bounds of an object.
+    """Return the four numbers of the bounds of an object; () if the value is no list of four numbers.
 
     Raises:
-        FieldError: there are none.
+        FieldError: a path does not resolve.
     """
     numbers = [
         walk(FieldPath.of(path), element) for path in (bounds if isinstance(bounds, tuple) else [bounds])
@@ -491,7 +495,10 @@ def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]
 
 
 def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
-    """Return whether bounds have width and height: as corners, some lie left of or below the first."""
+    """Return whether bounds have width and height instead of a second corner.
+
+    Names decide; without such names, a second corner left of or below the first in some box does.
+    """
     bounds = guess.bounds
     if bounds is None or isinstance(bounds, tuple):
         return bounds is not None and _words(bounds[-1].split(".")[-1])[-1] == "height"
@@ -505,7 +512,7 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
 
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
-    """Return the paths of a position and an orientation, of one pose if there is one."""
+    """Return the paths of a position and an orientation, preferably those of one pose."""
     turns = [
         path
         for path in _paths_by_name(fields, _TURNS)
@@ -513,9 +520,9 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
     ]
     places = [
         path
-        # such as `position`, else `agvPosition`
+        # first names such as `position`, then names such as `agvPosition`
         for path in (*_paths_by_name(fields, _POSITIONS), *_paths_by_last_word(fields, _POSITIONS))
-        # the positions of joints stand beside a list of their names
+        # positions next to a list of names are those of joints, as in sensor_msgs/JointState
         if _point(fields[path]) is not None
         and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
     ]
@@ -532,7 +539,7 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
 
 
 def _point(value: object) -> tuple[float, ...] | None:
-    """Return the coordinates of a point: of a message with x and y, or of a list of two or three numbers."""
+    """Return the coordinates of a point: a message with x and y, or a list of two or three numbers."""
     if _has(value, "xy"):
         names = "xy" if isinstance(value, Sparse) else field_names(value)
         return tuple(float(get_field(value, name)) for name in "xyz" if name in names)  # type: ignore[arg-type]
@@ -540,7 +547,7 @@ def _point(value: object) -> tuple[float, ...] | None:
 
 
 def _numbers(value: object, count: int) -> list[float]:
-    """Return the numbers of a list that has so many; an empty list for anything else."""
+    """Return the elements of a list of `count` numbers; [] for other values."""
     if not is_list(value) or len(value) != count:
         return []
     numbers = [float(number) for number in value if is_number(number) and number is not None]  # type: ignore[arg-type]
@@ -548,19 +555,19 @@ def _numbers(value: object, count: int) -> list[float]:
 
 
 def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
-    """Return whether an outline lies around a place; at most its own size apart."""
+    """Return whether a place is inside the box around an outline, enlarged by the outline's size."""
     low, high = (tuple(pick(corner[axis] for corner in corners) for axis in (0, 1)) for pick in (min, max))
     size = sum(high) - sum(low)
     return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
 
 
 _PIXELS = 50
-"""Coordinates in pixels reach beyond this as a rule, and are not below 0."""
+"""Coordinate that pixels usually exceed."""
 _IMAGES = re.compile("pixel|image|bbox|keypoint", re.IGNORECASE)
 
 
 def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
-    """Return whether points, whose z is 0 if there is one, or two corners in a row, look like pixels."""
+    """Return whether points, or boxes of four numbers, look like pixels: large, not negative, without z."""
     flat = [number for point in points for number in (point if len(point) > 3 else point[:2])]
     is_flat = not any(point[2] for point in points if len(point) == 3)
     return bool(flat) and is_flat and min(flat) >= 0 and max(flat) >= _PIXELS
@@ -582,7 +589,7 @@ def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
 
 
 def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
-    """Return the paths of what may distinguish objects: a name or an id, then such as `fiducial_id`."""
+    """Return the paths of fields that may distinguish objects: names and ids, then such as `fiducial_id`."""
     others = [
         path
         for path in fields
@@ -596,7 +603,7 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
         if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
             names.append(path)
         elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
-            # ids in lists, of one number or of the bytes of a UUID
+            # a list of one id, or of the bytes of a UUID
             names.append(path)
         elif inner := next((name for name in ("value", "uuid") if name in field_names(value)), None):
             names.append(f"{path}.{inner}")
@@ -609,14 +616,17 @@ def _words(name: str) -> list[str]:
 
 
 def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
-    """Return the paths that end in one of some names, by depth, then in the order of the names."""
+    """Return the paths whose last name is in `names`, by depth, then in the order of `names`."""
     ends = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
     paths = [path for path in fields if ends[path] in names]
     return sorted(paths, key=lambda path: (path.count("."), names.index(ends[path])))
 
 
 def _paths_by_last_word(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
-    """Return the paths whose last name has further words before one of some names, by depth."""
+    """Return the paths whose last name ends in a word of `names` after other words, by depth.
+
+    Names of planned or earlier positions are excluded.
+    """
     words_of = {path: _words(path.split(".")[-1]) for path in fields}
     paths = [
         path
@@ -651,7 +661,7 @@ def _iter_fields(
 
 
 def _list_rank(path: str) -> int:
-    """Return how well the name of a list suits objects that move."""
+    """Return a rank of a list by its name; lists of moving objects have the highest."""
     last = path.removesuffix("[*]").split(".")[-1].lower()
     return 2 * ("moving" in last or "dynamic" in last) + bool(_LISTS.search(last))
 
@@ -661,7 +671,7 @@ def _is_number(value: object) -> bool:
 
 
 def _has(value: object, names: str) -> bool:
-    """Return whether a message has numbers as fields with these names of one letter."""
+    """Return whether a message has a number in each of the fields with these one-letter names."""
     fields = field_names(value)
     if isinstance(value, Sparse):
         allowed = "xyz" if names == "xy" else names

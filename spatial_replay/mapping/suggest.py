@@ -1,6 +1,6 @@
 """Suggest a mapping file: the topics of a log and example messages in, YAML with comments out.
 
-A topic of a known type needs no fields. In other messages, `object_fields` finds them.
+The entry of a built-in type needs no fields. In messages of other types, `object_fields` finds them.
 """
 
 from __future__ import annotations
@@ -65,20 +65,20 @@ from spatial_replay.text import plural
 from spatial_replay.trace.trace import FOREVER
 
 EXAMPLES = 20
-"""First messages of each topic to decode; of later ones, ever fewer."""
+"""First messages of each topic to decode; later ones are decoded more and more rarely."""
 
 _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
 _ONE_CLOCK_S, _EXACT_S = 5.0, 0.05
-"""Stamps of one clock are recorded within this of each other; delays below the second do not matter."""
+"""Greatest difference of median delays on one clock, and greatest delay that does not matter, seconds."""
 _NO_TIMES: Mapping[str, Sequence[int]] = MappingProxyType({})
 _MOST_SIGNALS = 12
 _MOST_LISTS = 6
 _TEXTS = frozenset({"name", "label"})
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
-"""Topics about programs rather than objects, by the last part of their names."""
+"""Last parts of names of topics about programs instead of objects."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
-"""Names of frames that are mounted on an object."""
+"""Names of sensor frames, which are mounted on objects."""
 _NORTH_EAST_DOWN = re.compile(
     r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position|vehicle_odometry)(?![a-z0-9])", re.IGNORECASE
 )
@@ -86,13 +86,13 @@ _NORTH_EAST_DOWN = re.compile(
 _MAVROS = re.compile(r"(?<![a-z0-9])mavros(?![a-z0-9])", re.IGNORECASE)
 
 _LARGEST_SUGGESTION = LARGEST_TEXT // 2
-"""Bytes of a suggestion, so that a reader's additions fit, too."""
+"""Size limit of a suggestion, bytes; half of the limit of mappings, so that a user can add to it."""
 _LONGEST_KEY = 500
-"""Characters of a topic's name, which are in keys; YAML allows 1024 in one."""
+"""Length limit of a topic's name, which is a key; YAML allows 1,024 characters in a key."""
 
 _Axes: TypeAlias = Literal["plane", "north", "image"]
 _AXES: Mapping[_Axes, str] = MappingProxyType({"plane": "", "north": "x north, y east", "image": "in pixels"})
-"""Axes of coordinates, in words. One scene has one kind: the first of these that a log has is suggested."""
+"""Kinds of axes, in words. A scene has one kind, and the first of these in a log is suggested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,19 +100,18 @@ class TopicSuggestion:
     """A suggestion for one topic.
 
     Attributes:
-        fields: its entry in a mapping, by key, in YAML's flow style; None if nothing looks like an object.
-        path: of the list of objects.
-        further: suggestions for further lists of objects in its messages.
-        name: the template of its objects' names, by default or as in the entry.
-        remarks: what a reader should know or change.
-        is_transforms: whether it carries transforms. They are suggested as objects only if there are no
-            others.
-        frames: those of its coordinates, as the suggested entry reads them.
-        axes: those of its coordinates.
+        fields: entry of a mapping, values in YAML's flow style by key; None if no field looks like an object.
+        name: template of its objects' names, by default or as in the entry.
+        remarks: notes for the user, which become comments.
+        is_transforms: whether its messages are transforms, which are objects only in a log without others.
+        frames: frames of its coordinates, according to the entry.
+        axes: kind of axes of its coordinates.
         numbers: paths of possible signals.
-        aside: why the entry is not used as it is; empty where it is.
-        layout: where the fields of objects are, by the entry.
-        lateness_s: (N,) how much later messages were recorded than their stamps say; None without a clock.
+        aside: reason why the entry is not used; "" if it is used.
+        layout: layout of the entry; None without one.
+        lateness_s: (N,) time from stamps of messages to their recording; None if stamps are not a clock.
+        path: path of the list of objects.
+        further: suggestions for further lists of objects in its messages.
     """
 
     topic: Topic
@@ -131,19 +130,19 @@ class TopicSuggestion:
 
     @property
     def entry(self) -> str:
-        """The entry in YAML's flow style; empty if nothing looks like an object."""
+        """Entry in YAML's flow style; "" if no field looks like an object."""
         entries = ", ".join(self.entries)
         return f"[{entries}]" if self.further else entries
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """The entry of each list of objects; none if nothing looks like one."""
+        """Entry of each list of objects; () if no field looks like an object."""
         suggestions = (self, *self.further)
         return tuple(flow_text(part.fields) for part in suggestions if part.fields is not None)
 
     @property
     def signals(self) -> str:
-        """An entry that takes the numbers as signals; empty without any."""
+        """Entry that reads the numbers as signals; "" without numbers."""
         prefix = _topic_words(self.topic.name)
         names = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
         signals = flow_text({yaml_text(name): yaml_text(path) for name, path in names.items()})
@@ -158,8 +157,8 @@ def suggest_topics(
     """Suggest an entry for each topic.
 
     Args:
-        examples: some decoded messages of each topic, by its name.
-        times_ns: when each of these was recorded; by default, each second.
+        examples: some decoded messages of each topic, by name.
+        times_ns: log times of these messages, by topic; by default, one second apart.
     """
     suggestions = []
     for topic in topics:
@@ -178,12 +177,12 @@ def suggest_mapping(
 ) -> str:
     """Return the text of a mapping file, with comments.
 
-    It is valid if some topic holds objects or signals.
+    It is a valid mapping if a topic has objects or signals.
 
     Args:
-        log: the log's name.
-        examples: some decoded messages of each topic, by its name.
-        times_ns: when each of these was recorded, in their order.
+        log: name of the log.
+        examples: some decoded messages of each topic, by name.
+        times_ns: log times of these messages, by topic.
     """
     suggestions = suggest_topics(topics, examples, times_ns)
     first_ns = {name: times[0] for name, times in times_ns.items() if times}
@@ -252,7 +251,7 @@ def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
 
 
 def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
-    """Return the first texts, up to a number of bytes."""
+    """Return the first (name, text) pairs whose texts fit into `most` bytes."""
     texts_that_fit: list[tuple[str, str]] = []
     for name, text in texts:
         most -= len(text.encode()) + 1
@@ -263,7 +262,7 @@ def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[s
 
 
 def _with_distinct_names(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
-    """Return suggestions with the topic in those names that several topics share."""
+    """Return suggestions in which names shared by several topics are prefixed by the topic."""
     lists = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in active}
     shared = Counter(part.name for parts in lists.values() for part in parts)
     return [
@@ -279,10 +278,10 @@ def _with_frame_remark(suggestion: TopicSuggestion) -> TopicSuggestion:
 
 
 def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
-    """Return a suggestion with a word before the names of its objects."""
+    """Return a suggestion with a prefix of the names of its objects."""
     name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
     fields = {**(suggestion.fields or {}), "name": yaml_text(name)}
-    # of a list, its path comes first
+    # `objects` first, then `name`, as in handwritten mappings
     ordered = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
     further = tuple(_with_prefix(part, prefix) for part in suggestion.further)
     return replace(suggestion, fields=dict(ordered), name=name, further=further)
@@ -291,7 +290,7 @@ def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
 def _with_trial(
     suggestion: TopicSuggestion, examples: Sequence[object], times_ns: Sequence[int]
 ) -> TopicSuggestion:
-    """Return a suggestion after reading messages by it; it is aside where that fails."""
+    """Return a suggestion after a trial on messages; it is put aside if the messages cannot be read."""
     topic, layout = suggestion.topic, suggestion.layout
     entry = suggestion.entry or suggestion.signals
     if not entry or not examples or suggestion.is_transforms:
@@ -327,7 +326,7 @@ def _with_trial(
 def _origin_lines(
     active: Sequence[TopicSuggestion], examples: Mapping[str, Sequence[object]]
 ) -> Iterator[str]:
-    """Yield the line about where local metres are counted from: the first fix."""
+    """Yield the lines of the `origin`, which is the first fix."""
     for suggestion in active:
         layout = suggestion.layout
         place = None if layout is None else _first_fix(layout, examples.get(suggestion.topic.name, ()))
@@ -359,7 +358,7 @@ def _first_corner(message: object) -> tuple[float, float] | None:
 
 
 def _place_of_fix(fix: object, paths: Sequence[str]) -> tuple[float, float] | None:
-    """Return latitude and longitude; None without a fix, also where zeros stand for its lack."""
+    """Return latitude and longitude in degrees; None without a fix, or if both are 0."""
     status = FieldPath.of("status.status")
     try:
         latitude, longitude = (float(walk(FieldPath.of(path), fix)) for path in paths)  # type: ignore[arg-type]
@@ -367,7 +366,7 @@ def _place_of_fix(fix: object, paths: Sequence[str]) -> tuple[float, float] | No
     except (FieldError, TypeError, ValueError):
         return None
     if 90 < abs(latitude) <= 90e7 and abs(longitude) <= 360e7:
-        # whole numbers, as of MAVLink
+        # MAVLink sends integers, degrees * 10^7
         latitude, longitude = round(latitude * 1e-7, 7), round(longitude * 1e-7, 7)
     is_place = abs(latitude) <= 90 and abs(longitude) <= 360 and (latitude, longitude) != (0.0, 0.0)
     return (latitude, longitude) if is_fix and is_place else None
@@ -383,7 +382,7 @@ def _axes_lines(axes: _Axes) -> Iterator[str]:
 
 
 def _suggestions(topic: Topic, examples: Sequence[object]) -> list[TopicSuggestion]:
-    """Return a suggestion for each list of objects in the messages of a topic; at least one."""
+    """Return one suggestion per list of objects in a topic's messages; at least one suggestion."""
     is_ours = has_our_type(Channel(topic.name, topic.encoding, topic.schema))
     if is_ours or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
         return [TopicSuggestion(topic)]
@@ -408,7 +407,7 @@ def _of_known_type(topic: Topic, reading: MessageLayout, examples: Sequence[obje
     name = reading.name.replace("{topic}", name_from_topic(topic.name))
     fields: Mapping[str, str] = {} if has_outline else _POINT
     if reading.name == "{topic}" and takes_turns(_children(examples)):
-        # such as the odometry of several robots on one topic
+        # several children on one topic, such as the odometry of several robots
         name = "{child_frame_id}"
         fields = {"name": yaml_text(name), **fields}
     remarks = () if has_outline else _SIZELESS
@@ -428,7 +427,7 @@ def _of_guess(topic: Topic, guess: Guess, examples: Sequence[object]) -> TopicSu
 
 
 def _join_lists(lists: Sequence[TopicSuggestion]) -> TopicSuggestion:
-    """Return one suggestion for a topic, with the entries of further lists in its messages."""
+    """Join the suggestions for lists of objects of a topic into one."""
     first, *others = lists
     further = [
         suggestion
@@ -460,7 +459,7 @@ def _with_frames(
     name: str,
     remarks: tuple[str, ...],
 ) -> TopicSuggestion:
-    """Return a suggestion with the frames and axes of its coordinates, and how long they stay valid."""
+    """Return a suggestion with the frames and axes of its coordinates, and `max_age` if it is needed."""
     frames = frozenset(_iter_frames(layout, examples))
     fields = {**fields, "max_age": "forever"} if layout.stays or topic.latched else fields
     axes: _Axes = "plane"
@@ -483,7 +482,7 @@ def _children(messages: Sequence[object]) -> list[str]:
 
 
 def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]) -> bool:
-    """Return whether names of the objects in some messages fall back on their places in a list."""
+    """Return whether names of some objects fall back on their indices in a list."""
     if f"{INDEX}}}" not in layout.name:
         return False
     namer = Namer(NameTemplate.of(layout.name), topic.name, Codes(), (), ())
@@ -495,7 +494,7 @@ def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]
 
 
 def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
-    """Yield the frame of each object, where the layout looks for it."""
+    """Yield the frame of each object that has one according to the layout."""
     alternatives = [FieldPath.of(path) for path in layout.frame]
     for message, element in _iter_objects(layout, examples):
         roots = [(path, message if path.from_message else element) for path in alternatives]
@@ -505,7 +504,7 @@ def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[
 
 
 def _iter_objects(layout: MessageLayout, examples: Sequence[object]) -> Iterator[tuple[object, object]]:
-    """Yield each message with each object in it."""
+    """Yield (message, object) for each object in the messages."""
     path = FieldPath.of(layout.objects) if layout.objects else None
     for message in examples:
         try:
@@ -517,7 +516,7 @@ def _iter_objects(layout: MessageLayout, examples: Sequence[object]) -> Iterator
 
 
 def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
-    """Suggest the frames of transforms, without those that are mounted on others."""
+    """Suggest the child frames of transforms as objects, without frames of sensors."""
     if topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static":
         remark = "static transforms place frames, such as those of sensors; they are no objects"
         return TopicSuggestion(topic, remarks=(remark,), is_transforms=True)
@@ -605,7 +604,7 @@ def _name(topic: Topic, guess: Guess) -> str:
         return name_from_topic(topic.name)
     path = guess.names[0] if guess.names else INDEX
     if guess.names and (path == INDEX or path.startswith("$.") or path.split(".")[-1] in _TEXTS):
-        # names by themselves, and not numbers that need a word
+        # the value is a name; a number would need a word in front
         return f"{{{path}}}"
     word = name_from_topic(topic.name) if guess.objects is None else guess.objects.removesuffix("[*]")
     return f"{re.sub('(?<=x)es$|s$', '', word.split('.')[-1]) or 'object'}{{{path}}}"
@@ -640,13 +639,13 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
 def _choose_frame(
     mapped: Sequence[TopicSuggestion], transforms: Sequence[object]
 ) -> tuple[list[str], dict[str, str]]:
-    """Choose the frame of the scene, in which most topics can be placed.
+    """Choose the fixed frame as the frame in which most topics can be placed.
 
     Args:
         transforms: messages with transforms.
 
     Returns:
-        The lines about it, and for each topic in other frames only, why it is apart.
+        Lines of the mapping, and the reason why a topic cannot be placed, by topic.
     """
     frames = sorted(frozenset().union(*(suggestion.frames for suggestion in mapped)))
     edges = sorted({edge for message in transforms for edge in _edges(message)})
@@ -678,7 +677,7 @@ def _choose_frame(
 
 
 def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
-    """Return a frame and all those that transforms place in it."""
+    """Return a frame and all frames below it in the tree of transforms."""
     below = {root}
     while more := {child for parent, child in edges if parent in below} - below:
         below |= more
@@ -712,7 +711,7 @@ def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) 
 
 
 def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
-    """Return the clock, and why: stamps count if messages of one time were recorded apart."""
+    """Return the clock and the reason: stamps are used if delays of recording differ too much."""
     late = [(suggestion.topic.name, suggestion.lateness_s) for suggestion in active]
     without = [topic for topic, lateness in late if lateness is None]
     medians = {topic: float(np.median(lateness)) for topic, lateness in late if lateness is not None}
@@ -739,7 +738,10 @@ def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
 
 
 def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
-    """Choose the topic to sample: the last to start of those that start together, so that none is missing."""
+    """Choose the topic to sample: of the frequent topics that start together, the last to start.
+
+    So all of these topics have a message at the first sample.
+    """
     topics = [suggestion.topic for suggestion in active]
     begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
     often = max(topic.count or 0 for topic in topics)
@@ -768,7 +770,7 @@ def _description(topic: Topic) -> str:
 
 
 def _comment(text: str) -> str:
-    """Return a text that fits on one line."""
+    """Return a text on one line, of at most 200 characters."""
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())[
         :200
     ]
