@@ -1,4 +1,4 @@
-"""The samples of one instance, read again on each request, and what is missing in them."""
+"""Evidence for witnesses: the samples of one instance, read again on each request, and their gaps."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ from spatial_replay.trace.trace import ABSENT, Trace, window_of
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """An object or a signal that some samples lack, or a pause of all samples.
+    """The samples that lack an object or a signal, or pauses of all samples.
 
     Attributes:
-        name: of the object, or the signal in quotes; None for a pause, whose samples only fill it.
-        missing, samples: in how many of how many samples it is missing.
-        first_ns, last_ns: the first and the last of these.
-        window: the start, and the end (not included), of the samples between missing ones at the ends of a
-            log; None if others are missing. A member of a class that comes later, or leaves, has none.
-        longest_ns: the first sample of the longest stretch without it, and the first one after, if any.
-        is_filled: whether samples fill that stretch to its end, as `max_gap` does: a lost connection has one.
+        name: title of the object or signal (see `NamedPart`); None for pauses.
+        missing: number of samples that lack it, or that fill pauses.
+        samples: number of all samples.
+        first_ns, last_ns: times of the first and the last missing sample.
+        window: start and end (not included) of the samples that have it, if it is missing only at the ends
+            of the log; else None. None also for an object with a class that comes later, or leaves.
+        longest_ns: times of the first sample of its longest gap, and of the first sample after it.
+        is_filled: whether that gap is filled to its end, as by `max_gap`; a lost connection adds only
+            a sample at its beginning.
     """
 
     name: str | None
@@ -45,7 +47,7 @@ class Gap:
 
 
 class Evidence:
-    """The samples of one instance, read again on each request: a log need not fit into memory."""
+    """The samples of one instance, read again on each request, so that a log need not fit into memory."""
 
     def __init__(
         self,
@@ -55,12 +57,13 @@ class Evidence:
         units: Mapping[str, str] = MappingProxyType({}),
         zero_ns: int | None = None,
     ) -> None:
-        """Store how to read the samples.
+        """Store access to the samples.
 
         Args:
-            traces: iterates over the samples, with those looked back at, in blocks of any length.
-            units: those that the log declares, of signals by their names, of lengths by "".
-            zero_ns: the time that sentences count from; None for that of the first sample.
+            traces: iterates over the samples in blocks of any length, with earlier samples for terms that
+                look back.
+            units: declared units of the log, of signals by name, of lengths under "".
+            zero_ns: reference time of sentences; None for the time of the first sample.
         """
         self._zero_ns = zero_ns
         self.instance = instance
@@ -70,20 +73,20 @@ class Evidence:
         self._reach = instance.reach
 
     def bound(self, formula: Formula) -> Formula:
-        """Bind a formula of the instance to the object that it is about."""
+        """Bind a formula of the instance to the object of the instance."""
         return substitute(formula, self.instance.bindings)
 
     def scene(self, time_ns: int) -> TraceScene:
-        """Return the one sample of that time, with the earlier ones that it may look back at.
+        """Return the sample at a time, with the earlier samples that its terms look back at.
 
         Raises:
-            LookupError: there is none; the log changed since it was evaluated.
+            LookupError: there is no such sample, because the log changed since its evaluation.
         """
         return self.scenes([time_ns])[time_ns]
 
     def scenes(self, times_ns: Collection[int]) -> dict[int, TraceScene]:
-        """Return the sample of each of some times, as `scene` does, in one pass over the log."""
-        # in reverse, so that `pop` takes the earliest
+        """Return the samples at several times, as `scene` does, in one pass over the log."""
+        # in descending order, so that `pop` removes the earliest
         pending, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
         for scene in self._scenes() if pending else ():
             trace = scene.trace
@@ -111,11 +114,11 @@ class Evidence:
         bindings = self.instance.bindings
         if not any(isinstance(formula, Quantified) for formula in formulas):
             return leaf_values(scene, formulas, bindings)
-        # one call a formula: the limit of bindings counts all formulas of a call
+        # one call per formula, because the limit of bindings counts all formulas of a call
         return joined_channels([leaf_values(scene, [formula], bindings) for formula in formulas], axis=1)
 
     def first_ns(self) -> int:
-        """Return the zero, or else the time of the first sample, those looked back at included."""
+        """Return `zero_ns`; by default the time of the first sample, even one before the instance."""
         if self._zero_ns is not None:
             return self._zero_ns
         return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
@@ -126,10 +129,10 @@ class Evidence:
         return np.concatenate([scene.trace.times_ns[scene.skip :][self._inside(scene)] for scene in scenes])
 
     def gaps(self, formula: Formula, time_ns: int = -1) -> tuple[Gap, ...]:
-        """Return when each object and signal that a formula names is missing, for those that ever are.
+        """Return the gaps of objects and signals in a formula, one for each that is ever missing.
 
         Args:
-            time_ns: if a pause of the samples contains it, that one is the longest.
+            time_ns: a pause that contains this time counts as the longest.
         """
         kinds = named_parts(formula)
         parts: list[NDArray[np.bool_]] = []
@@ -152,7 +155,7 @@ class Evidence:
         return tuple(gaps)
 
     def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
-        """Return (G, T), in which samples each open group has a member, or may have had one."""
+        """Return (G, T), whether each open group has a member, or may have one, in each sample."""
         parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes() if groups else ():
             inside = self._inside(scene)
@@ -163,16 +166,16 @@ class Evidence:
         return np.concatenate(parts, axis=1) if parts else np.empty((0, 0), np.bool_)
 
     def _inside(self, scene: TraceScene) -> slice:
-        """Return which samples of a scene the instance is evaluated over."""
+        """Return the samples of a scene that the instance is evaluated over."""
         times_ns = scene.trace.times_ns[scene.skip :]
         return slice(*window_of(times_ns, self.instance.start_ns, self.instance.end_ns))
 
     def _scenes(self) -> Iterator[TraceScene]:
-        """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
+        """Iterate over the samples in blocks, with the earlier samples that their terms look back at."""
         previous_trace: Trace | None = None
         for trace in self._traces():
             if len(trace) and trace.times_ns[0] >= self.instance.end_ns:
-                # an object of a template is there for a part of the log only
+                # the instance of a template may end long before the log
                 return
             skip = 0
             if previous_trace is not None and self._reach:
@@ -185,7 +188,7 @@ class Evidence:
 
 
 class NamedPart(NamedTuple):
-    """An object or a signal that a formula names."""
+    """An object or a signal in a formula."""
 
     name: str
     is_signal: bool
@@ -197,7 +200,7 @@ class NamedPart(NamedTuple):
 
 
 def named_parts(formula: Formula) -> list[NamedPart]:
-    """Return the signals and objects that a formula names, each once."""
+    """Return the named signals and objects of a formula, each once."""
     atoms = list(iter_atoms(formula))
     parts = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
     terms = [term for atom in atoms if atom.relation != "present" for term in atom.terms]
@@ -206,14 +209,14 @@ def named_parts(formula: Formula) -> list[NamedPart]:
 
 
 def _object_names(base: Term) -> tuple[str, ...]:
-    """Return the objects that a term names, itself or as the members of a group."""
+    """Return the named objects of a term, members of groups included."""
     if isinstance(base, Group):
         return named_members(base)
     return (base.name,) if isinstance(base, TrackedName) else ()
 
 
 def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
-    """Return (T,), in which samples an object is not seen, or a signal has no finite value."""
+    """Return (T,), whether an object has no known position, or a signal no finite value, in each sample."""
     name = part.name
     if part.is_signal:
         values = trace.signals.get(name)
@@ -224,7 +227,7 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
 
 
 def _is_absent(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
-    """Return (T,), in which samples an object does not exist, instead of being unknown."""
+    """Return (T,), whether an object is absent, not only unknown, in each sample."""
     if part.is_signal or part.name not in trace.names:
         return np.full(len(trace), not part.is_signal)
     return np.asarray(trace.rows[:, trace.names.index(part.name)] == ABSENT)
@@ -244,7 +247,7 @@ def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_
     last = len(missing) - 1
     turns = np.flatnonzero(np.diff(missing, prepend=False, append=False))
     starts, ends = turns[::2], turns[1::2]
-    # leading and trailing samples, without another one between
+    # missing samples are only leading or trailing ones
     is_at_ends = bool(((starts == 0) | (ends > last)).all()) and not missing.all()
     window_start = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
     window_end = int(times_ns[starts[-1]]) if ends[-1] > last else None

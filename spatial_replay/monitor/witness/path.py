@@ -1,7 +1,7 @@
-"""The path from a node to the leaf that decides it, and the atom that decides that leaf at its sample.
+"""The deciding path of a node: from the node to its deciding leaf and atom, at the deciding sample.
 
-Robustness consists of minima and maxima only, so each number is that of one leaf at one sample, perhaps
-negated. The path to it follows one end of the interval (see `End`).
+Robustness consists of minima and maxima only, so it equals the number of one leaf at one sample, perhaps
+negated. The path to this leaf follows one end of the interval (see `End`).
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ Interval = tuple[float, float]
 
 
 class End(Enum):
-    """Which end of an interval decides.
+    """The deciding end of an interval.
 
-    The low end shows why a formula is satisfied (it is at least 0), the high end why it is violated. Where
-    neither is so, the formula is `OPEN`: followed along the low ends of minima and the high ends of maxima,
-    it leads to an operand that is itself open.
+    The low end decides a satisfied formula, because it is at least 0. The high end decides a violated one.
+    Other formulas are `OPEN`: their path follows the low ends of minima and the high ends of maxima, and ends
+    at an operand that is itself open.
     """
 
     LOW = "low"
@@ -94,15 +94,15 @@ class End(Enum):
 
     @property
     def turned(self) -> End:
-        """The end for the operand of a negation."""
+        """The deciding end of a negation's operand."""
         return {End.LOW: End.HIGH, End.HIGH: End.LOW, End.OPEN: End.OPEN}[self]
 
     def of_minimum(self, low: _Number, high: _Number) -> _Number:
-        """Return the numbers by which a minimum chooses its operand."""
+        """Return the numbers that a minimum compares to choose its operand."""
         return high if self is End.HIGH else low
 
     def of_maximum(self, low: _Number, high: _Number) -> _Number:
-        """Return the numbers by which a maximum chooses its operand."""
+        """Return the numbers that a maximum compares to choose its operand."""
         return low if self is End.LOW else high
 
 
@@ -122,8 +122,8 @@ class Extremum(NamedTuple):
 
 
 def extremum_of(operator: BooleanOperator, operands: Sequence[int]) -> SignedOperand | Extremum:
-    """Return a Boolean operator over operands of the given numbers, as minima and maxima."""
-    # stand-ins, because equal operands may be one object and still are two places in the text
+    """Return a Boolean operator as minima and maxima of the operands with the given indices."""
+    # distinct stand-ins, because two equal operands of the text may be one Python object
     stand_ins = tuple(Truth(True) for _ in operands)
     numbers = {id(stand_in): number for stand_in, number in zip(stand_ins, operands, strict=True)}
     formula = Boolean(operator, stand_ins)
@@ -143,10 +143,10 @@ def _normal_form(formula: Formula, numbers: Mapping[int, int], *, negated: bool)
 def attaining_operands(
     part: SignedOperand | Extremum, end: End, interval: Callable[[int], Interval]
 ) -> list[SignedOperand]:
-    """Return the operands that attain an extremum: one, or several equal ones in their order.
+    """Return the operands that attain an extremum: one, or several equal operands in order.
 
     Args:
-        interval: low and high end of each operand, not negated.
+        interval: returns the low and high end of an operand, before negation.
     """
     if isinstance(part, SignedOperand):
         return [part]
@@ -170,7 +170,7 @@ class PathNode(NamedTuple):
 
     Attributes:
         node: its id.
-        sample: index among the samples evaluated.
+        sample: index among the evaluated samples.
     """
 
     node: int
@@ -181,9 +181,9 @@ class DecidingPath(NamedTuple):
     """The path down from a node.
 
     Attributes:
-        steps: at least one. The last is at a leaf, at `true` or `false`, or at an operator without a sample.
-            The window of such an operator is empty, lies beyond the log, or has only samples left out.
-        end: which end of the last node's interval decides.
+        steps: at least one step. The last step is a leaf, `true` or `false`, or an operator without a sample.
+            The window of such an operator is empty, beyond the log, or has only samples that are left out.
+        end: deciding end of the last node's interval.
     """
 
     steps: tuple[PathNode, ...]
@@ -191,10 +191,10 @@ class DecidingPath(NamedTuple):
 
 
 def deciding_path(nodes: OfflineNodes, node: int, end: End, *, sample: int = 0) -> DecidingPath:
-    """Return the path to what decides a node at a sample.
+    """Return the deciding path of a node at a sample.
 
-    Ties go to the operand that leads to the earliest sample, then to the first operand; in a window, to the
-    earliest sample.
+    Of equal operands, the one whose path ends at the earliest sample decides, then the first operand. Of
+    equal samples in a window, the earliest decides.
     """
     return _Walk(nodes).follow(node, sample, end)
 
@@ -217,7 +217,7 @@ class _Walk:
                         extremum, end, lambda index: self._nodes.interval(index, sample)
                     )
                 ]
-                # `min` returns the first of equal samples: ties go to the first operand
+                # `min` returns the first of equal keys, so the first operand wins ties
                 operand_path = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal():
                 lasting = self._lasting(node, sample, end) if self._nodes.goes_on else None
@@ -226,7 +226,7 @@ class _Walk:
                     return DecidingPath((step,), end)
                 operand_path = self.follow(next_step.node, next_step.sample, end)
                 if end is End.OPEN and not self._is_open(operand_path.steps[-1]):
-                    # the operand is certain there, but not whether its rates have values
+                    # the operand is certain, but it is unknown whether its rates have values
                     operand_path = next(self._unknown_rates(next_step.node, next_step.sample), operand_path)
             case _:
                 return DecidingPath((step,), end)
@@ -237,7 +237,7 @@ class _Walk:
         return low < 0.0 <= high
 
     def _unknown_rates(self, node: int, sample: int) -> Iterator[DecidingPath]:
-        """Iterate over the paths to rates that an operator asks of its operand and that are unknown."""
+        """Iterate over the paths to unknown rates in the operand of an operator."""
         step, (formula, operands) = PathNode(node, sample), self._nodes.tree[node]
         match formula:
             case Atom() if rate_conditions(formula) and self._is_open(step):
@@ -261,7 +261,7 @@ class _Walk:
     def _deciding_operand(
         self, formula: Temporal, operands: Sequence[int], sample: int, end: End
     ) -> PathNode | None:
-        """Return the operand and sample that an operator takes its number from; None for an empty window."""
+        """Return the operand and sample that decide an operator's number; None for an empty window."""
         *_, right = operands
         window = self._window(formula, sample)
         if not len(window):
@@ -283,9 +283,9 @@ class _Walk:
         return self._until(SignedOperand(left), SignedOperand(right), sample, window, end, is_ahead=is_ahead)
 
     def _lasting(self, node: int, sample: int, end: End) -> PathNode | None:
-        """Return where the left operand of an until, that later samples may still fulfil, was least so far.
+        """Return the sample of the least left operand so far, if it decides an until with an open window.
 
-        None if the samples so far decide the until.
+        None if other samples decide the until, and for other operators.
         """
         formula, operands = self._nodes.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
@@ -299,7 +299,7 @@ class _Walk:
         return PathNode(left.index, sample + int(np.argmin(lasting))) if lasting.min() == high else None
 
     def _window(self, formula: Temporal, sample: int) -> range:
-        """Return the samples that an operator looks at."""
+        """Return the samples in an operator's window."""
         begin, end = windows_of(formula, self._nodes.times_ns, np.array([sample]))
         return range(int(begin[0]), int(end[0]))
 
@@ -319,7 +319,7 @@ class _Walk:
         *,
         is_ahead: bool = True,
     ) -> PathNode:
-        """Return what decides an until or, looking back, a since."""
+        """Return the operand and sample that decide an until or, with `is_ahead` false, a since."""
         span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
         lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
         left_so_far = [_least_between(numbers, is_ahead=is_ahead) for numbers in lefts]
@@ -341,7 +341,7 @@ class _Walk:
         return left_steps[0] if least < right_key else PathNode(right.index, best_sample)
 
     def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> PathNode:
-        """Return what decides a weak until: the greater of `phi U psi` and `G phi`."""
+        """Return the operand and sample that decide a weak until, the greater of `phi U psi` and `G phi`."""
         left, right = map(SignedOperand, operands)
         inside = slice(window.start, window.stop)
         lefts, rights = self._ends(left, slice(sample, window.stop)), self._ends(right, inside)
@@ -355,7 +355,7 @@ class _Walk:
 
 
 def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
-    """Return the least of a column from its near end to before each place; +inf at the near end."""
+    """Return the running minimum of a column from its near end to before each place; +inf at the near end."""
     ordered = column if is_ahead else column[::-1]
     least = np.minimum.accumulate(np.concatenate([[np.inf], ordered[:-1]]))
     return least if is_ahead else least[::-1]
@@ -363,11 +363,11 @@ def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class MissedResponse:
-    """An implication on the path to the deciding atom that failed: its condition held, its response did not.
+    """A failed implication on the deciding path: its condition held, and its response did not.
 
     Attributes:
-        condition, response: their names, or their texts, shortened.
-        time_ns: of the sample at which the condition held.
+        condition, response: their names or shortened texts.
+        time_ns: time of the sample at which the condition held.
         is_condition: whether the deciding atom is in the condition.
     """
 
@@ -378,19 +378,19 @@ class MissedResponse:
 
 
 def short_title(formula: Formula) -> str:
-    """Return the name of a formula, or its text, shortened."""
+    """Return the name of a formula, or its shortened text."""
     return formula.name or shortened_formula(format_formula(formula))
 
 
 def missed_response(
     path: DecidingPath, nodes: OfflineNodes, bindings: Bindings = MappingProxyType({})
 ) -> tuple[MissedResponse | None, DecidingPath | None]:
-    """Return the outermost implication that failed on the path to what violates a formula, if there is one.
+    """Return the outermost failed implication on the path of a violated formula, if there is one.
 
-    If its condition decided, the path to what came closest to fulfilling its response comes with it.
+    If its condition decides, also return the path to the atom that came closest to fulfilling its response.
 
     Args:
-        bindings: the objects that variables stand for.
+        bindings: objects by the names of variables.
     """
     for step, next_step in pairwise(path.steps):
         node, operands = nodes.tree[step.node]
@@ -407,7 +407,7 @@ def missed_response(
 
 
 def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
-    """Return what is unknown in the one sample of a scene, each reason once, in the order of the atom."""
+    """Return why an atom is unknown in the one sample of a scene, each reason once, in order."""
     parts = list(iter_expressions(atom.expression))
     exact = [part.signal for part in parts if isinstance(part, Equality)]
     reasons = (reason for part in parts if part not in exact for reason in _reasons(scene, part))
@@ -445,7 +445,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
 
 
 def _position(term: Term) -> Projection:
-    """Return a number that is unknown where the position of a term is."""
+    """Return an expression that is unknown if the position of a term is unknown."""
     return Projection(term, "x", "min")
 
 
@@ -479,7 +479,7 @@ def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
 
 
 def _members(base: Term) -> Sequence[str]:
-    """Return the objects a term stands for, if they are named."""
+    """Return the named objects of a term; none for an open group."""
     match base:
         case TrackedName():
             return [base.name]
@@ -502,11 +502,11 @@ class Measured:
     Attributes:
         quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal", "present", "speed" or
             "rate".
-        names: the objects or regions measured, each with its delay and enlargement; or the signal.
+        names: measured objects or regions, with their delays and enlargements; or the signal.
         value: the number.
-        spread: its uncertainty, from that of the objects.
-        contact: for distances, where they are attained; otherwise None.
-        reports_ns: for rates, the times of the two reports that they compare; otherwise None.
+        spread: its uncertainty, from the uncertainty of the objects.
+        contact: closest points of a distance; else None.
+        reports_ns: times of the two reports that a rate compares; else None.
     """
 
     quantity: str
@@ -522,14 +522,14 @@ class DecidingAtom:
     """An atom in one sample.
 
     Attributes:
-        atom: with the objects that its variables stand for.
-        end: which end of its interval decides.
+        atom: the atom, with objects instead of variables.
+        end: deciding end of its interval.
         value: its robustness with every uncertainty at 0; NaN if unknown.
-        lower, upper: the ends of its interval.
-        branch: the summands of its number: numbers, signals and measurements, each with its weight, such as
-            -1; empty if it is unknown.
-        measured: the signals and measurements among them.
-        unknown: the reasons why it is unknown.
+        lower, upper: ends of its interval.
+        branch: summands of its number: numbers, signals and measurements, each with its weight, such as -1.
+            Empty if the atom is unknown.
+        measured: signals and measurements among the summands.
+        unknown: reasons why it is unknown.
     """
 
     atom: Atom = field(repr=False)
@@ -543,12 +543,12 @@ class DecidingAtom:
 
     @property
     def text(self) -> str:
-        """The atom as it is written, its variables replaced."""
+        """The text of the atom, with objects instead of variables."""
         return self.atom.text
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """Names of the objects, regions and groups that the atom is about, in the order written."""
+        """Names of the atom's objects, regions and groups, in the order of the text."""
         bases = (base_of(term) for term in self.atom.terms)
         return tuple(dict.fromkeys(base.name or format_term(base) for base in bases))
 
@@ -569,9 +569,9 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
 
 
 def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, Formula, bool] | None:
-    """Return the condition and the response of the outermost implication that fails below a quantifier.
+    """Return condition and response of the outermost failed implication below a quantifier.
 
-    The third value is whether the atom that decides the leaf is in the condition.
+    The third value tells whether the deciding atom of the leaf is in the condition.
     """
     while not isinstance(leaf, Atom):
         operand_and_end = _below(scene, leaf, end)
@@ -592,7 +592,7 @@ def _intervals(scene: TraceScene, formulas: Sequence[Formula], *, wide: bool = T
 
 
 def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
-    """Return the operand or the binding that decides a leaf, and which of its ends."""
+    """Return the operand or binding that decides a leaf, and its deciding end."""
     match leaf:
         case Boolean():
             formulas = list(leaf.operands)
@@ -610,7 +610,7 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
 
 
 def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
-    """Return the body for each binding that the quantifier does not leave out."""
+    """Return the bodies for all bindings that the quantifier does not leave out."""
     bodies = list(_bodies(scene, formula))
     if not rate_conditions(formula.body):
         return bodies
@@ -627,7 +627,7 @@ def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
 
 
 def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Return the bindings among which is one that decides a quantifier: of distances, those of near pairs."""
+    """Return bindings that include a deciding one: near pairs, if a distance decides the quantifier."""
     pair = closest_pair_of(formula)
     everyone = permutations(present, len(formula.variables))
     if pair is None or len(present) < 3:
@@ -645,7 +645,7 @@ def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) 
 def _branch(
     scene: TraceScene, expression: Expression, end: End, weight: float
 ) -> Iterator[tuple[float, Expression]]:
-    """Iterate over the weighted summands of an expression, once minima and maxima have taken an operand."""
+    """Iterate over the weighted summands of an expression, with the chosen operands of minima and maxima."""
     match expression:
         case Sum():
             yield from _branch(scene, expression.first, end, weight)
@@ -678,7 +678,7 @@ def _as_atom(expression: Expression) -> Atom:
 
 
 def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
-    """Return a signal or a measurement of single objects: of groups, the members that attain it."""
+    """Return the numbers of a signal or measurement; groups are replaced by the members that attain it."""
     match part:
         case Rate():
             low, high = _intervals(scene, [_as_atom(part)])[0]
@@ -700,7 +700,7 @@ def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
 
 
 def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
-    """Return the measurement of the members of groups that decide it."""
+    """Return a measurement between the members of groups that attain it."""
     singles = [_singles(scene, term) for term in part.terms]
     candidates = [part.with_terms(*terms) for terms in product(*singles)]
     values, places = measurement_values(scene, candidates)[0][:, 0], np.arange(len(candidates))
@@ -713,7 +713,7 @@ def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:
-    """Return the objects or regions a term stands for in the sample; the term itself if there are none."""
+    """Return the objects or regions of a term in the sample; the term itself if it has none."""
     base = base_of(term)
     if not isinstance(base, Group):
         return [term]

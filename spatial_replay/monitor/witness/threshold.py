@@ -1,4 +1,4 @@
-"""Which change of one number in the deciding atom flips a verdict."""
+"""Find the change of one number in the deciding atom that flips a verdict."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ from spatial_replay.text import DIGITS
 
 @dataclass(frozen=True, slots=True)
 class Dial:
-    """A number that an atom's robustness depends on.
+    """A number of an atom that is varied to flip a verdict.
 
     Attributes:
-        kind: the number that the atom compares with, the radius by which a term is enlarged, or else the
-            margin by which the relation has to hold, which is 0.
+        kind: "number": a number that the atom compares with. "radius": the enlargement of a term. "margin":
+            the amount by which the relation has to hold, 0 as written.
         value: the number.
         is_exact: whether the atom holds at one number only (`a dist b == c`).
-        constant: the constant whose value it is, if every atom with that constant is changed; else "".
+        constant: name of the constant with this value, if it is varied in all atoms; else "".
     """
 
     kind: Literal["number", "radius", "margin"]
@@ -72,7 +72,7 @@ class Dial:
 
     @classmethod
     def of(cls, deciding: DecidingAtom) -> Dial:
-        """Choose the first number of the deciding branch written in the atom, else a radius, else 0."""
+        """Choose the first written number of the deciding branch; else its first radius; else the margin."""
         atom = deciding.atom
         is_exact = "==" in atom.parameters
         parts = [part for _, part in deciding.branch]
@@ -85,7 +85,7 @@ class Dial:
         return cls("margin", 0.0, is_exact)
 
     def with_constant(self, formula: Formula) -> Dial | None:
-        """Return the dial of the constant whose value it is; None if more depends on that than numbers."""
+        """Return the dial of the number's constant; None without one, and if computed numbers use it."""
         if not isinstance(self.value, NamedNumber) or not self.value.is_plain:
             return None
         (constant,) = self.value.constants
@@ -98,13 +98,13 @@ class Dial:
         return None if is_entangled else replace(self, constant=constant)
 
     def is_at(self, kind: Literal["number", "radius"], number: float) -> bool:
-        """Return whether the dial changes a number of that kind."""
+        """Return whether the dial varies this number of that kind."""
         if self.constant:
             return isinstance(number, NamedNumber) and self.constant in number.constants
         return kind == self.kind and number == self.value
 
     def turn(self, expression: Expression, value: float) -> Expression:
-        """Return the expression with another number in its place."""
+        """Return the expression with the dial at another value."""
         if self.kind == "margin":
             divisor = expression.divisor if isinstance(expression, Scaled) else 1.0
             return Sum(expression, Number(-value / divisor))
@@ -125,7 +125,7 @@ class Dial:
         return map_leaves(expression, leaf)
 
     def slopes(self, expression: Expression) -> set[float]:
-        """Return what adding 1 to the number adds to the expression, for each branch that may decide."""
+        """Return the derivatives of the expression with respect to the dial, over all branches."""
         if self.kind == "margin":
             return {-1.0 / (expression.divisor if isinstance(expression, Scaled) else 1.0)}
         match expression:
@@ -152,7 +152,7 @@ class Dial:
 
 
 def _radii(expression: Expression) -> list[float]:
-    """Return the radii that a measurement depends on, in the order written."""
+    """Return the radii that a measurement depends on, in the order of the text."""
     if not isinstance(expression, Measurement):
         return []
     effects = zip(expression.radius_effects, expression.terms, strict=True)
@@ -177,7 +177,7 @@ def _numbers(expression: Expression) -> Iterator[float]:
 
 
 def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> Iterator[tuple[Atom, int]]:
-    """Iterate over the atoms of a formula, each with the signs in which the formula can have its number."""
+    """Iterate over the atoms of a formula, with the signs of their effects on the formula's number."""
     match formula:
         case Atom():
             yield from ((formula, sign) for sign in signs)
@@ -192,32 +192,35 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
 
 
 RESIDUE: Final = 1e-12
-"""A difference of so little, to what is compared, is the rounding error of its two numbers."""
+"""Relative difference of two numbers that counts as rounding error."""
 _PRECISION: Final = 60
 _FAR = 1e300
 _STEPS = 8.0
-"""Floating-point steps by which a number is moved further, so that rounding cannot undo it."""
+"""Floating-point steps by which a number moves beyond the flip, so that rounding cannot undo it."""
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
-"""Parts per round of a search for a number that does not move all samples alike. Each round reads the log
-once, and divides the interval between a number that flips the verdict and one that does not."""
+"""Rounds of a search, and parts of the interval in each.
+
+The search is for dials that do not shift all samples equally. Each round reads the log once, and divides the
+interval between a number that flips the verdict and one that does not.
+"""
 _AT_FIRST = 64
-"""Numbers tried before those in between, if flipping numbers have no order."""
+"""Numbers in the first pass of a search in which larger changes need not flip the verdict."""
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """The number that decides an atom, and where it would flip the verdict.
+    """The number of an atom, and the nearest number that would flip the verdict.
 
     Attributes:
-        value: the number as written in the specification. Without one (`a leftof b`), 0: the margin by
+        value: number in the specification. For an atom without a number (`a leftof b`) it is 0, the margin by
             which the relation has to hold.
-        flips_at: the nearest number that flips the verdict, rounded to a few digits beyond.
+        flips_at: nearest number that flips the verdict, rounded away from `value` to a few digits.
         is_written: whether the number is in the text.
         is_exact: whether numbers beyond `flips_at` need not flip it (`a dist b == c`).
         verdict: the verdict at `flips_at`.
-        constant: the constant whose value the number is, if `flips_at` is a value of that; else "".
-        replacement: of an atom without a number, how it is written with one that flips the verdict; else "".
+        constant: name of the number's constant, if `flips_at` is a value of it; else "".
+        replacement: text with a number that flips the verdict, for an atom without a number; else "".
     """
 
     value: float
@@ -230,10 +233,11 @@ class Threshold:
 
 
 Obstacle: TypeAlias = Literal["others", "unknown", "limits", "infinity"]
-"""Why no number of an atom flips a verdict.
+"""The reason why no number of an atom flips a verdict.
 
-Other atoms, or unknown samples, decide it too; no number that can be written is large enough; or the atom is
-infinite."""
+"others": other atoms decide it, too. "unknown": unknown samples decide it, too. "limits": no number that can
+be written is large enough. "infinity": the atom is infinite.
+"""
 
 
 def threshold_of(
@@ -246,18 +250,18 @@ def threshold_of(
     *,
     goes_on: bool = False,
 ) -> Threshold | Obstacle | None:
-    """Compute how far the deciding atom's number has to move to flip a verdict, or why no number does.
+    """Find the nearest number of the deciding atom that flips a verdict, or the reason why no number does.
 
-    A constant moves in all atoms. A number without a name moves in all atoms of the same place in the text,
-    as a quantifier over a named group, or a macro, makes them.
+    A constant is varied in all atoms. A number without a name is varied in all atoms from the same place in
+    the text; a quantifier over a named group, or a macro, creates several.
 
     Args:
-        leaves: (C, A, T), the instance's leaves in each sample.
-        node: whose verdict.
-        goes_on: whether samples may follow: then the verdict is that over every continuation.
+        leaves: (C, A, T), leaves of the instance in each sample.
+        node: node of the verdict.
+        goes_on: whether samples may follow; the verdict then holds over every continuation.
 
     Returns:
-        None of an atom that is itself open.
+        None for an atom that is itself open.
     """
     if deciding.end is End.OPEN or deciding.unknown:
         return None
@@ -297,7 +301,7 @@ class _Search:
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
         slopes = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
-        # slopes of the formula, not of the leaves: equal leaves share a place, wherever they were written
+        # slopes are found from the formula, because equal leaves of different places share one index
         self._moving: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
         for index, leaf in enumerate(self._order):
@@ -305,7 +309,7 @@ class _Search:
             if bare is not None and (atom_slopes := slopes.get(bare[0].expression)):
                 self._moving[index], self._slopes[index] = leaf, bare[1] * max(atom_slopes)
         bodies = [part for part in iter_formulas(self._formula) if isinstance(part, Quantified)]
-        # a quantifier moves with the one atom of its body; a prism's height may decide, not a radius
+        # only a quantifier over a single atom shifts with it; with radii, a prism's height may decide
         self._is_uniform = (
             all(len(atom_slopes) == 1 for atom_slopes in slopes.values())
             and not any(
@@ -335,7 +339,7 @@ class _Search:
         nearest = [number for side in self._directions if (number := self._nearest(side)) is not None]
         for number in sorted(nearest, key=lambda number: abs(number - dial.value)):
             candidates = list(filter(self._is_possible, _short_numbers(number, dial.value)))
-            # nearly always one of the first two flips it; each costs a measurement of all bindings
+            # one of the first two nearly always flips it, and each number costs a measurement of all bindings
             for batch in filter(None, (candidates[:2], candidates[2:])):
                 verdicts = self._verdicts(batch, is_shifted=False)
                 for candidate, verdict in zip(batch, verdicts, strict=True):
@@ -349,12 +353,12 @@ class _Search:
         return None
 
     def _replacement(self, margin: float) -> str:
-        """Return the deciding atom with a number that makes it hold by a margin; "" if none does."""
+        """Return the deciding atom with a number for a margin, as text; "" if that does not flip the verdict."""
         atom = self._deciding.atom
         for variant in _variants(atom, margin):
             formula = self._change_atoms(variant)
             added_leaves = new_leaves(formula, self._order)
-            # heights, or rounding, may decide instead
+            # heights or rounding may decide instead, so the verdict is computed
             if self._is_flipped(self._verdict_with(formula, added_leaves, self._columns(added_leaves))):
                 changed_atom = variant(atom)
                 return format_atom(
@@ -366,7 +370,7 @@ class _Search:
         return ""
 
     def obstacle(self) -> Obstacle:
-        """Return why no number flips the verdict: from the one if the atom is moved arbitrarily far."""
+        """Return why no number flips the verdict, from the verdict with the atom shifted by `_FAR`."""
         far = _FAR if self._deciding.end is End.HIGH else -_FAR
 
         def change(atom: Atom) -> Atom:
@@ -380,27 +384,30 @@ class _Search:
         return "others" if verdict is self._verdict else "unknown"
 
     def _is_flipped(self, verdict: Verdict) -> bool:
-        """Return whether a verdict is the opposite one or, of a log that goes on, another one."""
+        """Return whether a verdict is the opposite one; for a log that continues, any other verdict."""
         return verdict is not self._verdict and (self._goes_on or verdict is not Verdict.UNKNOWN)
 
     def _is_possible(self, number: float) -> bool:
         return math.isfinite(number) and (self._dial.kind != "radius" or number >= 0.0)
 
     def _nearest(self, direction: float) -> float | None:
-        """Return the nearest number in one direction that flips the verdict, perhaps a little beyond."""
+        """Return the nearest number in one direction that flips the verdict, up to a small excess."""
         find = self._size_by_samples if self._is_uniform else self._size_by_rounds
         size = find(direction)
         return None if size is None else self._number_beyond(size, direction)
 
     def _size_by_samples(self, direction: float) -> float | None:
-        """Where the dial moves an atom alike in every sample, one of them decides when the verdict flips."""
+        """Return the least change that flips the verdict, for a dial that shifts all samples equally.
+
+        Robustness is the shifted number of one sample, so only one change per sample is tried.
+        """
         moves = [
             -direction * self._leaves[:, index].ravel() / slope
             for index, slope in self._slopes.items()
             if slope
         ]
         sizes = np.sort(np.concatenate(moves))
-        # the tolerance keeps the deciding sample, whose quotient may be rounded down
+        # the tolerance includes the deciding sample, whose quotient may be rounded down
         sizes = sizes[np.isfinite(sizes) & (sizes >= self._least * (1.0 - 1e-9))]
         candidates = np.concatenate([[self._least], sizes])
 
@@ -435,10 +442,7 @@ class _Search:
         return [self._is_flipped(verdicts.get(number, self._verdict)) for number in numbers]
 
     def _number_beyond(self, size: float, direction: float) -> float:
-        """Return the number that is further by `size` and a little more, so that rounding cannot undo it.
-
-        A radius goes no lower than 0.
-        """
+        """Return the number moved by `size` and a few rounding steps; a radius is at least 0."""
         value = self._dial.value
         rounding_step = (
             0.0 if self._dial.is_exact else _STEPS * float(np.spacing(max(abs(value) + size, 1.0)))
@@ -447,10 +451,10 @@ class _Search:
         return max(number, 0.0) if self._dial.kind == "radius" else number
 
     def _verdicts(self, numbers: Sequence[float], *, is_shifted: bool = True) -> list[Verdict]:
-        """Return the verdict with each number in place of the dial's.
+        """Return the verdict with the dial at each number.
 
         Args:
-            is_shifted: whether numbers of atoms may be shifted, but for rounding, instead of measured again.
+            is_shifted: whether atoms may be shifted instead of measured again; both agree up to rounding.
         """
         formulas = [self._formula_at(number) for number in numbers]
         added_leaves = [new_leaves(formula, self._order) for formula in formulas]
@@ -470,7 +474,7 @@ class _Search:
         ]
 
     def _is_meant(self, atom: Atom) -> bool:
-        """Return whether the constant is in an atom or, of another number, it was written where that was."""
+        """Return whether an atom has the constant or, without one, is from the deciding atom's place."""
         if self._dial.constant:
             return any(self._dial.is_at("number", number) for number in _numbers(atom.expression))
         meant = self._deciding.atom
@@ -488,7 +492,7 @@ class _Search:
         return replace(atom, expression=self._dial.turn(atom.expression, number))
 
     def _shift_columns(self, added: Sequence[Formula], number: float) -> Floats:
-        """Return columns of atoms at a number, shifted from those of the original ones."""
+        """Return the columns of atoms at a number, as shifts of the original atoms' columns."""
         indices = {
             leaf_key(rewritten(leaf, lambda atom: self._atom_at(atom, number))): index
             for index, leaf in self._moving.items()
@@ -508,7 +512,7 @@ class _Search:
 
 
 def _bare(formula: Formula) -> tuple[Atom, int] | None:
-    """Return the atom that a leaf consists of, but for quantifiers and negations, with its sign."""
+    """Return the only atom of a leaf below quantifiers and negations, with its sign; None for others."""
     sign = 1
     while not isinstance(formula, Atom):
         if isinstance(formula, Boolean) and formula.operator == "not":
@@ -525,13 +529,13 @@ def _radii_in(expression: Expression) -> list[float]:
 
 
 def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
-    """Yield ways to write an atom without a number so that it has to hold by a margin."""
+    """Yield changes of an atom without a number after which it has to hold by a margin."""
     match atom.relation, atom.expression:
         case "ovlp", _:
             yield partial(_as_distance, margin=margin)
         case "sum", Sum(_, Negative()):
             yield partial(_with_summand, margin=margin)
-    # a term that is larger by the margin, if that adds as much in every branch
+    # a term enlarged by the margin, if that shifts every branch by the same amount
     radius, slope = abs(margin), -math.copysign(1.0, margin)
     dial = Dial("radius", radius, is_exact=False)
     for place in range(len(atom.terms)):
@@ -577,10 +581,10 @@ def _enlarge_term(atom: Atom, place: int, radius: float) -> Atom:
 
 
 def _short_numbers(number: float, value: float) -> Iterator[float]:
-    """Iterate over short numbers near one, and beyond it as seen from a value; the number itself is last."""
+    """Iterate over short numbers near a number, and beyond it from `value`; the number itself is last."""
     exact, change = Decimal(number), Decimal(number) - Decimal(value)
     rounding_away = ROUND_CEILING if change > 0 else ROUND_FLOOR
-    # a rounding error, or the step that `_number_beyond` adds near 0, has no digits of its own
+    # a number near 0 that is only rounding error has no digits of its own: the change has them
     leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
     last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):

@@ -1,4 +1,4 @@
-"""Why a formula has its verdict: the one atom at one sample that decides it, and how to flip it."""
+"""Witnesses of verdicts: the deciding atom at one sample, and the change that flips the verdict."""
 
 from __future__ import annotations
 
@@ -60,15 +60,15 @@ from spatial_replay.spec.walks import (
 
 @dataclass(frozen=True, slots=True)
 class WitnessStep:
-    """A node on the path to the deciding atom, at the sample that decides.
+    """A node on the deciding path, at its deciding sample.
 
     Attributes:
         node: its id.
         operator: "and", "F", a relation's name, …
-        name: the name of the spec that it is the root of, or None.
+        name: name of the spec whose root it is, or None.
         text: its canonical text.
-        time_ns: of the sample.
-        leaves_out: whether its operator leaves samples or members out in which a rate has no value.
+        time_ns: time of the sample.
+        leaves_out: whether its operator leaves out samples or members whose rate has no value.
     """
 
     node: int
@@ -81,11 +81,11 @@ class WitnessStep:
 
 @dataclass(frozen=True, slots=True)
 class WhilePresent:
-    """The verdict of an unknown formula if it is asked for only while its objects are in the samples.
+    """The verdict of an unknown formula after a restriction to samples with its objects.
 
     Attributes:
-        names: of these objects.
-        text: how that is written.
+        names: names of these objects.
+        text: text of the restricted formula.
     """
 
     names: tuple[str, ...]
@@ -98,30 +98,31 @@ class Witness:
     """The atom that decides a node's verdict over a finished log, or settled it before the log ended.
 
     Robustness consists of minima and maxima, so one atom at one sample determines it. It determines the upper
-    end of a violated formula, the lower end of a satisfied one, and the open ends of an unknown one.
+    end of a violated formula, the lower end of a satisfied formula, and the open ends of an unknown formula.
 
     Attributes:
-        name: of the spec.
-        object: what a template's parameter stands for, or None.
-        verdict, lower, upper: of the node.
-        path: from the node to the deciding leaf, at least one step.
-        deciding: the atom; None if the path ends at `true` or `false`, at a window or a next sample beyond
-            the log, or at a quantifier over an empty group.
-        threshold: the change of the atom's number that flips the verdict; None if there is none.
-        obstacle: why there is none, if there is an atom.
-        open_end: for a settled verdict whose interval has an open end, the atom that leaves it open, and the
-            time of its sample.
-        settled_ns: the time of the sample that made the verdict certain; interval and
-            threshold are then those of that moment. None if it is about the whole log.
-        missed: the outermost implication on the path that failed, or None.
-        gaps: of an unknown atom, when what it is about is missing.
-        closest: for a missed response, the atom that came closest to fulfilling it, and the time of its
-            sample. None if this atom decides, or if there is none.
-        closest_path: from the response to that atom.
-        units: those that the log declares, of signals by their names, of lengths by "".
-        unit: the declared one of `lower` and `upper`, or "".
-        while_present: of a formula that is unknown only because samples lack its objects; else None.
-        closest_threshold: the change of the number of `closest` that flips the verdict, or None.
+        name: name of the spec.
+        object: object of a template's instance; else None.
+        verdict, lower, upper: verdict of the node, and ends of its interval.
+        path: path from the node to the deciding leaf, at least one step.
+        deciding: deciding atom. None if the path ends at `true` or `false`, at a window or a next sample
+            beyond the log, or at a quantifier over an empty group.
+        threshold: change of the atom's number that flips the verdict; None if there is none.
+        obstacle: reason for no threshold, if there is a deciding atom.
+        open_end: atom that leaves the other end of a known verdict's interval open, and the time of its
+            sample; else None.
+        settled_ns: time of the sample that made the verdict certain. The interval then belongs to that
+            sample. None for a witness over the whole log.
+        missed: outermost failed implication on the path, or None.
+        gaps: missing samples of the objects and signals in an unknown atom.
+        closest: atom that came closest to fulfilling a missed response, and the time of its sample. None if
+            this atom decides, or if there is none.
+        closest_path: path from the response to that atom.
+        units: declared units of the log, of signals by name, of lengths under "".
+        unit: declared unit of `lower` and `upper`, or "".
+        while_present: verdict with `present`, for a formula that is unknown only because samples lack its
+            objects; else None.
+        closest_threshold: change of the number of `closest` that flips the verdict, or None.
     """
 
     name: str
@@ -146,17 +147,17 @@ class Witness:
 
     @property
     def node(self) -> int:
-        """The id of the node that it is about."""
+        """The id of its node."""
         return self.path[0].node
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is about the sample that made the verdict certain, before the log ended."""
+        """Whether a sample made the verdict certain before the log ended."""
         return self.settled_ns is not None
 
     @property
     def time_ns(self) -> int:
-        """The time of the sample that decides."""
+        """The time of the deciding sample."""
         return self.path[-1].time_ns
 
 
@@ -172,16 +173,17 @@ def find_witness(
 ) -> Witness:
     """Return the witness of a node.
 
-    Ties go to the earliest sample, then to the first operand.
+    Of equal atoms, the atom at the earliest sample decides, then the first operand.
 
     Args:
-        evidence: the samples that the instance was evaluated over.
-        leaves: (C, A, T), the instance's leaves in them.
+        evidence: evidence of the instance.
+        leaves: (C, A, T), leaves of the instance.
         times_ns: (T,), T at least 1.
-        node: its id.
-        goes_on: whether samples may follow these; the verdict then holds for any of them.
-        whole: leaves and times of the whole log, if the number that flips the verdict is sought over it.
-        flips: whether that number is sought at all.
+        node: id of the node.
+        goes_on: whether samples may follow; the verdict then holds over every continuation.
+        whole: leaves and times of the whole log, on which the flipped verdict is computed; None for these
+            samples.
+        flips: whether to search for the number that flips the verdict.
     """
     instance = evidence.instance
     evaluate, verdict_of = (evaluate_prefix, online_verdict) if goes_on else (evaluate_offline, final_verdict)
@@ -237,7 +239,7 @@ def find_witness(
 def _open_end(
     evidence: Evidence, nodes: OfflineNodes, node: int, end: End
 ) -> tuple[DecidingAtom, int] | None:
-    """Return the atom that leaves one end of a node open, and the time of its sample; None if none does."""
+    """Return the atom that leaves an end of a node open, and the time of its sample, if there is one."""
     path = deciding_path(nodes, node, end)
     deciding = atom_of_path(evidence, nodes, path, evidence.scene)
     if deciding is None or deciding.lower == deciding.upper:
@@ -246,17 +248,17 @@ def _open_end(
 
 
 SceneAt: TypeAlias = Callable[[int], TraceScene]
-"""Returns the one sample of a time (see `Evidence.scene`)."""
+"""Returns the scene of the sample at a time (see `Evidence.scene`)."""
 
 
 class MissedWitness(NamedTuple):
-    """A response that failed on a deciding path.
+    """A missed response on a deciding path.
 
     Attributes:
-        missed: the outermost implication that failed; None if none did.
-        closest: if the condition decided, the atom that came closest to fulfilling the response, and the time
-            of its sample; else None.
-        path: from the response to that atom, unless both are in one node of an open group.
+        missed: outermost failed implication, or None.
+        closest: atom that came closest to fulfilling the response, and the time of its sample. None if the
+            condition does not decide.
+        path: path from the response to that atom. None within one node of an open group.
     """
 
     missed: MissedResponse | None = None
@@ -270,7 +272,7 @@ _NOTHING_MISSED: Final = MissedWitness()
 def atom_of_path(
     evidence: Evidence, nodes: OfflineNodes, path: DecidingPath, scene_at: SceneAt
 ) -> DecidingAtom | None:
-    """Return the atom that decides the leaf at the end of a path; None if that is no leaf."""
+    """Return the deciding atom of the leaf at the end of a path; None if the path ends at no leaf."""
     step = path.steps[-1]
     leaf = evidence.bound(nodes.tree[step.node][0])
     if not isinstance(leaf, Atom | Quantified):
@@ -281,7 +283,7 @@ def atom_of_path(
 def find_missed_response(
     evidence: Evidence, nodes: OfflineNodes, path: DecidingPath, scene_at: SceneAt
 ) -> MissedWitness:
-    """Return the response that was missed on a path to what violates a formula."""
+    """Return the missed response on the path of a violated formula."""
     missed, nearest = missed_response(path, nodes, evidence.instance.bindings)
     if missed is not None:
         best = None if nearest is None else atom_of_path(evidence, nodes, nearest, scene_at)
@@ -310,9 +312,9 @@ def _steps(evidence: Evidence, nodes: OfflineNodes, path: DecidingPath) -> tuple
 def _while_present(
     evidence: Evidence, leaves: Floats, times_ns: Integers, node: int, path: DecidingPath
 ) -> WhilePresent | None:
-    """Return the verdict of a node while its objects are present, by the innermost operator of a path.
+    """Return the verdict of a node if the innermost operator of its path asks for present objects.
 
-    None where that is unknown, too, the leaf's objects are in all samples, or one of them is in none.
+    None if this verdict is unknown, if the leaf's objects are in all samples, or if one of them is in none.
     """
     instance, bindings = evidence.instance, evidence.instance.bindings
     formula, order = instance.formula, instance.program.leaves
@@ -351,11 +353,11 @@ def _while_present(
 def time_of_least(
     instance: Instance, leaves: Floats, times_ns: Integers, node: int, settled_ns: int, least: float
 ) -> int:
-    """Return when the robustness of a violated node became, for certain, as low as it is on the whole log.
+    """Return the time at which a violated node's robustness on the whole log became certain.
 
     Args:
-        settled_ns: when its violation became certain, which is not later.
-        least: the upper end of its interval for the finished log.
+        settled_ns: time at which the violation became certain.
+        least: upper end of the node's interval on the finished log.
     """
     order = instance.program.leaves
     nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
@@ -367,7 +369,7 @@ def time_of_least(
         prefix = evaluate_prefix(instance.formula, order, leaves[..., until], times_ns[until])
         return bool(prefix.ends(node)[1][0] <= least)
 
-    # most often the samples that decide it suffice: one evaluation instead of a search
+    # the samples up to the deciding one mostly suffice: one evaluation instead of a search
     later = range(earliest, earliest if is_reached(earliest) else len(times_ns) - 1)
     return int(times_ns[earliest + bisect_left(later, True, key=is_reached)])
 
