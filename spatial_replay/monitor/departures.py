@@ -94,7 +94,7 @@ class Departures:
 
     An absence is collected if the member was closer than twice the threshold before or after it. For a
     threshold of 0, the limit is the member's own size. It is also collected if the member approached fast
-    enough to reach the threshold meanwhile.
+    enough to reach the threshold while it was away.
 
     Attributes:
         departures: the departures so far.

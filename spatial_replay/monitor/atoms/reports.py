@@ -1,6 +1,7 @@
 """Reports of objects and signals in samples: the previous report, and the time between both.
 
-Consecutive samples may show the same report. A sample without a report starts the history anew.
+Consecutive samples may show the same report. The first report after a sample without one has no previous
+report.
 """
 
 from __future__ import annotations

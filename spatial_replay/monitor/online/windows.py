@@ -412,7 +412,7 @@ def _bring_up(
     rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
     mode: int, last: int, is_fresh: bool,
 ) -> None:  # fmt: skip
-    """Update the columns of one set to the last sample; compute them anew if `is_fresh`."""
+    """Update the columns of one set to the last sample; if `is_fresh`, compute all their numbers."""
     nodes, first = len(rows) - 1, mode * (len(rows) - 1)
     for d in range(nodes if has_column(rows) else nodes - 1):
         code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
@@ -717,7 +717,7 @@ def _run_corner(
 def _renew_tables(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
-    """Compute the tables of a part anew, with more positions from its base on."""
+    """Compute the tables of a part again, with more positions from its base on."""
     nodes = len(rows) - 1
     count, variables = rows[nodes, codes.PART_TABLES], rows[nodes, codes.PART_VARIABLES]
     for corner in range(1 << variables):

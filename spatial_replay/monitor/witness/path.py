@@ -571,7 +571,7 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
 def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, Formula, bool] | None:
     """Return condition and response of the outermost failed implication below a quantifier.
 
-    The third value tells whether the deciding atom of the leaf is in the condition.
+    The third value is whether the deciding atom of the leaf is in the condition.
     """
     while not isinstance(leaf, Atom):
         operand_and_end = _below(scene, leaf, end)

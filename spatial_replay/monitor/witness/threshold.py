@@ -353,7 +353,7 @@ class _Search:
         return None
 
     def _replacement(self, margin: float) -> str:
-        """Return the deciding atom with a number for a margin, as text; "" if that does not flip the verdict."""
+        """Return the text of the deciding atom with a margin that flips the verdict; "" if there is none."""
         atom = self._deciding.atom
         for variant in _variants(atom, margin):
             formula = self._change_atoms(variant)
