@@ -48,14 +48,14 @@ Specifications: TypeAlias = Specification | PathName | Sequence[Specification | 
 
 
 class Evaluating(Reading, total=False):
-    """How to evaluate a log, and how to read it: the options of `replay_log` and `write_report`.
+    """Options of evaluating and reading a log, for `replay_log` and `write_report`.
 
     Attributes:
-        constants: values in place of those that files and the log's own specifications give their constants.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
+        constants: values that replace those in files and in the log's own specifications.
+        each: objects for each parameter of a template: "all", "class:NAME" or a name.
         semantics: "ltlf" unless given, or "paper": Def. 16 of the paper to the letter.
         start_ns, end_ns, every: evaluate every `every`th sample from `start_ns` to before `end_ns`.
-        strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
+        strict_names: whether missing objects and signals are errors; otherwise they are unknown.
     """
 
     constants: Mapping[str, float | str] | None
@@ -80,19 +80,19 @@ def replay_log(
     """Evaluate specifications over a log, and write the annotated log if a file is named.
 
     Args:
-        log: a file in any format, an address of one (s3://, gs://, az://, https://), or a trace.
-        specifications: one or several, parsed or as files; None takes those that the log was written with.
+        log: a file in any format, its address (s3://, gs://, az://, https://), or a trace.
+        specifications: one or several, parsed or as files; None takes the specifications in the log.
         output: the annotated log to write (MCAP).
         layer: write the derived messages only, without the log's own.
         keep: the log's own messages in the output: "all", "mapped" for mapped topics, or patterns of topics
-            such as "/camera/*"; several add up. The default is all, of a ROS 2 bag none.
+            such as "/camera/*"; several are combined. The default is all messages, but none of a ROS 2 bag.
         arrow: the title of the result whose violation the output's scene points at; "" for the first one.
-        options: how to evaluate it (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
-            `strict_names`; see `Evaluating`), and how to read it, as for `read_trace`.
+        options: options of evaluation (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
+            `strict_names`; see `Evaluating`) and of reading, as for `read_trace`.
 
     Raises:
-        UsageError: options that do not work, a missing file, an output that is an input.
-        SpecificationError: a specification with errors.
+        UsageError: an option is invalid, a file is missing, or the output is an input.
+        SpecificationError: a specification has errors.
         LogError: the log cannot be read.
         OutputError: the output cannot be written.
     """
@@ -103,7 +103,7 @@ def replay_log(
             "keep applies to an annotated log with the log's own messages; give output, not layer"
         )
     if keep is None and output is None:
-        # of the messages, those that samples are made of
+        # without an output, only the messages of samples are read
         keep = (MAPPED,)
     constants, how = _evaluation(options)
     source = _source(log, options)
@@ -148,20 +148,20 @@ def diff_specifications(
     output: PathName | None = None,
     **options: Unpack[Evaluating],
 ) -> SpecificationDiff:
-    """Compare two versions of a specification over a log: what changed, since when, and which edit did it.
+    """Compare two versions of a specification over a log: changes, their times, and the edits behind.
 
-    The edit is found by evaluation: the old specification with this edit alone has the new verdict, and the
-    new one without it has the old verdict.
+    Edits are found by evaluation. The old specification with the edit alone has the new verdict. The new
+    specification without the edit has the old verdict.
 
     Args:
         log: a file in any format, or a trace.
         old, new: parsed, or as files.
         output: a page to write, with both under one time cursor; its name ends in .html.
-        options: how to evaluate and read the log, as for `replay_log`.
+        options: options of evaluation and reading, as for `replay_log`.
 
     Raises:
-        UsageError: no spec in common, options that do not work, no sample in the window.
-        SpecificationError: a specification with errors.
+        UsageError: the versions have no spec in common, an option is invalid, or the window has no sample.
+        SpecificationError: a specification has errors.
         LogError: the log cannot be read.
     """
     constants, how = _evaluation(options)
@@ -183,18 +183,19 @@ def diff_logs(
     output: PathName | None = None,
     **options: Unpack[Evaluating],
 ) -> LogDiff:
-    """Compare two runs: which objects moved differently, and what that did to each spec and decision.
+    """Compare two runs: objects that moved differently, and the effects on each spec and decision.
 
     Args:
-        specifications: one or several, parsed or as files; None takes those that a log was written with.
+        specifications: one or several, parsed or as files; None takes the specifications in a log.
         align: "time" since the zero of each log, the "progress" of an automaton, or the name of a spec, whose
             first change of sign in each run is the event.
         output: a page to write, with both under one time cursor; its name ends in .html.
-        options: how to evaluate and read both logs, as for `replay_log`.
+        options: options of evaluation and reading for both logs, as for `replay_log`.
 
     Raises:
-        UsageError: no common object, other units, nothing to align by, options that do not work.
-        SpecificationError: a specification with errors.
+        UsageError: the runs have no common object, different units or nothing to align by, or an option is
+            invalid.
+        SpecificationError: a specification has errors.
         LogError: a log cannot be read.
     """
     constants, how = _evaluation(options)
@@ -221,19 +222,19 @@ def clip_log(
     topics: Sequence[str] | None = None,
     **options: Unpack[Evaluating],
 ) -> Clip:
-    """Write the smallest part of a log that has its verdicts, robustness and witnesses.
+    """Write the smallest part of a log with the same verdicts, robustness and witnesses.
 
     Args:
         output: the clip to write (MCAP), an annotated log.
-        around_ns: keep at least so much before and after the samples that decide.
-        of: names of the specs whose verdicts are kept; all results without it.
+        around_ns: least time to keep before and after the deciding samples.
+        of: names of the specs whose verdicts are kept; without it, all results.
         topics: patterns of the topics to keep, such as "/camera/*"; None for all.
 
     The other arguments are those of `replay_log`.
 
     Raises:
-        UsageError: no such spec, options that do not work, an output that is an input.
-        SpecificationError: a specification with errors.
+        UsageError: a spec is missing, an option is invalid, or the output is an input.
+        SpecificationError: a specification has errors.
         LogError: the log cannot be read.
         OutputError: the clip cannot be written.
     """
@@ -252,7 +253,7 @@ def clip_log(
 
 
 def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, ReplayOptions]:
-    """Take the options of evaluating out, and return them; those of reading remain."""
+    """Remove the options of evaluation from all options, and return them."""
     refuse_unknown(options, (*Evaluating.__annotations__, "specifications", "output"))
     window = Window(options.pop("start_ns", 0), options.pop("end_ns", FOREVER), options.pop("every", 1))
     choice, constants = options.pop("each", None), options.pop("constants", None)
@@ -271,24 +272,25 @@ def tune(
     seed: int = 0,
     **reading: Unpack[Reading],
 ) -> Tuning:
-    """Find the constants with which all good runs are satisfied and all bad ones are violated.
+    """Find constants with which all good runs satisfy a specification, and all bad runs violate it.
 
-    With bad runs those of the widest margin: the least of the good runs' robustness and the bad runs' negated
-    one is the greatest. With good runs only the tightest ones that satisfy them all.
+    With bad runs, the constants have the widest margin. The margin is the least of the good runs' robustness
+    and the bad runs' negated robustness. With good runs only, the constants are the tightest ones that all
+    runs satisfy.
 
     Args:
         specification: parsed, or as a file.
         good, bad: logs in any format, or traces.
         vary: the values to try, by name: `{"near": (40, 100), "hold": ("1s", "4s")}`; None takes the range in
-            the text. Without it all constants are tuned that have a range there.
-        constants: values of others, in place of those in the file.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
-        seed: of the search over several constants; the same seed finds the same values.
-        reading: how to read the logs, as for `read_trace`.
+            the text. Without `vary`, all constants with a range in the text are tuned.
+        constants: values of other constants, instead of those in the file.
+        each: objects for each parameter of a template: "all", "class:NAME" or a name.
+        seed: seed of the search over several constants; the same seed finds the same values.
+        reading: options of reading, as for `read_trace`.
 
     Raises:
-        UsageError: no good run, a constant that cannot be tuned, a run that does not fit the specification.
-        SpecificationError: a specification with errors.
+        UsageError: there is no good run, a constant cannot be tuned, or a run does not fit the specification.
+        SpecificationError: a specification has errors.
         LogError: a log cannot be read.
     """
     if isinstance(specification, Specification):
@@ -316,20 +318,20 @@ def learn(
     profile: str = DEFAULT_PROFILE,
     **reading: Unpack[Reading],
 ) -> Learned:
-    """Find a short specification that all good runs satisfy; each of its lines is violated by some bad run.
+    """Find a short specification that all good runs satisfy, and each of whose lines a bad run violates.
 
-    Without bad runs its lines say what good runs have in common: how they end, what always holds, what comes
-    before what. Limits keep a margin from the good runs (see `docs/learning.md`).
+    Without bad runs, its lines are common properties of the good runs: ends, invariants and orders of events.
+    Limits keep a margin from the good runs (see `docs/learning.md`).
 
     Args:
         good, bad: logs in any format, or traces; at least two good ones.
-        lines: write at most so many specs, the most telling ones.
-        profile: of the relations, "paper" or "spatial_spec".
-        reading: how to read the logs, as for `read_trace`.
+        lines: largest number of specs; the most telling ones are written.
+        profile: profile of the relations, "paper" or "spatial_spec".
+        reading: options of reading, as for `read_trace`.
 
     Raises:
-        UsageError: fewer than two good runs, a run that is too short, runs that are equal or in other units,
-            nothing that the good runs have in common.
+        UsageError: there are fewer than two good runs, a run is too short, runs are equal or in different
+            units, or the good runs have nothing in common.
         LogError: a log cannot be read.
     """
     refuse_unknown(reading, Reading.__annotations__)
@@ -357,20 +359,19 @@ def evaluate_logs(
     strict_names: bool = False,
     **reading: Unpack[Reading],
 ) -> BatchResult:
-    """Evaluate many logs, but for what an earlier batch has evaluated already, and store their results.
+    """Evaluate many logs, and store their results. Results of an earlier batch are reused.
 
     Args:
-        logs: a suite file (.yaml), which says all the rest; or logs: files, folders, patterns such as
-            "nightly/**/*.mcap", addresses.
+        logs: a suite file (.yaml), which has all other settings; or files, folders, addresses, and patterns
+            such as "nightly/**/*.mcap".
         specifications: the specification files or their addresses, unless `logs` is a suite.
-        output: the folder of results, made if need be, or the address of one, as "s3://bucket/results".
-        jobs: how many processes evaluate; a program that gives more than 1 needs the guard
-            `if __name__ == "__main__":`, as for every process pool.
-        dask: the address of a Dask scheduler, whose workers evaluate instead.
-        fail_on: "vacuous", "cut", "unknown", "left", "doubtful": results that fail as well.
-        allow: "vacuous", "dropped", "doubtful": results that pass although nothing tested them, logs that
-            lack samples which their recorder dropped, and results that rest on an assumption which the log
-            contradicts.
+        output: folder of results, created if needed, or its address, such as "s3://bucket/results".
+        jobs: number of processes; for more than 1, a program needs the guard `if __name__ == "__main__":`, as
+            for every process pool.
+        dask: address of a Dask scheduler, whose workers evaluate instead.
+        fail_on: "vacuous", "cut", "unknown", "left", "doubtful": further kinds of results that fail.
+        allow: "vacuous", "dropped", "doubtful": kinds of results that pass. Nothing tested them, the recorder
+            dropped samples, or the log contradicts an assumption.
         constants, each, semantics, strict_names, reading: as for `replay_log`.
 
     Returns:
@@ -379,8 +380,8 @@ def evaluate_logs(
         no explanation.
 
     Raises:
-        UsageError: a pattern without a log, options that do not work, pyarrow is not installed.
-        SpecificationError: specifications with errors.
+        UsageError: a pattern has no log, an option is invalid, or pyarrow is not installed.
+        SpecificationError: specifications have errors.
         OutputError: results cannot be written; those written so far stay.
         ClusterError: the scheduler is lost; the results written so far stay.
     """
@@ -435,8 +436,9 @@ def judge(
             labels.csv next to the logs, or in the data set.
         result: the name of the spec that judges; by default the last one that no other spec uses.
         against: earlier episodes to compare with.
-        same_start: how far the objects of a pair may be apart in the first sample; 0.001 unless given.
-        failures: a specification file, whose specs are failures; each failed episode has the first of them.
+        same_start: largest distance of an object between the first samples of a pair; 0.001 unless given.
+        failures: a specification file whose specs describe failures; each failed episode has its first
+            failure.
         stages: whether each episode has its stage of the task at the end.
         output: the folder of results; without one, results are not stored.
 
@@ -500,7 +502,8 @@ def read_results(folder: PathName) -> pa.Table:
     """Return the table of the last run of a batch, a `pyarrow.Table`.
 
     Raises:
-        UsageError: no such folder, no results in it, or those of another version; pyarrow is not installed.
+        UsageError: the folder is missing, has no results or results of another version, or pyarrow is not
+            installed.
         LogError: the table is damaged.
     """
     from spatial_replay.batch.store import ResultsFolder
@@ -514,15 +517,15 @@ def verify(
     """Recompute a log's certificate, with the log's own specifications and options, and compare.
 
     Args:
-        source: the log that it was made from, evaluated in its place.
-        explain: say where it differs first, in `explanation`; takes another evaluation if it differs.
-        reading: how to read `source`, as for `read_trace`.
+        source: source of the log, which is evaluated instead.
+        explain: whether `explanation` has the first differences, which takes another evaluation.
+        reading: options of reading `source`, as for `read_trace`.
 
     Returns:
         Both certificates; `differences` is empty if they are equal.
 
     Raises:
-        UsageError, LogError, SpecificationError: it cannot be evaluated.
+        UsageError, LogError, SpecificationError: the log cannot be evaluated.
     """
     refuse_unknown(reading, Reading.__annotations__)
     if source is None and reading:
@@ -532,14 +535,14 @@ def verify(
 
 
 def info(log: PathName, **reading: Unpack[Reading]) -> Overview:
-    """Read a log once and return what it holds: samples, objects, signals, topics, attachments.
+    """Read a log once, and return its contents: samples, objects, signals, topics, attachments.
 
     Args:
-        reading: how to read it, as for `read_trace`.
+        reading: options of reading, as for `read_trace`.
 
     Raises:
-        UsageError: a missing file, or an external log without a mapping.
-        LogError: nothing in it can be read.
+        UsageError: the file is missing, or an external log has no mapping.
+        LogError: nothing in the log can be read.
     """
     return overview_of(open_source(log, **reading))
 

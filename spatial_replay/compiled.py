@@ -1,16 +1,16 @@
 """Numeric kernels: plain functions over arrays and numbers, run by the interpreter or as machine code.
 
-Compiling every kernel takes longer than reading a short log, and loading the compiled ones from disk takes
-its time, too. So a kernel is interpreted while little work is due (see `_may_interpret`). Long ones are
-shared among the processor's cores.
+Compiling all kernels takes longer than reading a short log, and loading machine code from disk takes time,
+too. So a kernel is interpreted while little work is due (see `_may_interpret`). Long kernels are shared among
+the processor's cores.
 
-Both ways give the same bits. Kernels use only sums, products, quotients, square roots, sines and cosines of
+Both forms give the same bits. Kernels use only sums, products, quotients, square roots, sines and cosines of
 IEEE doubles, without fast-math and fused contraction.
 
-Machine code is kept on disk, in a folder named after a digest of all sources of the package. So a changed
-kernel is never mistaken for the one before. A digest lies beside each file: damaged code would end the
-process by a signal, and is compiled again. `SPATIAL_REPLAY_CACHE` names another place.
-`SPATIAL_REPLAY_KERNELS` is `compiled` or `interpreted` to have only one of the two ways.
+Machine code is cached in a folder named after a digest of all sources of the package, so stale code is never
+loaded. Each file has its digest next to it. Damaged code would end the process by a signal, so it is removed
+and compiled again. `SPATIAL_REPLAY_CACHE` names another folder. `SPATIAL_REPLAY_KERNELS` is `compiled` or
+`interpreted` to allow one form only.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ import numpy as np
 from spatial_replay.errors import UsageError
 
 _WAIT_S: Final = 1.0
-"""Compiling that takes less is not announced."""
+"""Compile time above which compiling is announced, seconds."""
 _SLICE_S: Final = 2e-4
-"""How long the thread that loads code may keep the interpreter from a control loop."""
+"""Switch interval of threads while code is loaded, seconds: a control loop waits at most so long."""
 _REMEDY: Final = "`spatial-replay warmup` does it beforehand"
 
 
@@ -60,16 +60,16 @@ class Compiler:
             )
         self.interprets = True
         self.spent_s = 0.0
-        # tasks that a child process compiles, with the runs that load their code afterwards
+        # tasks that a child process compiles, with the trial runs that load their code afterwards
         self.trials: list[tuple[str, Callable[[], object]]] = []
         self.loader: threading.Thread | None = None
         self._loading = set[int]()
         self.listeners: list[Callable[[], None]] = []
         self._is_announced = False
-        # a module that another thread is still importing is in `sys.modules`, too
+        # not taken from `sys.modules`, which also has modules that another thread is still importing
         self._compiler: Any = None
         self.lock = threading.RLock()
-        # held while files are opened that a forked process must not keep
+        # held while files are open that a forked process must not inherit
         self.fork_lock = threading.Lock()
         self.turns = set[int]()
 
@@ -79,7 +79,7 @@ class Compiler:
 
     @property
     def is_awaiting(self) -> bool:
-        """Whether this thread interprets what a child process compiles."""
+        """Whether this thread interprets kernels that a child process compiles."""
         return bool(self.trials) and threading.get_ident() not in self._loading
 
     @property
@@ -89,13 +89,13 @@ class Compiler:
 
     @cached_property
     def _cached(self) -> frozenset[str]:
-        """The kernels whose machine code earlier processes have left in the cache."""
-        # a file is named after module, function and line: kernels.measure_rows-335.py311.nbi
+        """The names of kernels with machine code in the cache."""
+        # numba names a file after module, function and line: kernels.measure_rows-335.py311.nbi
         files = () if self.folder is None else self.folder.rglob("*.nbi")
         return frozenset(path.name.partition("-")[0] for path in files)
 
     def holds(self, function: Any) -> bool:
-        """Say whether the cache has machine code of a function."""
+        """Return whether the cache has machine code of a function."""
         return _name(function) in self._cached
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -106,26 +106,27 @@ class Compiler:
 
                 if self.folder is not None:
                     remove_damaged_files(self.folder)
-                    # and of what kernels that the cache holds are compiled for later
+                    # also for cached kernels that are compiled later, for further types
                     atexit.register(seal, self.folder)
                 self._compiler = numba
             compiler, is_cached = self._compiler, self.folder is not None
-            # the folder is read from the compiler's settings when a function is decorated; they belong to
-            # the user's own functions, too, and are put back
+            # numba reads the folder from its settings when a function is decorated; they also apply to the
+            # user's own functions, so they are restored
             before = compiler.config.CACHE_DIR
             if is_cached:
                 compiler.config.CACHE_DIR = str(self.folder)
             try:
                 available = compiler.njit(function).targetdescr.options
-                # an option that another version of the compiler does not have changes speed only
+                # options that another version of numba does not have only affect speed
                 options = {name: value for name, value in options.items() if hasattr(available, name)}
+                # with numba's default error model, a division by zero would raise
                 return compiler.njit(cache=is_cached, error_model="numpy", **options)(function)
             finally:
                 compiler.config.CACHE_DIR = before
 
     @contextmanager
     def compiling(self, function: Any) -> Iterator[None]:
-        """Let listeners know of a call that compiles what no cache holds; else say so if it takes long."""
+        """Notify listeners of a call that compiles an uncached kernel, and announce it if it takes long."""
         if self.holds(function):
             yield
             return
@@ -144,8 +145,8 @@ class Compiler:
 
     @contextmanager
     def loading(self) -> Iterator[None]:
-        """Load machine code in this thread, while others interpret."""
-        # of the files that a child has written
+        """Let this thread load machine code, while others interpret."""
+        # stale after a child has written files
         self.__dict__.pop("_cached", None)
         before, thread = sys.getswitchinterval(), threading.get_ident()
         sys.setswitchinterval(_SLICE_S)
@@ -157,7 +158,7 @@ class Compiler:
             sys.setswitchinterval(before)
 
     def await_code(self) -> bool:
-        """Begin a thread that loads the code of all trials, unless one runs; say whether it was begun."""
+        """Start a thread that loads the code of all trials, unless one runs. Return whether it started."""
         with self.lock:
             if self.loader is not None or self.folder is None:
                 return False
@@ -166,7 +167,7 @@ class Compiler:
             return True
 
     def finish(self, count: int) -> bool:
-        """End the thread that loads code, unless more than so many trials wait; say whether it ends."""
+        """End the thread that loads code, unless more than `count` trials wait. Return whether it ends."""
         with self.lock:
             if len(self.trials) > count:
                 return False
@@ -175,11 +176,11 @@ class Compiler:
             return True
 
     def renew(self) -> None:
-        """Begin the thread again in a forked process, which has none of its parent's."""
+        """Start the thread again in a forked process, which does not inherit its parent's threads."""
         self.lock = threading.RLock()
         self.fork_lock.release()
         self._loading.clear()
-        # the lock would last as long as the last process that has it open
+        # a lock of `flock` lasts until the last process has closed it
         for descriptor in self.turns:
             os.close(descriptor)
         self.turns.clear()
@@ -188,7 +189,7 @@ class Compiler:
             self.await_code()
 
     def say(self, text: str) -> None:
-        """Write a line on standard error, unless a listener shows that kernels are compiled."""
+        """Write a line on standard error, unless listeners show that kernels are compiled."""
         if not self.listeners:
             sys.stderr.write(f"spatial-replay: {text}\n")
 
@@ -199,7 +200,7 @@ class Compiler:
 
 
 def _name(function: Any) -> str:
-    """Return how the compiler names the files of a function."""
+    """Return the beginning of the names of numba's files for a function."""
     return f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
 
 
@@ -207,18 +208,18 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 _PATIENCE_S: Final = 0.8
-"""How long a process interprets kernels in any case: loading the compiler and machine code takes as long."""
+"""Time that a process interprets kernels in any case, seconds: as long as loading numba and code."""
 _FIRST_S: Final = 1.5
-"""The same for a kernel that was never run, before any code is loaded: most take a tenth of the guess."""
+"""This time for a kernel that was never run, before numba is loaded. Most take a tenth of the guess."""
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.03
-"""How long each kernel may be interpreted after that before it is compiled, or loaded from the cache."""
+"""Times that each kernel is interpreted afterwards, seconds: before compiling, and before loading."""
 _GUESS_S: Final = 2e-6
-"""For each element of its arrays, the time a kernel is expected to take when it was never run."""
+"""Guessed time of a kernel that was never run, seconds per array element."""
 _LONG: Final = 3.0
-"""How many times that a kernel takes whose calls are long: it works on pairs of elements."""
+"""Factor on the guess for long kernels, which work on pairs of elements."""
 _CALL: Final = 32
-"""As many elements take as long as what a call costs anyway."""
+"""Fixed cost of a call, in array elements."""
 
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -227,35 +228,35 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
 
 
 def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel whose calls may take milliseconds: other threads run while it does.
+    """Return a kernel whose calls may take milliseconds, and let other threads run meanwhile.
 
-    Not for short calls: each would hand the interpreter to a busy thread, which keeps it for milliseconds.
+    Short calls must not use it: a busy thread would get the interpreter, and keep it for milliseconds.
     """
     return _Kernel(function, {"nogil": True, "no_cfunc_wrapper": True}, times=_LONG)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel of which the interpreter takes two to five times as little time.
+    """Return a kernel that is interpreted two to five times as fast.
 
-    It gets its arrays as memoryviews of plain numbers; of a named tuple, those of one dimension. So it must
-    take and set single elements, with no slices but of one dimension, and never divide by zero.
+    It gets arrays as memoryviews of plain numbers; in named tuples, only arrays of one dimension. So it may
+    only read and set single elements, slice one dimension, and never divide by zero.
     """
     kernel = cast("_Kernel[_Arguments, _Result]", function)
     return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True, times=kernel.times)
 
 
 def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a function that only kernels call: as `kernel`, without the entry from Python."""
+    """Return a kernel that only other kernels call, without an entry from Python."""
     return _Kernel(function, {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
 def inlined(function: Callable[_Arguments, _Result], **options: bool) -> Callable[_Arguments, _Result]:
-    """Return a piece that becomes part of every kernel that calls it.
+    """Return a piece that is inlined into every kernel that calls it.
 
-    A call counts references to the arrays that it is given; within one function, that cancels out.
+    A call counts references to its arrays. Within one function, these counts cancel out.
 
     Args:
-        options: further ones of the compiler, ignored by versions that do not have them.
+        options: further options of numba, ignored by versions without them.
     """
     options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return _Kernel(function, options)
@@ -267,16 +268,16 @@ def compile_ahead() -> None:
 
 
 def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None:
-    """Make kernels ready for a control loop, which a call that is compiled late would keep waiting.
+    """Prepare kernels for a control loop, so that no call waits for the compiler.
 
-    A trial run loads machine code that the cache holds. Otherwise a child process compiles it, and all
-    kernels that are not loaded are interpreted until a thread has loaded it.
+    A trial run loads cached machine code. If there is none, a child process compiles it, and kernels are
+    interpreted until a thread has loaded it.
 
     Args:
-        task: the name of the task of `spatial-replay warmup` that compiles all kernels of the trial.
+        task: name of the `spatial-replay warmup` task that compiles all kernels of the trial.
         wait: whether to compile in this process, and return when all kernels are compiled.
     """
-    # once: garbage of a program that starts many monitors is still collected
+    # only at the first start, so that garbage of a program with many monitors is still collected
     collections = _no_collection() if _process.interprets else nullcontext()
     compile_ahead()
     if _process.only is not None or wait or _is_compiled(task):
@@ -287,7 +288,7 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
         _process.folder = _passing_folder()
     _process.trials.append((task, trial))
     try:
-        # interpreted: it imports and keeps all that the first sample would wait for
+        # the interpreted trial imports and caches everything that the first sample would wait for
         with collections:
             trial()
     except BaseException:
@@ -300,7 +301,7 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
 
 
 def _passing_folder() -> Path | None:
-    """Return a folder for machine code of this process alone; None if none can be written."""
+    """Return a temporary folder for machine code of this process; None if none can be written."""
     try:
         folder = Path(tempfile.mkdtemp(prefix="spatial-replay-"), f"kernels-{source_digest()}")
         folder.mkdir()
@@ -323,32 +324,32 @@ def _is_compiled(task: str) -> bool:
 
 
 def _note_of(task: str, folder: Path) -> Path:
-    """Return the file that says that the code of a task is there."""
+    """Return the path of the file that marks a task as compiled."""
     return folder / f"{task}-{_target()}.compiled"
 
 
 @cache
 def _target() -> str:
-    """Return a digest of what machine code depends on besides the sources: Python, compiler, processor."""
-    # imported now: while a loop runs, that would keep it waiting
+    """Return a digest of the target of machine code: Python, numba and processor."""
+    # imported before a control loop runs, which would wait for the import
     import numba
 
     target = [sys.version, numba.__version__, platform.machine(), platform.processor()]
     with suppress(OSError):  # not Linux
-        # of the first core
+        # lines of the first core
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
         target += [line for line in lines if line.startswith(("model name", "flags", "Features"))]
     return hashlib.sha256("\n".join(target).encode()).hexdigest()[:16]
 
 
 def _load_code(folder: Path) -> None:
-    """Load the code of all trials, each compiled by a child process: one at a time on a machine."""
+    """Load the code of all trials. A child process compiles each of them, one at a time on a machine."""
     count = 0
     try:
         while not _process.finish(count):
             task, trial = _process.trials[count]
             note = _note_of(task, folder)
-            # waits for the child of another process; the lock is also the child's, and ends with both
+            # waits for children of other processes; the child inherits the lock, so it lasts for both
             with turn(folder, "warmup") as lock:
                 status = 0 if note.exists() else _compile_in_child(task, folder, lock)
             if not note.exists():
@@ -357,7 +358,7 @@ def _load_code(folder: Path) -> None:
                 trial()
             count += 1
     except Exception as error:
-        # interpreted from now on: a loop must not wait for the compiler
+        # kernels stay interpreted, because a control loop must not wait for the compiler
         _process.loader = None
         _process.say(f"code stays interpreted: {error!s:.200}; {_REMEDY}")
     else:
@@ -366,7 +367,7 @@ def _load_code(folder: Path) -> None:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keep new objects out of garbage collections: each keeps all threads waiting for 50 ms."""
+    """Keep new objects out of garbage collections, each of which stops all threads for 50 ms."""
     if not gc.isenabled():
         yield
         return
@@ -387,16 +388,16 @@ compile_task(sys.argv[1])
 
 
 def _compile_in_child(task: str, folder: Path, lock: int) -> int:
-    """Compile a task in a child, which goes on if this process ends; return its status."""
+    """Compile a task in a child, which continues if this process ends. Return its status."""
     if not sys.executable or getattr(sys, "frozen", False):
         raise OSError("this program has no interpreter of its own to begin a child process with")
-    # a child that compiles starts none itself
+    # with this setting, the child starts no child itself
     environment = {
         **os.environ,
         "SPATIAL_REPLAY_KERNELS": "compiled",
         "SPATIAL_REPLAY_CACHE": str(folder.parent),
     }
-    # a process forked now would keep the pipe open whose end says that the child has begun
+    # a process forked meanwhile would keep open the pipe by which Popen notices the start of the child
     with _process.fork_lock:
         child = subprocess.Popen(
             [sys.executable, "-P", "-c", _CHILD, task, *sys.path],
@@ -411,7 +412,7 @@ def _compile_in_child(task: str, folder: Path, lock: int) -> int:
 
 
 def kernels() -> Iterator[_Kernel[..., Any]]:
-    """Yield the kernels of all modules that are loaded, without the pieces that only kernels call."""
+    """Yield the kernels of all loaded modules, without pieces that only kernels call."""
     for module in tuple(sys.modules.values()):
         for value in tuple(vars(module).values()) if module.__name__.startswith(__package__) else ():
             if isinstance(value, _Kernel) and value.__module__ == module.__name__ and value.is_entry:
@@ -420,7 +421,7 @@ def kernels() -> Iterator[_Kernel[..., Any]]:
 
 @contextmanager
 def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
-    """Run kernels in one form only, while this lasts."""
+    """Run kernels in one form only within this context."""
     before, _process.only = _process.only, form
     try:
         yield
@@ -430,7 +431,7 @@ def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
 
 @contextmanager
 def compilations(hear: Callable[[], None]) -> Iterator[None]:
-    """Call `hear`, while this lasts, whenever a kernel is about to be compiled that no cache holds."""
+    """Call `hear` before an uncached kernel is compiled within this context."""
     _process.listeners.append(hear)
     try:
         yield
@@ -439,7 +440,7 @@ def compilations(hear: Callable[[], None]) -> Iterator[None]:
 
 
 class _Kernel(Generic[_Arguments, _Result]):
-    """A function in its two forms, each made when it is first needed."""
+    """A function in two forms, interpreted and compiled, each made when it is first needed."""
 
     def __init__(
         self,
@@ -473,7 +474,7 @@ class _Kernel(Generic[_Arguments, _Result]):
             return result
         run = cast(Callable[..., _Result], self.interpreted_form())
         begin = time.thread_time()
-        # as in machine code: a quotient by zero or a product out of range is no error and no warning
+        # as in machine code, a division by zero or an overflow gives no error and no warning
         with np.errstate(all="ignore"):
             result = run(*(map(_view, arguments) if self._is_elementwise else arguments), **named)
         took = time.thread_time() - begin
@@ -493,7 +494,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         return bool(getattr(self._compiled, "signatures", ()))
 
     def _may_interpret(self, elements: int) -> bool:
-        """Return whether a call is interpreted: while little work is due, in this process or this kernel."""
+        """Return whether a call is interpreted: little work is due in this process or for this kernel."""
         if _process.only is not None:
             return _process.only == "interpreted"
         if not _process.interprets:
@@ -504,17 +505,17 @@ class _Kernel(Generic[_Arguments, _Result]):
         patience_s = _FIRST_S if is_guess else _PATIENCE_S
         if _process.spent_s + cost <= patience_s or self._spent_s + cost <= _WARM_S:
             return True
-        # asked last, since looking for the cache takes its time, too
+        # tested last, because searching the cache takes time, too
         return self._spent_s + cost <= _COLD_S and not _process.holds(self.__wrapped__)
 
     def interpreted_form(self) -> Callable[_Arguments, _Result]:
-        """Return the function as it stands, calling others as they stand."""
+        """Return the plain function, which calls the plain forms of other kernels."""
         if self._interpreted is None:
             self._interpreted = _link(self.__wrapped__, methodcaller("interpreted_form"))
         return self._interpreted
 
     def compiled_form(self) -> Callable[_Arguments, _Result]:
-        """Return the function as machine code, calling machine code."""
+        """Return the compiled function, which calls the compiled forms of other kernels."""
         if self._compiled is None:
             linked = _link(self.__wrapped__, methodcaller("compiled_form"))
             self._compiled = _process.compile(linked, self.options)
@@ -546,9 +547,9 @@ def _names(function: FunctionType) -> set[str]:
 
 
 def _elements(values: object) -> int:
-    """Return how many numbers arrays have, also within tuples.
+    """Return the number of elements of arrays, also within tuples.
 
-    64 bytes count as a number, because kernels copy bytes at once or skip records.
+    In arrays of bytes, 64 bytes count as an element, because kernels copy bytes at once or skip records.
     """
     if isinstance(values, np.ndarray):
         return values.size // (64 if values.itemsize == 1 else 1)
@@ -559,7 +560,7 @@ def _elements(values: object) -> int:
 
 def _view(value: Any) -> object:
     if isinstance(value, tuple):
-        # kernels take rows of the arrays in named tuples, and a memoryview of several dimensions has none
+        # kernels take rows of arrays in named tuples, and memoryviews of several dimensions have no rows
         make: Any = type(value)
         return cast(object, make(*(_view(array) if array.ndim == 1 else array for array in value)))
     return value.data if isinstance(value, np.ndarray) else value
@@ -574,18 +575,18 @@ os.register_at_fork(
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def over_cores(
     used: Callable[..., object], run: Callable[[int, int], object], count: int, least: int
 ) -> None:
-    """Call `run(begin, end)` for shares that make up range(count), each share on a core of its own.
+    """Split range(count) into shares, and call `run(begin, end)` for each share on its own core.
 
     Args:
-        used: the long kernel that `run` calls; all is one share until it is compiled.
-        least: the least length of a share, which takes at least about a millisecond.
+        used: long kernel that `run` calls; until it is compiled, there is one share.
+        least: least length of a share, which should take about a millisecond.
     """
     shares = min(cores(), count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
     if shares < 2:
@@ -601,14 +602,14 @@ def over_cores(
 
 _STALE_S: Final = 7 * 24 * 3600.0
 _ROOM_BYTES: Final = 2**25
-"""A disk with less space keeps no code: a kernel that cannot be written ends the process."""
+"""Free disk space below which code is not cached, bytes. A kernel that cannot be written ends the process."""
 _PACKAGE: Final = Path(__file__).parent
 
 
 def cache_folder() -> Path | None:
-    """Return the folder for machine code of these sources, made if need be; None if none can be written.
+    """Return the folder for machine code of these sources, created if needed; None if none can be written.
 
-    Code in it is loaded as it is, so it lies where only the user, or who installed the package, writes.
+    Code is loaded unchecked, so only the user, or the installer of the package, may write to the folder.
     """
     name = f"kernels-{source_digest()}"
     shipped: Path | None = None
@@ -617,13 +618,13 @@ def cache_folder() -> Path | None:
         try:
             is_new = not folder.exists()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # that of another user, where several may write, cannot be opened
+            # in a folder where several users write, the lock of another user cannot be opened
             os.close(_opened_lock(folder))
             with tempfile.TemporaryFile(dir=folder):
                 if shutil.disk_usage(folder).free < _ROOM_BYTES:
                     raise OSError(errno.ENOSPC, "no space left")
         except OSError:
-            # code that was compiled when an image was built, and is read-only now, or on a full disk
+            # this may be code of a container image, which is read-only or on a full disk
             shipped = shipped or (folder if any(folder.rglob("*.nbi")) else None)
             continue
         if is_new:
@@ -636,9 +637,9 @@ def cache_folder() -> Path | None:
 
 
 def remove_damaged_files(folder: Path) -> None:
-    """Remove machine code that is not what was written.
+    """Remove machine code that does not match its digest.
 
-    Code newer than its digest may be in the making while other processes run that use the folder. It stays.
+    Code newer than its digest may be unfinished while other processes use the folder. It is kept.
     """
     descriptor = _opened_lock(folder)
     try:
@@ -651,13 +652,13 @@ def remove_damaged_files(folder: Path) -> None:
             is_damaged = not _is_sealed(path) or _seal_of(path).read_bytes() != _digest_of(path)
             if is_damaged and (is_alone or _is_sealed(path)):
                 path.unlink()
-    # until this process ends
+    # a shared lock, until this process ends
     fcntl.flock(descriptor, fcntl.LOCK_SH)
 
 
 @contextmanager
 def turn(folder: Path | None, kernel: str) -> Iterator[int]:
-    """Wait for other processes that compile the same kernel: what they wrote is then loaded.
+    """Wait for other processes that compile the same kernel, because their code can be loaded.
 
     Yields:
         The descriptor of the lock, which a child process may inherit; -1 without a folder.
@@ -674,7 +675,7 @@ def turn(folder: Path | None, kernel: str) -> Iterator[int]:
         yield descriptor
     finally:
         with _process.fork_lock:
-            # a process forked by this thread has closed it
+            # in a process that this thread has forked, `renew` has closed it
             if descriptor in _process.turns:
                 _process.turns.remove(descriptor)
                 os.close(descriptor)
@@ -685,7 +686,7 @@ def _opened_lock(folder: Path, name: str = "lock") -> int:
 
 
 def seal(folder: Path) -> None:
-    """Note what was written since the last time."""
+    """Write the digests of files that were written since the last call."""
     for path in folder.rglob("*.nb[ic]"):
         with suppress(OSError):
             if not _is_sealed(path):
@@ -693,7 +694,7 @@ def seal(folder: Path) -> None:
 
 
 def _is_sealed(path: Path) -> bool:
-    """Return whether a digest was noted after a file was written."""
+    """Return whether the digest of a file was written after the file."""
     sealed = _seal_of(path)
     return sealed.exists() and sealed.stat().st_mtime_ns >= path.stat().st_mtime_ns
 
@@ -713,13 +714,13 @@ def _cache_parents() -> Iterator[Path]:
     yield _PACKAGE / "__pycache__"
     if Path(value := os.environ.get("XDG_CACHE_HOME", "")).is_absolute():
         yield Path(value) / "spatial-replay"
-    # a user without a home folder
+    # `Path.home` fails for a user without a home folder
     with suppress(RuntimeError):
         yield Path.home() / ".cache" / "spatial-replay"
 
 
 def _remove_stale(parent: Path, keep: str) -> None:
-    """Remove machine code of other sources that no process has added to for a while."""
+    """Remove machine code of other sources to which no process has added for a week."""
     oldest = time.time() - _STALE_S
     for folder in parent.glob("kernels-*"):
         with suppress(OSError):

@@ -28,26 +28,26 @@ _ERROR_NUMBER: Final = re.compile(r"\[Errno (\d+)\]")
 
 
 def system_reason(error: Exception) -> str:
-    """Return why the system refuses something, in its own words: "permission denied"."""
+    """Return the system's message for an error, in lower case: "permission denied"."""
     number = getattr(error, "errno", None)
     if number is None and (match := _ERROR_NUMBER.search(str(error))) is not None:
         # several attempts to connect failed, each with its own error
         number = int(match[1])
-    # names that are not found have numbers below 0, of another list
+    # errors of getaddrinfo have negative numbers, which strerror does not know
     words = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
     return (words or str(error) or type(error).__name__).lower()
 
 
 @contextmanager
 def importing(what: str, *, extra: str) -> Iterator[None]:
-    """Import optional libraries: a context in which they are imported.
+    """Context for the import of optional libraries.
 
     Args:
-        what: what needs them: "videos need PyAV".
-        extra: of this package, which installs them.
+        what: the feature with its library: "videos need PyAV".
+        extra: extra of this package that installs the library.
 
     Raises:
-        UsageError: one is not installed.
+        UsageError: the library is not installed.
     """
     try:
         yield
@@ -139,4 +139,4 @@ class OutputError(SpatialReplayError):
 
 
 class ClusterError(SpatialReplayError):
-    """A cluster whose scheduler answers no more."""
+    """A cluster whose scheduler has stopped answering."""

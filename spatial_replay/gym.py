@@ -1,4 +1,4 @@
-"""Episodes of gymnasium environments, judged while they happen."""
+"""Episodes of gymnasium environments, judged while they run."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ with importing("judging environments takes gymnasium", extra="gym"):
 if TYPE_CHECKING:
     _VectorWrapper: TypeAlias = VectorWrapper[Any, Any, Any, Any, Any]
 else:
-    # no generic class in gymnasium 1.1
+    # the class is not generic in gymnasium 1.1
     _VectorWrapper = VectorWrapper
 
 Objects: TypeAlias = Callable[[Any, dict[str, Any]], Mapping[str, TrackedObject | Footprint]]
-"""From an observation and its info, the objects by name."""
+"""Function from an observation and its info to objects by name."""
 Signals: TypeAlias = Callable[[Any, dict[str, Any]], Mapping[str, float | str]]
-"""From an observation and its info, the signals by name."""
+"""Function from an observation and its info to signals by name."""
 Judged: TypeAlias = dict[str, Any]
 """The `info["judge"]` of a step, see `Judge`."""
 LogPath: TypeAlias = Callable[[Judged], str | PathLike[str] | None]
-"""From the last `info["judge"]` of an episode, the log to write; None for none."""
+"""Function from the last `info["judge"]` of an episode to the path of its log; None writes no log."""
 
 _UNTIL: Final = ("satisfied", "violated", "settled")
 _REWARDS: Final = ("margin", "progress")
@@ -50,16 +50,15 @@ _REWARDS: Final = ("margin", "progress")
 class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment whose episodes are judged by a specification.
 
-    A sample is taken of every reset and of every step. `info["judge"]` has:
+    Every reset and every step gives a sample. `info["judge"]` has:
 
-    - `episode`: its number, from 0; `env`: that of the environment, in a vector of them.
+    - `episode`: its number, from 0; `env`: the number of the environment in a vector.
     - `verdict`: "satisfied", "violated" or "unknown", if the episode ended with this sample.
-    - `success`: whether that is "satisfied".
-    - `settled`: whether no later sample can change it.
+    - `success`: whether the verdict is "satisfied".
+    - `settled`: whether no later sample can change the verdict.
     - `margin`: the robustness of the episode so far; NaN if it is not determined.
-    - `stage`, `owed`, `progress`: how far the episode has come (see `annotate.stages`); only of a spec that
-      has an automaton.
-    - `reason`: what violated the spec, in a sentence; only where an episode ends with a settled violation.
+    - `stage`, `owed`, `progress`: see `annotate.stages`; only of a spec that has an automaton.
+    - `reason`: a sentence on the violation; only if an episode ends with a settled violation.
 
     The numbers equal those of a replay of the log of the episode.
     """
@@ -86,17 +85,18 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Wrap an environment, or a vector of them.
 
         Args:
-            objects, signals: return what a sample has, from an observation and its info.
-            rate_hz: steps a second; the reset of an episode has the time 0.
+            objects, signals: functions that return the objects and signals of a sample.
+            rate_hz: steps per second; the reset of an episode has the time 0.
             result: the name of the spec that judges; by default the last one that no other spec uses.
             until: the settled verdict that terminates an episode.
-            reward: replaces the environment's reward by the gain in margin or progress since the sample
-                before. A margin that is not finite gains 0, and the next one counts from the last finite one.
-            log: called at the end of each episode; the episode is written to the path that it returns.
+            reward: replaces the environment's reward by the gain in margin or progress since the previous
+                sample. A margin that is not finite gains 0, and the next gain counts from the last finite
+                margin.
+            log: function that is called at the end of each episode, and returns the path of its log.
 
         Raises:
-            UsageError: no such spec or option, a template, no objects or signals; `until` with a vector
-                environment that resets its episodes itself.
+            UsageError: a spec or option is unknown, the spec is a template, there are no objects and signals,
+                or `until` is given for a vector environment that resets its episodes itself.
             NoAutomatonError: `reward="progress"` with a spec that has no automaton.
         """
         super().__init__(env)
@@ -125,7 +125,7 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, episodes.gain(reward), terminated, truncated, {**info, "judge": judged}
 
     def close(self) -> None:
-        """Write the log of an unfinished episode, if it is wanted, and close the environment."""
+        """Write the log of an unfinished episode if requested, and close the environment."""
         self._episodes.end()
         super().close()
 
@@ -133,8 +133,8 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
 class VectorJudge(_VectorWrapper):
     """A vector environment whose episodes are judged; `Judge` returns it for a vector environment.
 
-    Values of `info["judge"]` are arrays with masks (`_verdict`, …). Where the same step resets an episode,
-    its last sample is in `info["final_info"]["judge"]`.
+    Values of `info["judge"]` are arrays with masks (`_verdict`, …). If the same step resets an episode, its
+    last sample is in `info["final_info"]["judge"]`.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class VectorJudge(_VectorWrapper):
             episodes, info = self._episodes[number], _info_of(infos, number)
             last = info.pop("final_obs", None), info.pop("final_info", None)
             if begins[number]:
-                # the step of a reset: its action was ignored
+                # in this mode, the step after the end is the reset, and its action is ignored
                 judged = episodes.begin(observation, info)
             elif self._mode is AutoresetMode.SAME_STEP and self._ended[number]:
                 judged = episodes.extend(*_last_of(last), ended=True)
@@ -196,7 +196,7 @@ class VectorJudge(_VectorWrapper):
         return observations, rewards, terminations, truncations, infos
 
     def close(self, **options: Any) -> None:
-        """Write the logs of unfinished episodes, if they are wanted, and close the environments."""
+        """Write the logs of unfinished episodes if requested, and close the environments."""
         for episodes in self._episodes:
             episodes.end()
         super().close(**options)
@@ -234,7 +234,7 @@ class _Episodes:
         self._objects, self._signals, self._log = objects, signals, log
         self._until, self._reward = until, reward
         period_ns = Fraction(10**9) / Fraction(repr(float(rate_hz)))
-        # whole numbers are multiplied in a tenth of the time
+        # multiplying an int takes a tenth of the time of a Fraction
         self._period_ns = int(period_ns) if period_ns.denominator == 1 else period_ns
         self._about: Judged = {} if env is None else {"env": env}
         self._episode = -1
@@ -257,7 +257,7 @@ class _Episodes:
         return self.extend(observation, info)
 
     def extend(self, observation: Any, info: dict[str, Any], *, ended: bool = False) -> Judged:
-        """Add a sample, the last one if the episode has ended; return what `info["judge"]` is."""
+        """Add a sample, which is the last one if the episode has ended. Return its `info["judge"]`."""
         sample = Sample(
             round(self._frame * self._period_ns),
             self._objects(observation, info) if self._objects is not None else {},
@@ -284,11 +284,11 @@ class _Episodes:
         return judged
 
     def gain(self, reward: Any) -> Any:
-        """Return the reward of the last step: that of the environment, or the gain."""
+        """Return the reward of the last step: the environment's reward, or the gain."""
         return reward if self._reward is None else self._gain
 
     def end(self) -> None:
-        """End the episode, if that has not happened, and write its log, if that is wanted."""
+        """End the episode unless it has ended, and write its log if requested."""
         judged, self._judged = self._judged, None
         path = None if self._log is None or judged is None else self._log(judged)
         if path is not None:
@@ -354,7 +354,7 @@ def _last_of(last: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
 
 
 def _info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """Return the info of one environment of a vector, without what its masks say it does not have."""
+    """Return the info of one environment of a vector, without values that its masks exclude."""
     info: dict[str, Any] = {}
     for key, values in infos.items():
         mask = infos.get(f"_{key}")
@@ -364,6 +364,6 @@ def _info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
         if isinstance(values, dict):
             info[key] = _info_of(values, number)
         else:
-            # without a mask, a value may be about all environments
+            # without a mask, a value may apply to all environments
             info[key] = values[number] if mask is not None or np.ndim(values) else values
     return info

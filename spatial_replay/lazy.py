@@ -1,4 +1,4 @@
-"""Lazy imports: names of a package, and how values are displayed in notebooks."""
+"""Lazy imports: names of a package, and displays of values in notebooks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package (PEP 562).
 
-    A name of its `__all__` is loaded as the package's source imports it for type checkers.
+    The module of a name in `__all__` is read from the imports for type checkers in the package's source.
 
     Args:
         package: its `globals()`, where loaded names are stored.
@@ -42,7 +42,7 @@ def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Call
 class Displayed:
     """A value that `spatial_replay.notebook` can display.
 
-    That package imports the values, so values cannot import it; it is loaded by name when a notebook asks.
+    That package imports the values, so values cannot import it. It is loaded by name for a display.
     """
 
     __slots__ = ()

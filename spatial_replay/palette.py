@@ -33,7 +33,7 @@ def hexadecimal(colour: tuple[float, float, float]) -> str:
 
 
 def light(colour: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a background colour for dark text: less than a third of the colour, in white."""
+    """Return a background colour for dark text: 30 % of the colour, mixed with white."""
     red, green, blue = (0.7 + 0.3 * share for share in colour)
     return red, green, blue
 
@@ -46,7 +46,7 @@ def lighter(colour: str) -> str:
 
 
 MAP: Final = (hexadecimal(NEGATIVE), "#f5f5f5", hexadecimal(POSITIVE))
-"""Colours of a gradient map, from what fails most over 0 to what holds most."""
+"""Colours of a gradient map: for the least robustness, for 0, and for the greatest."""
 
 SIGNS: Final = MappingProxyType(
     {

@@ -1,6 +1,6 @@
 """A pytest plugin: suites named `*.replay.yaml` are collected, as one test for each log and spec.
 
-Every run of pytest imports this module, so it loads nothing of the package until there is such a file.
+Every run of pytest imports this module, so it imports the package only if there is such a file.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SuiteFile(pytest.File):
             for log in prepared.logs:
                 task = Task(log.path, tuple(file.text for file in prepared.files), case.conditions)
                 for number, file in enumerate(prepared.files):
-                    # several specification files may use one name
+                    # several specification files may have a spec of the same name
                     stem = f"{file.name.removesuffix('.spatial')}." if len(prepared.files) > 1 else ""
                     for spec in _result_names(task, number):
                         name = f"{case.name}[{log.name}-{stem}{spec}]"
@@ -76,7 +76,7 @@ class ReplayItem(pytest.Item):
             self.add_marker(pytest.mark.xdist_group(task.log))
 
     def runtest(self) -> None:
-        """Evaluate the log, unless another of its specs has, and fail for each result that does not pass."""
+        """Evaluate the log unless its rows are known, and fail for each result that does not pass."""
         rows = [row for row in _results(self.session).rows(self.task)[self._file] if row.spec == self._spec]
         ids = dict.fromkeys([*filter(None, (row.requirement for row in rows)), *self._case.requirements])
         self.user_properties += [("requirement", identifier) for identifier in ids]
@@ -86,7 +86,7 @@ class ReplayItem(pytest.Item):
             raise _NotSatisfiedError("\n\n".join(failures))
 
     def _failure(self, row: ResultRow) -> str | None:
-        """Return what is wrong with a result and what explains it; None if it passes."""
+        """Return the failure of a result with its explanation; None if it passes."""
         from spatial_replay.text import requirement_text
 
         failure = row.error
@@ -100,7 +100,7 @@ class ReplayItem(pytest.Item):
         return "\n".join(filter(None, lines))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """Return the explanation alone: where it was raised says nothing."""
+        """Return the explanation without a traceback, which would only show this plugin."""
         if isinstance(excinfo.value, _NotSatisfiedError):
             return str(excinfo.value)
         return super().repr_failure(excinfo)
@@ -144,7 +144,7 @@ _RESULTS = pytest.StashKey[_Results]()
 
 
 def _results(session: pytest.Session) -> _Results:
-    """Return the results of a session's tests, none of which is evaluated yet at first."""
+    """Return the results of a session's tests, which are evaluated on demand."""
     if _RESULTS not in session.stash:
         jobs = session.config.getoption("--replay-jobs")
         tasks = [item.task for item in session.items if isinstance(item, ReplayItem)]

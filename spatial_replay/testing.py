@@ -1,4 +1,4 @@
-"""Assertions for tests of one's own: a log satisfies a specification, or the test fails with the reason."""
+"""Assertions for users' tests: a log satisfies a specification, or the test fails with the reason."""
 
 from __future__ import annotations
 
@@ -25,28 +25,27 @@ def assert_satisfied(
 
     Args:
         log: a file in any format, an address, or a trace.
-        specifications: one or several, parsed or as files; None takes those that the log was written with.
-        at_least: the least robustness that passes, whatever the verdict, in the units of the formula.
-        tolerance: how much less passes, as an allowance for rounding.
-        allow: "vacuous", "dropped" and "doubtful": results that were tested by nothing, logs that lack
-            samples which their recorder dropped, and results that rest on an assumption which the log
-            contradicts.
-        options: how to evaluate and read the log, as for `replay_log`.
+        specifications: one or several, parsed or as files; None takes the specifications in the log.
+        at_least: least robustness that passes, independent of the verdict, in the units of the formula.
+        tolerance: allowance below the limit, for rounding.
+        allow: "vacuous", "dropped" and "doubtful": kinds of results that pass. Nothing tested them, the
+            recorder dropped samples, or the log contradicts an assumption.
+        options: options of evaluation and reading, as for `replay_log`.
 
     Returns:
-        What `replay_log` returns, for further assertions.
+        The results of `replay_log`, for further assertions.
 
     Raises:
         AssertionError: a result is violated, unknown, less robust, doubtful, or tested by nothing; its text
-            is what `explain` says.
-        UsageError, SpecificationError, LogError: it cannot be evaluated.
+            is the output of `explain`.
+        UsageError, SpecificationError, LogError: the log cannot be evaluated.
     """
     __tracebackhide__ = True
     replayed = replay_log(log, specifications, **options)
     expectation = Expectation(at_least=at_least, tolerance=tolerance, allow=frozenset(allow))
     reasons = []
     for result in replayed.results:
-        # those fields of a row of a batch that decide
+        # the fields of a row of a batch that decide whether it passes
         outcome: Any = SimpleNamespace(
             verdict=result.verdict,
             lower=result.lower,

@@ -20,12 +20,12 @@ from spatial_replay.errors import UsageError
 _Called = TypeVar("_Called", bound=Callable[..., Any])
 
 _LONGEST: Final = 300
-"""Characters of a printable text."""
+"""Length limit of a printable text, characters."""
 _LONGEST_FORMULA: Final = 60
 _LONGEST_NAME: Final = 100
 _MOST_NAMES: Final = 2_000
 _MOST_ALIKE: Final = 5
-"""Bounds of the comparison, which takes quadratic time: names come from logs and may be hostile."""
+"""Limits of comparing names, which takes quadratic time: names come from logs and may be hostile."""
 
 
 def is_encodable(text: str) -> bool:
@@ -34,7 +34,7 @@ def is_encodable(text: str) -> bool:
 
 
 def encodable(text: str) -> str:
-    """Return a text that fits UTF-8: bytes of a file name that do not are written as escapes."""
+    """Return a text that fits UTF-8, with escapes for the invalid bytes of a file name."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
@@ -46,7 +46,7 @@ class Instant:
     first_ns: int
 
     def __str__(self) -> str:
-        # what rounds to 0 has no sign
+        # adding 0.0 removes the sign of a time that rounds to -0.0
         return f"{round((self.time_ns - self.first_ns) / 1e9, 3) + 0.0:.3f} s"
 
 
@@ -54,7 +54,7 @@ class Sentence(str):
     """A sentence that knows the times in it, so that a page can link them.
 
     Attributes:
-        parts: what it is made of, in order.
+        parts: texts and times of the sentence, in order.
     """
 
     __slots__ = ("parts",)
@@ -70,7 +70,7 @@ class Sentence(str):
 
 
 CALENDAR_NS: Final = 500_000_000 * 10**9
-"""Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
+"""Least time that counts from 1970. Smaller times are of clocks that start at power-on."""
 
 
 def clock_text(time_ns: int, *, with_date: bool = False) -> str:
@@ -84,7 +84,7 @@ def clock_text(time_ns: int, *, with_date: bool = False) -> str:
 
 
 def counted_from(texts: Iterable[str], first_ns: int) -> tuple[Sentence, ...]:
-    """Return texts whose times, where they know them, count from `first_ns`."""
+    """Return texts as sentences. Times of given sentences count from `first_ns`."""
     return tuple(
         Sentence(
             *(Instant(part.time_ns, first_ns) if isinstance(part, Instant) else part for part in text.parts)
@@ -105,7 +105,7 @@ def without_numbers(text: str) -> str:
 
 
 def without_repetition(texts: Iterable[str]) -> list[str]:
-    """Return texts with one in place of several that differ in their numbers only, and how many those are."""
+    """Return texts, with one text and a count for several texts that differ in their numbers only."""
     alike: dict[str, list[str]] = {}
     for text in texts:
         alike.setdefault(without_numbers(text), []).append(text)
@@ -123,19 +123,19 @@ def plural(count: int, noun: str) -> str:
 
 DIGITS: Final = 4
 LARGEST_PLAIN: Final = 1e12
-"""Digits of numbers in texts; from here on they are written with an exponent."""
+"""Digits of numbers in texts, and the number from which on they have an exponent."""
 
 
 def number_text(number: float) -> str:
     """Return a number with four digits, enough for a reader; JSON and logs have all of them."""
-    # 0 has no sign
+    # adding 0.0 removes the sign of -0.0
     number += 0.0
     is_long = 10.0**DIGITS <= abs(number) < LARGEST_PLAIN
     return f"{number:.0f}" if is_long else f"{number:.{DIGITS}g}"
 
 
 def with_unit(number: float, unit: str) -> str:
-    """Return a number with its unit, as in "0.05 m"; neither infinity nor a number of unit "1" has one."""
+    """Return a number with its unit: "0.05 m". Infinity and numbers of unit "1" have none."""
     if names := names_from_unit(unit):
         called = [f" ({json.dumps(name, ensure_ascii=False)})" for name in names if names[name] == number]
         return number_text(number) + "".join(called[:1])
@@ -143,7 +143,7 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def interval_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
-    """Return a robustness with its unit, and its interval where that is wider: "between -inf and -0.2 m"."""
+    """Return a robustness with its unit, and its interval if that is wider: "between -inf and -0.2 m"."""
     number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
     if math.isnan(lower) or lower == upper == robustness:
         return number
@@ -152,7 +152,7 @@ def interval_text(robustness: float, lower: float, upper: float, unit: str = "")
 
 
 def names_from_unit(unit: str) -> dict[str, float]:
-    """Return the numbers by name that stand, as a JSON object, in place of a unit; none for a unit."""
+    """Return the numbers by name in a JSON object that replaces a unit; none for a plain unit."""
     try:
         return {name: float(number) for name, number in json.loads(unit).items()} if unit[:1] == "{" else {}
     except (ValueError, TypeError, OverflowError, RecursionError):
@@ -160,7 +160,7 @@ def names_from_unit(unit: str) -> dict[str, float]:
 
 
 def plain_unit(unit: str) -> str:
-    """Return a unit; "" for names in place of one."""
+    """Return a unit; "" if names of numbers replace it."""
     return "" if names_from_unit(unit) else unit
 
 
@@ -187,7 +187,7 @@ def json_value(value: Any) -> Any:
 
 
 def json_fields(record: Any, *names: str) -> dict[str, Any]:
-    """Return attributes of a record for JSON, by their names without "is_"; without names, all its fields."""
+    """Return attributes of a record for JSON, by names without "is_"; by default all its fields."""
     keys = names or getattr(record, "_fields", None) or [field.name for field in fields(record)]
     return {key.removeprefix("is_"): json_value(getattr(record, key)) for key in keys}
 
@@ -203,18 +203,18 @@ def cut(text: str, longest: int) -> str:
 
 
 def listing(names: Sequence[str], most: int = 8) -> str:
-    """Return the first of some names, with an ellipsis where there are more."""
+    """Return the first of some names, with an ellipsis if there are more."""
     return ", ".join([*names[:most], *["…"] * (len(names) > most)])
 
 
 def first_lines(lines: Sequence[str], most: int) -> list[str]:
-    """Return the first lines, and how many more there are."""
+    """Return the first lines, and a line that counts the others."""
     more = [f"… and {len(lines) - most:,} more"] if len(lines) > most else []
     return [*lines[:most], *more]
 
 
 def escape_text(text: str, kept: str = "") -> str:
-    """Return a text with escapes such as `\\x1b` in place of unprintable characters, but those in `kept`."""
+    """Return a text with escapes such as `\\x1b` for unprintable characters, except those in `kept`."""
     if text.isprintable():
         return text
     return "".join(
@@ -226,7 +226,7 @@ def escape_text(text: str, kept: str = "") -> str:
 
 
 def shortened_formula(text: str) -> str:
-    """Return the text of a formula that a sentence only mentions."""
+    """Return a short text of a formula, for sentences that only mention it."""
     return printable(text, _LONGEST_FORMULA)
 
 
@@ -236,7 +236,7 @@ def time_text(time_ns: int, first_ns: int = 0) -> str:
 
 
 def times_apart(*times_ns: int) -> tuple[Sentence, ...]:
-    """Return times in seconds; in nanoseconds, too, if some that differ would read the same."""
+    """Return times in seconds, and also in nanoseconds if different times would read the same."""
     times = tuple(Sentence(Instant(time_ns, 0)) for time_ns in times_ns)
     if len(set(times)) == len(set(map(int, times_ns))):
         return times
@@ -244,18 +244,18 @@ def times_apart(*times_ns: int) -> tuple[Sentence, ...]:
 
 
 def requirement_text(identifier: str | None, title: str | None) -> str:
-    """Return the id of a requirement and its words, as far as it has them: "REQ-12: no one is hit"."""
+    """Return the id and the title of a requirement, if it has them: "REQ-12: no one is hit"."""
     return ": ".join(part for part in (identifier, title) if part)
 
 
 def names_of(title: str, requirement: str | None) -> tuple[str, ...]:
-    """Return what a reader may call a result or node: by its title, or with the id of its requirement."""
+    """Return the names of a result or node: its title, and forms with the id of its requirement."""
     ids = () if requirement is None else (requirement, f"{requirement} {title}", f"{title} [{requirement}]")
     return title, *ids
 
 
 TEXTS: Final = -(2.0**1000)
-"""The greatest of the numbers that stand for texts in signals; no measured number is anywhere near them."""
+"""The greatest number that stands for a text in signals. Measured numbers are far from this range."""
 
 
 def text_number(text: str) -> float:
@@ -280,10 +280,10 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
 
 
 def named_arguments(called: _Called) -> _Called:
-    """Let a function, or the constructor of a class, answer an unknown argument with the nearest name.
+    """Return a function or class that answers an unknown argument with the nearest name.
 
     Raises:
-        UsageError: raised by what is returned.
+        UsageError: raised by calls with an unknown argument.
     """
     function = called.__init__ if isinstance(called, type) else called  # type: ignore[misc]
 
@@ -302,10 +302,10 @@ def named_arguments(called: _Called) -> _Called:
 
 
 def refuse_unknown(given: Mapping[str, object], known: Collection[str]) -> None:
-    """Refuse arguments without a known name.
+    """Refuse arguments with an unknown name.
 
     Raises:
-        UsageError: the first such argument, with the nearest name.
+        UsageError: a name is unknown; the message has the nearest name.
     """
     for name in given:
         if name not in known:
@@ -314,6 +314,6 @@ def refuse_unknown(given: Mapping[str, object], known: Collection[str]) -> None:
 
 
 def _likeness(name: str, known: str) -> tuple[float, float]:
-    """Return how like two names are, and how like their letters, which those of swapped letters share."""
+    """Return the likeness of two names, and that of their sorted letters, which finds swapped letters."""
     ratio = difflib.SequenceMatcher(None, known, name).ratio()
     return ratio, difflib.SequenceMatcher(None, sorted(known), sorted(name)).ratio()

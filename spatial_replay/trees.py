@@ -22,9 +22,9 @@ _NO_STAGES: Mapping[str, Stage] = MappingProxyType({})
 
 
 class PlannedSteps(Decorator):
-    """A decorator that decides on steps of a planner, and whose child executes them one after the other.
+    """A decorator that takes steps from a planner, and whose child executes them.
 
-    A tick takes the next step if none is executed, and ticks the child during a step. Where the child ends,
+    A tick takes the next step if none is executed, and ticks the child during a step. When the child ends,
     the tick concludes the step. The reason of a failure is the feedback message of the behaviour that failed.
     A step has also failed if the planner stops it, or if a parent interrupts it.
 
@@ -42,8 +42,8 @@ class PlannedSteps(Decorator):
 
         Args:
             recorder: with a planner.
-            stages: "pick", "way" or "place" by the names of behaviours: where a motion fails if they fail, or
-                a behaviour below them.
+            stages: "pick", "way" or "place" by the name of a behaviour: the stage of a motion that fails if
+                the behaviour, or one below it, fails.
 
         Raises:
             UsageError: the recorder has no planner.
@@ -106,7 +106,7 @@ class PlannedSteps(Decorator):
 
 
 def _ancestors(behaviour: Behaviour, root: Behaviour) -> Iterator[Behaviour]:
-    """Yield a behaviour, and those above it up to a root."""
+    """Yield a behaviour and its ancestors, up to a root."""
     yield behaviour
     while behaviour is not root and behaviour.parent is not None:
         behaviour = behaviour.parent
