@@ -23,30 +23,35 @@ TICKS_PER_S = 60
 STEPS_PER_TICK = STEPS_PER_S // TICKS_PER_S
 
 WIDEST = 0.08
-"""The maximum distance of the fingers, in metres."""
+"""Maximum distance of the fingers, metres."""
 FINGERTIP = 0.008
-"""How far the fingertips reach below the tool's point, in metres."""
+"""Length of the fingertips below the tool point, metres."""
 FINGER_DEPTH, FINGER_WIDTH = 0.018, 0.0145
-"""The size of a finger across the axis on which the fingers open, and along it, in metres."""
+"""Size of a finger across and along the axis on which the fingers open, metres."""
 ABOVE = 0.3
-"""The travel height of the tool, in metres."""
+"""Travel height of the tool, metres."""
 
 Motion: TypeAlias = Generator[None, None, None]
-"""A motion: each of its steps commands the arm for one tick."""
+"""A motion; each of its steps commands the arm for one tick."""
 
 _FAST = 0.45
+"""Travel speed of the tool, m/s."""
 _TURNING = 2.0
+"""Turning speed of the tool, rad/s."""
 _REACHED = 0.003
+"""Distance at which the tool has reached its commanded position, metres."""
 _SETTLING_TICKS = 30
+"""Maximum number of ticks to wait for the tool to reach its commanded position."""
 _GRIP_FORCE = 25.0
+"""Force of the fingers, N."""
 _PINCHED = 0.004
-"""How much wider than commanded the fingers are, in metres, if they hold something."""
+"""Excess of the fingers' actual distance over the commanded one if they hold a body, metres."""
 _MIDDLE, _FURTHEST = 0.78, 2.75
-"""The centre of the tool's yaw range relative to the direction from the base, and its half width."""
+"""Centre of the tool's yaw range relative to the direction from the base, and half width, radians."""
 _NEAREST, _FARTHEST = 0.27, 0.77
-"""The smallest and the largest distance from the base at which the tool reaches the table, in metres."""
+"""Smallest and largest distance from the base at which the tool reaches the table, metres."""
 _INSIDE = 0.33
-"""The smallest distance from the base when the tool travels around it, in metres."""
+"""Smallest distance from the base during travel around it, metres."""
 
 
 class Arm:
@@ -64,21 +69,21 @@ class Arm:
 
     @property
     def position(self) -> Floats:
-        """The actual position (3,) of the tool point."""
+        """The measured position (3,) of the tool point."""
         return tool_frame(self._engine.joints())[0]
 
     @property
     def width(self) -> float:
-        """The actual distance of the fingers."""
+        """The measured distance of the fingers."""
         return self._engine.finger_width()
 
     @property
     def holds(self) -> bool:
-        """Whether something between the fingers keeps them from their distance."""
+        """Whether a body between the fingers keeps them from their commanded distance."""
         return self.width > self._width + _PINCHED
 
     def drive(self) -> None:
-        """Send the latest command to the motors; it holds for one tick."""
+        """Send the latest command to the motors, for one tick."""
         width = WIDEST if self.limp else self._width
         self._engine.drive(self._joints, self._velocities, width, _GRIP_FORCE)
 
@@ -89,7 +94,7 @@ class Arm:
         self._joints, self._position, self._yaw = joints, position, yaw
 
     def move(self, x: float, y: float, z: float, yaw: float | None = None, *, speed: float = _FAST) -> Motion:
-        """Move the tool in a straight line, and wait until it is at rest."""
+        """Move the tool in a straight line, and wait until it has reached the point."""
         goal = np.array([x, y, z])
         start, turned = self._position, self._yaw
         turn = 0.0 if yaw is None else yaw - turned
@@ -100,7 +105,7 @@ class Arm:
         yield from self._settle()
 
     def travel(self, x: float, y: float, yaw: float) -> Motion:
-        """Lift the tool and move it above a point, around the base."""
+        """Lift the tool, and move it around the base to a position above a point."""
         start = self._position
         if start[2] < ABOVE - 0.01:
             yield from self.move(start[0], start[1], ABOVE)
@@ -118,7 +123,7 @@ class Arm:
         yield from self.move(x, y, ABOVE)
 
     def grip(self, width: float) -> Motion:
-        """Move the fingers to a distance, or until a body between them stops them."""
+        """Move the fingers to a distance, or until a body stops them."""
         self._width = width
         self._velocities = np.zeros_like(self._joints)
         last = self.width
@@ -162,28 +167,28 @@ class Arm:
 
 
 def _shares(*durations_s: float) -> list[float]:
-    """Return the share of a motion that is done after each tick: a cubic, slow at both ends."""
-    # the cubic is 1.5 times as fast in the middle as on average
+    """Return the completed share of a motion after each tick: a cubic, slow at both ends."""
+    # the maximum speed of the cubic, in the middle, is 1.5 times its mean speed
     count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
     return [3 * (k / count) ** 2 - 2 * (k / count) ** 3 for k in range(1, count + 1)]
 
 
 def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> float:
-    """Return the yaw, `yaw` plus whole periods, that is closest to the middle of the last joint's range.
+    """Return `yaw` plus the number of periods that brings it closest to the middle of the last joint's range.
 
-    The period is pi for an empty gripper, which is symmetric, and 2 pi for one that holds a body.
+    The period is pi for an empty gripper, because it is symmetric, and 2 pi for a gripper that holds a body.
     """
     low = math.atan2(y, x) + _MIDDLE - period / 2
     return low + (yaw - low) % period
 
 
 def in_reach(x: float, y: float) -> bool:
-    """Return whether the tool, pointing down, reaches a point on the table."""
+    """Return whether the downward tool reaches a point on the table."""
     return _NEAREST <= math.hypot(x, y) <= _FARTHEST
 
 
 def can_turn(yaw: float, x: float, y: float) -> bool:
-    """Return whether the last joint can turn the tool at a point to `yaw`."""
+    """Return whether the last joint can turn the tool to `yaw` at a point."""
     return abs(yaw - math.atan2(y, x) - _MIDDLE) <= _FURTHEST
 
 
@@ -192,7 +197,7 @@ def can_turn(yaw: float, x: float, y: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The physics, the arm, the bodies by name, and where ticks of behaviour trees go."""
+    """The physics, the arm, the bodies by name, and a function that receives ticks of behaviour trees."""
 
     engine: Engine
     arm: Arm
@@ -204,7 +209,7 @@ class Scene:
         return self.engine.pose(name)
 
     def place_of(self, name: str) -> tuple[float, float]:
-        """Return the centre of a body in the plane, in metres."""
+        """Return the centre (x, y) of a body, metres."""
         x, y, _ = self.engine.pose(name).position.tolist()
         return x, y
 
@@ -213,11 +218,11 @@ class Scene:
         return footprint(self.bodies[name].shape, self.engine.pose(name))
 
     def height(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest point of a body."""
+        """Return the lowest and highest z of a body, metres."""
         return height(self.bodies[name].shape, self.engine.pose(name))
 
     def clearance(self, covered: Footprint, name: str, *, above: float = 0.0) -> float:
-        """Return the distance, in metres, to all bodies but one that reach higher than `above`."""
+        """Return the distance, metres, to the nearest body other than `name` that is higher than `above`."""
         others = [
             self.footprint(body) for body in self.bodies if body != name and self.height(body)[1] > above
         ]
@@ -225,14 +230,14 @@ class Scene:
 
 
 def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
-    """Return the distance, in metres, to the nearest of some footprints; below 0 if it overlaps one."""
+    """Return the distance, metres, to the nearest of the other footprints; below 0 for an overlap."""
     batch = FootprintBatch.from_footprints([covered, *others])
     operands = [Operand(np.array([[0]])), Operand(np.arange(1, len(batch))[None, :])]
     return float(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0, 0])
 
 
 def extent(covered: Footprint, angle: float) -> tuple[float, float]:
-    """Return the smallest and the largest coordinate of a footprint along a direction."""
+    """Return the smallest and largest coordinate of a footprint along a direction."""
     along = np.array([math.cos(angle), math.sin(angle)])
     spans = [(part.vertices @ along, part.radius) for part in covered.parts]
     low = min(float(values.min()) - radius for values, radius in spans)
@@ -244,16 +249,17 @@ def extent(covered: Footprint, angle: float) -> tuple[float, float]:
 Point = tuple[float, float]
 
 _THICKEST = WIDEST - 0.008
-"""The maximum thickness of a body between the fingers, in metres."""
+"""Maximum thickness of a body between the fingers, metres."""
 _OPENING = 0.02
-"""How much wider than the body the fingers open, in metres."""
+"""Excess of the fingers' opening over the thickness of the body, metres."""
 _BELOW_TOP = 0.022
-"""The depth of a grasp below the top of a tall body, in metres."""
+"""Depth of a grasp below the top of a tall body, metres."""
 _HAND_DEPTH, _HAND_WIDTH, _HAND_ABOVE = 0.064, 0.21, 0.035
-"""The hand: its size across and along its opening, and its height above the tool point, in metres."""
+"""Size of the hand across and along its opening, and its height above the tool point, metres."""
 _ROOM, _AMPLE = 0.0015, 0.01
-"""The clearance around the fingers, in metres, that is required, and beyond which more does not count."""
+"""Required clearance around the fingers, and clearance from which more does not count, metres."""
 _ANGLES = 12
+"""Number of tool yaws to try for a body without flat sides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,10 +267,10 @@ class Grasp:
     """A grasp of a body.
 
     Attributes:
-        yaw: of the tool when it picks the body up, in radians.
-        turn: yaw of the tool when it sets the body down.
-        above_bottom: height of the tool point above the body's lowest point, in metres.
-        opening: distance of the fingers before and after, in metres.
+        yaw: yaw of the tool at the pick, radians.
+        turn: yaw of the tool at the place, radians.
+        above_bottom: height of the tool point above the body's lowest point, metres.
+        opening: distance of the fingers before and after the grasp, metres.
     """
 
     yaw: float
@@ -276,9 +282,9 @@ class Grasp:
 def best_grasp(
     scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
 ) -> Grasp | Outcome:
-    """Return the grasp with the most clearance, preferring thin sides; or the failure if there is none.
+    """Return the grasp with the most clearance, or the failure; among equal ones, across the thinnest side.
 
-    A body that is not lifted is turned the shorter way round.
+    A body that is not lifted is turned in the shorter direction.
     """
     start = scene.place_of(name)
     if not in_reach(*start):
@@ -318,7 +324,7 @@ def best_grasp(
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:
-    """Return the height of the support under a point: the table, or a body that supports others."""
+    """Return the height of the surface under a point: the table, or a support."""
     spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
     under = [
         scene.height(support)[1]
@@ -329,7 +335,7 @@ def surface(scene: Scene, name: str, goal: Point) -> float:
 
 
 def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
-    """Return (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
+    """Return pairs (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
     pose, covered = scene.pose(name), scene.footprint(name)
     if isinstance(scene.bodies[name].shape, Box) and pose.is_level:
         turns = [pose.yaw, pose.yaw + math.pi / 2]
@@ -346,9 +352,9 @@ def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
 def _turns(
     scene: Scene, name: str, angle: float, goal: Point, yaw: float | None, is_lifted: bool
 ) -> Iterator[tuple[float, float]]:
-    """Iterate over the yaws of the tool for picking up and setting down that the arm can reach."""
+    """Yield pairs of tool yaws, at the pick and at the place, that the arm can reach."""
     pose, start = scene.pose(name), scene.place_of(name)
-    # any yaw suits a round body: the arm keeps its own relative to the direction from the base
+    # a round body has no yaw, so the tool keeps its yaw relative to the direction from the base
     is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
     for picked in (angle, angle + math.pi):
         grasp_yaw = turn_towards(picked, *start, 2 * math.pi)
@@ -363,7 +369,7 @@ def _turns(
 
 
 def _room(scene: Scene, name: str, place: Point, turn: float, grasp: Grasp, bottom: float) -> float:
-    """Return the clearance of fingers and hand to other bodies when a body is held at a place."""
+    """Return the clearance of fingers and hand to other bodies while they hold a body at a place."""
     tool = bottom + grasp.above_bottom
     fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, turn)
     hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, turn)
@@ -374,20 +380,21 @@ def _room(scene: Scene, name: str, place: Point, turn: float, grasp: Grasp, bott
 # ---------------------------------------------------------------------------------------------------- picking
 
 _SLOW = 0.15
+"""Speed of the tool near bodies, m/s."""
 _SETTING_DOWN = 0.002
-"""The height above its support at which a body is released, in metres."""
+"""Height above its support at which a body is released, metres."""
 _LOST_TICKS = 6
-"""Ticks without contact after which a body is lost."""
+"""Number of ticks without contact after which a body is lost."""
 _STRAIGHT = 0.08
-"""The longest stretch, in metres, on which the tool's way counts as straight."""
+"""Maximum length of a segment on which the tool's path is nearly straight, metres."""
 _NEAR = 0.02
-"""The tolerance of a body's position, in metres."""
+"""Tolerance of a placed body's position, metres."""
 
 
 def picking(
     scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point] = ()
 ) -> Generator[None, None, Outcome]:
-    """Pick a body up and place its centre at a point, along others, with `yaw` unless that is None."""
+    """Pick a body up, carry it along `via` and place its centre at `goal`; None keeps its yaw."""
     grasp = best_grasp(scene, name, goal, yaw)
     if isinstance(grasp, Outcome):
         return grasp
@@ -413,7 +420,7 @@ def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]
 
 
 def take_hold(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
-    """Close the fingers on a body where it stands; return the reason of a failure, or ""."""
+    """Close the fingers on a body without lifting it; return the reason of a failure, or ""."""
     arm, (x, y) = scene.arm, scene.place_of(name)
     z = scene.height(name)[0] + grasp.above_bottom
     yield from arm.travel(x, y, grasp.yaw)
@@ -429,8 +436,8 @@ def take_hold(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, st
 def carry(
     scene: Scene, name: str, grasp: Grasp, goal: Point, via: Sequence[Point] = ()
 ) -> Generator[None, None, str]:
-    """Move the held body above a point, along others; return the reason of a failure, or ""."""
-    # the tool's way hardly leaves straight lines between points that are so close
+    """Move the held body along `via` to a position above `goal`; return the reason of a failure, or ""."""
+    # `travel` moves around the base, which hardly differs from a straight line between such close points
     way = (scene.place_of(name), *via, goal)
     for point in islice(points_along(way, _STRAIGHT), 1, None) if via else (goal,):
         x, y = _tool_for(scene, name, point, grasp.turn)
@@ -454,7 +461,7 @@ def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, Non
 
 
 def put_back(scene: Scene, name: str) -> Motion:
-    """Put down what the fingers hold, where it is, and open them."""
+    """Put down the held body at its current position, and open the fingers."""
     if scene.engine.fingers_touching(name):
         yield from set_down(scene, name, scene.place_of(name))
     yield from let_go(scene, WIDEST)
@@ -464,7 +471,7 @@ def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]
     """Lower the held body onto its support; return the reason of a failure, or ""."""
     arm = scene.arm
     x, y, above = arm.commanded
-    # measured now, because the body may hang in another pose than it stood in
+    # measured now, because the body may hang in another pose than the one before the grasp
     z = surface(scene, name, goal) + above - scene.height(name)[0] + _SETTING_DOWN
     lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
     if lowered:
@@ -480,7 +487,7 @@ def let_go(scene: Scene, opening: float) -> Motion:
 
 
 def miss_text(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
-    """Return how a released body differs from its goal, or ""."""
+    """Return a sentence on a released body that misses its goal, or ""."""
     if stood and not scene.pose(name).stands:
         return f"{name} fell over"
     away = math.dist(scene.place_of(name), goal)
@@ -488,7 +495,7 @@ def miss_text(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> st
 
 
 def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
-    """Return the tool position for which the held body, usually off centre, is at a point."""
+    """Return the tool position at which the held body, usually off centre, is at a point."""
     x, y = scene.place_of(name)
     tool_x, tool_y, _ = scene.arm.commanded
     dx, dy, turned = x - tool_x, y - tool_y, turn - scene.arm.yaw
@@ -497,7 +504,7 @@ def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
 
 
 def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:
-    """Move while the fingers hold a body; stop and return False when they lose it."""
+    """Run a motion while the fingers hold a body; stop and return False if they lose it."""
     lost = 0
     for _ in motion:
         yield
@@ -511,30 +518,33 @@ def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, b
 
 
 _LOW = FINGERTIP + 0.006
-"""The height of the tool while it pushes, in metres: low enough not to tip a body."""
+"""Height of the tool during a push, metres: low enough not to tip a body."""
 _AWAY = 0.01
-"""The distance behind a body at which the fingers come down, in metres."""
+"""Distance behind a body at which the fingers come down, metres."""
 _MARGIN = 0.001
+"""Remaining distance at which a stroke ends, and required clearance behind a body, metres."""
 _PUSH_FAST, _PUSH_SLOW = 0.1, 0.015
+"""Speed of a push, at its beginning and at its end, m/s."""
 _CLOSE = 0.004
-"""The distance to its goal, in metres, at which a body needs no further stroke."""
+"""Distance to its goal at which a body needs no further stroke, metres."""
 _FAR = 0.015
-"""The tolerance of a body's position after all strokes, in metres."""
+"""Tolerance of a body's position after all strokes, metres."""
 _STRAIGHTENED = 0.0025
+"""Distance from a straight line up to which points of a path are dropped, metres."""
 _TURNED = 0.05
-"""The tolerance of a body's yaw that is given, in radians."""
+"""Tolerance of a requested yaw, radians."""
 _TURNS = 2
-"""The maximum number of turns on the spot."""
+"""Maximum number of turns on the spot."""
 _STROKES = 4
-"""The maximum number of strokes to one goal."""
+"""Maximum number of strokes to one goal."""
 
 
 def pushing(
     scene: Scene, name: str, path: Sequence[Point], yaw: float | None = None
 ) -> Generator[None, None, Outcome]:
-    """Push a body along a path, one stroke for each straight stretch, with corrections at the end.
+    """Push a body along a path, one stroke for each straight segment, with corrections at the end.
 
-    With `yaw`, turn it there: a stroke also turns a body a little, as its side comes to lie at the fingers.
+    With `yaw`, turn the body at the end, because strokes rotate it: its side aligns with the fingers.
     """
     corners = straighten([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
@@ -555,7 +565,7 @@ def pushing(
 def _push_to(
     scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
 ) -> Generator[None, None, Outcome | None]:
-    """Push a body to a point in several strokes; return the failure, if it fails."""
+    """Push a body to a point in up to `strokes` strokes; return the failure, or None."""
     miss_m = 0.0
     for _ in range(strokes):
         trouble = yield from _stroke(scene, name, goal)
@@ -587,7 +597,7 @@ def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generat
 
 
 def straighten(path: Sequence[Point]) -> list[Point]:
-    """Return the corners of a path, without points on the line between others (Douglas–Peucker)."""
+    """Return the corners of a path, without points on straight lines (Douglas–Peucker)."""
     if len(path) < 3:
         return list(path)
     points = np.array(path)
@@ -605,7 +615,7 @@ def straighten(path: Sequence[Point]) -> list[Point]:
 
 
 def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outcome | None]:
-    """Push a body straight towards a point; return the failure, if it fails."""
+    """Push a body in a straight line to a point; return the failure, or None."""
     x, y = scene.place_of(name)
     length = math.dist((x, y), goal)
     if length < _CLOSE:
@@ -637,7 +647,7 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outco
 def _advance(
     scene: Scene, name: str, behind: Point, heading: float, length: float, back: float
 ) -> Generator[None, None, bool]:
-    """Move the fingers forward until the body has moved by a length; return whether it did."""
+    """Move the fingers forward until the body has moved by `length`; return False if it does not."""
     u, v = math.cos(heading), math.sin(heading)
     x, y = scene.place_of(name)
     travelled = 0.0
@@ -654,7 +664,7 @@ def _advance(
 
 
 def _gap(scene: Scene, name: str, behind: Point, heading: float) -> float | None:
-    """Return the widest gap of the fingers that fits behind a body; None if none does."""
+    """Return the widest distance of the fingers that fits behind a body; None if no distance fits."""
     low, high = extent(scene.footprint(name), heading + math.pi / 2)
     widest = max(0.0, min(0.05, high - low - 2 * FINGER_WIDTH))
     for gap in (widest, widest / 2, 0.0):

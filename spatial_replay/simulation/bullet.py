@@ -1,6 +1,6 @@
-"""The physics, and the kinematics of a Franka arm: the only module that knows PyBullet.
+"""Physics, and kinematics of a Franka arm; the only module that uses PyBullet.
 
-The tool frame is between the fingertips: z along the fingers, y along the axis on which they open.
+The tool frame is between the fingertips. Its axis z is along the fingers; they open along its axis y.
 """
 
 from __future__ import annotations
@@ -28,35 +28,36 @@ JOINTS = 7
 
 LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-"""Limits of the joints in radians, from the data sheet."""
+"""Joint limits, radians, from the data sheet."""
 
 REST = np.array([0.0, -0.3, 0.0, -2.3, 0.0, 2.0, math.pi / 4])
-"""Joints in radians in front of the base, the elbow up and the fingers down."""
+"""Rest position of the joints, radians: the tool in front of the base, the elbow up, the fingers down."""
 
 _OFFSETS = np.array(
     [(0, 0, 0.333), (0, 0, 0), (0, -0.316, 0), (0.0825, 0, 0), (-0.0825, 0.384, 0), (0, 0, 0), (0.088, 0, 0)]
 )
 _TURNS = (0.0, -math.pi / 2, math.pi / 2, math.pi / 2, -math.pi / 2, math.pi / 2, math.pi / 2)
-"""The frame of each joint in that of the previous link: an offset in metres, a rotation about x in
-radians."""
+"""Frame of each joint relative to the previous link: offset, metres, and rotation about x, radians."""
 
 _TOOL = 0.107 + 0.105
-"""The distance from the last joint to the tool frame, in metres."""
+"""Distance from the last joint to the tool frame, metres."""
 
 _DAMPING = 1e-5
+"""Damping of the least squares, which keeps them solvable near singular poses."""
 _STEPS = 3
+"""Default number of iterations."""
 _LONGEST = 0.2
-"""The longest step of an iteration, in radians."""
+"""Maximum step of an iteration, radians."""
 
 
 def tool_frame(joints: Floats) -> tuple[Floats, Floats]:
-    """Return the position (3,) in metres and the rotation (3, 3) of the tool for joints (7,) in radians."""
+    """Return the position (3,), metres, and rotation (3, 3) of the tool for joints (7,), radians."""
     position, rotation, _ = _chain(joints)
     return position, rotation
 
 
 def downwards(yaw: float) -> Floats:
-    """Return the rotation (3, 3) of a tool that points down with a yaw; the fingers open across it."""
+    """Return the rotation (3, 3) of a downward tool with a yaw; the fingers open across the yaw."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
     return np.array([[cosine, sine, 0.0], [sine, -cosine, 0.0], [0.0, 0.0, -1.0]])
 
@@ -64,8 +65,8 @@ def downwards(yaw: float) -> Floats:
 def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _STEPS) -> Floats:
     """Return joints (7,) that bring the tool near a pose, by damped least squares from `start`.
 
-    The arm is redundant; its free motion tends to the rest position. A pose out of reach is approached as
-    far as possible: compare with `tool_frame` of the result if that matters.
+    The arm is redundant: its remaining freedom moves it towards the rest position. The result for a pose out
+    of reach is as near as possible. `tool_frame` of the result gives the actual pose.
     """
     joints = start
     for _ in range(steps):
@@ -84,7 +85,7 @@ def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _
 
 
 def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the position and the rotation of the tool, and the Jacobian (6, 7) of both."""
+    """Return the position and rotation of the tool, and their Jacobian (6, 7)."""
     position, rotation = np.zeros(3), np.eye(3)
     origins, axes = [], []
     for offset, turn, angle in zip(_OFFSETS, _TURNS, joints.tolist(), strict=True):
@@ -101,7 +102,7 @@ def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _rotation_between(first: Floats, second: Floats) -> Floats:
-    """Return the rotation vector (3,) from one rotation to another, exact enough to iterate with."""
+    """Return the rotation vector (3,) between two rotations, exact enough for an iteration."""
     between = second @ first.T
     axis = np.array(
         [between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]]
@@ -127,18 +128,19 @@ STEPS_PER_S = 240
 """Simulation steps per second."""
 
 FINGERS = (9, 10)
-"""The indices of the two fingers, as joints and as links."""
+"""Indices of the two fingers, as joints and as links."""
 
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
-"""Maximum torques of the arm's joints in N m, from the data sheet."""
+"""Maximum torques of the arm's joints, N m, from the data sheet."""
 _GAINS = (0.3,) * JOINTS
+"""Position gains of the arm's joints."""
 _WOOD = 0.5
-"""Default friction."""
+"""Default friction coefficient."""
 _FRICTION = MappingProxyType({"lateralFriction": _WOOD, "spinningFriction": 2e-3, "rollingFriction": 2e-3})
-"""Friction of bodies; rolling friction brings rolling bodies to rest, as on a real table."""
+"""Friction of bodies; rolling friction stops rolling bodies, as on a real table."""
 
 _NEAR, _FAR = 0.05, 5.0
-"""From where to where a camera sees, in metres."""
+"""Nearest and farthest distance in a camera's picture, metres."""
 
 
 class Engine:
@@ -161,6 +163,7 @@ class Engine:
             call("configureDebugVisualizer", bullet.COV_ENABLE_GUI, 0)
             call("resetDebugVisualizerCamera", 1.2, 90.0, -45.0, (0.45, 0.0, 0.0))
         call("setGravity", 0.0, 0.0, -9.81)
+        # deterministic pairs, because equal seeds must give equal runs
         call("setPhysicsEngineParameter", deterministicOverlappingPairs=1, numSolverIterations=100)
         self._table: int = self._add(Box(1.8, 1.8, 0.1), 0.0, (0.0, 0.0, -0.05), 0.0, (0.72, 0.62, 0.5, 1.0))
         call("changeDynamics", self._table, -1, lateralFriction=_WOOD)
@@ -170,7 +173,7 @@ class Engine:
         self.set_grip(1.0)
 
     def close(self) -> None:
-        """Release the simulator; closing twice does nothing."""
+        """Release the simulator; a second call has no effect."""
         if self._client >= 0:
             self._call("disconnect")
             self._client = -1
@@ -199,7 +202,7 @@ class Engine:
         return Pose(np.array(position), np.array(self._bullet.getMatrixFromQuaternion(turn)).reshape(3, 3))
 
     def move(self, name: str, x: float, y: float) -> None:
-        """Move a fixed body, whatever stands in its way; its height and its orientation stay."""
+        """Move a fixed body without regard to collisions; its height and orientation do not change."""
         (*_, z), turn = self._call("getBasePositionAndOrientation", self._bodies[name])
         self._call("resetBasePositionAndOrientation", self._bodies[name], (x, y, z), turn)
 
@@ -213,8 +216,10 @@ class Engine:
             self._call("resetJointState", self._robot, finger, width / 2)
 
     def drive(self, joints: Floats, velocities: Floats, width: float, force: float) -> None:
-        """Command the motors: joints (7,), their velocities, the distance of the fingers and their force in
-        N."""
+        """Command the motors: joints (7,), their velocities, and the distance and force of the fingers.
+
+        The force is in N.
+        """
         bullet = self._bullet
         self._call(
             "setJointMotorControlArray",
@@ -242,7 +247,7 @@ class Engine:
         return np.array([state[0] for state in states])
 
     def finger_width(self) -> float:
-        """Return the distance of the fingers, in metres."""
+        """Return the distance of the fingers, metres."""
         return float(sum(state[0] for state in self._call("getJointStates", self._robot, list(FINGERS))))
 
     def fingers_touching(self, name: str) -> int:
@@ -259,11 +264,11 @@ class Engine:
         eye: tuple[float, float, float],
         look_at: tuple[float, float, float],
     ) -> tuple[NDArray[np.uint8], Floats]:
-        """Return what a camera sees: red, green, blue (height, width, 3), and distances along its axis.
+        """Return a camera's picture (height, width, 3) in red, green, blue, and distances along its axis.
 
         Args:
-            size: width and height in pixels.
-            focal: focal length in pixels; the principal point is in the middle.
+            size: width and height, pixels.
+            focal: focal length, pixels; the principal point is in the middle.
         """
         width, height = size
         angle = math.degrees(2 * math.atan(height / 2 / focal))
@@ -273,8 +278,9 @@ class Engine:
         seen = self._call(
             "getCameraImage", width, height, view, lens, renderer=bullet.ER_TINY_RENDERER, shadow=0
         )
-        # without numpy at its build, the simulator returns tuples
+        # a PyBullet that was built without NumPy returns tuples
         colours = np.asarray(seen[2], np.uint8).reshape(height, width, 4)[..., :3]
+        # the depth buffer is not linear: 0 at _NEAR, 1 at _FAR
         share = np.asarray(seen[3], np.float64).reshape(height, width)
         return colours, _FAR * _NEAR / (_FAR - (_FAR - _NEAR) * share)
 
@@ -286,7 +292,7 @@ class Engine:
     # ---------------------------------------------------------------------------------------- private
 
     def _couple_fingers(self) -> None:
-        """Couple the fingers, as in the real hand, so that a body they hold stays in the middle."""
+        """Couple the fingers, as in the real hand, so that a held body stays in the middle."""
         left, right = FINGERS
         kind, axis, centre = self._bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0)
         gear = self._call(
@@ -316,7 +322,7 @@ class Engine:
         return number
 
     def _call(self, function: str, *arguments: Any, **named: Any) -> Any:
-        """Call a function of the simulator for this world; a process may have several."""
+        """Call a function of the simulator for this world, because a process may have several worlds."""
         return getattr(self._bullet, function)(*arguments, physicsClientId=self._client, **named)
 
 
@@ -324,7 +330,7 @@ def _load() -> ModuleType:
     """Import the simulator.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: the simulator is not installed.
     """
     with (
         importing("simulated worlds need PyBullet (it has wheels for Python 3.11)", extra="sim"),
@@ -336,10 +342,10 @@ def _load() -> ModuleType:
 
 
 def _refuse_no_display() -> None:
-    """Check that there is a display for a window; without one, the simulator would end the process.
+    """Check that there is a display for a window; without a display, the simulator would end the process.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no display.
     """
     name = os.environ.get("DISPLAY")
     if not name:
@@ -358,6 +364,7 @@ def _refuse_no_display() -> None:
 @contextmanager
 def _without_greeting() -> Iterator[None]:
     """Suppress the build date that PyBullet writes to standard error on import."""
+    # C code writes it, so only the file descriptor can be redirected
     stderr = os.dup(2)
     try:
         with Path(os.devnull).open("wb") as nothing:

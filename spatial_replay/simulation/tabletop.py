@@ -1,4 +1,4 @@
-"""A table with a robot and bodies: the world of every scenario, by its name, with seeded detection noise."""
+"""Scenarios by name, and their world: a table with a robot, bodies and seeded detection noise."""
 
 from __future__ import annotations
 
@@ -48,8 +48,7 @@ from spatial_replay.trace.trace import Sample
 # -------------------------------------------------------------------------------------------------- scenarios
 
 Placing = Callable[[Scene, str, Point, float | None, Sequence[Point]], Generator[None, None, Outcome]]
-"""How the robot picks a body up, carries it along some points and places it: `picking`, or a behaviour tree
-around it."""
+"""Motion that picks a body up, carries it along points and places it: `picking`, or a behaviour tree."""
 
 Script = Callable[[Scene], Generator[None, None, Outcome]]
 """The motion of the robot without a planner."""
@@ -60,10 +59,10 @@ class Placement:
     """The initial state of a body.
 
     Attributes:
-        x, y, yaw: the pose of its centre, in metres and radians.
-        mass_kg: 0 for a fixed body.
-        bottom: the height of its support, in metres.
-        colour: red, green, blue from 0 to 1.
+        x, y, yaw: pose of the body's centre, metres and radians.
+        mass_kg: mass; 0 for a fixed body.
+        bottom: height of the surface under the body, metres.
+        colour: red, green, blue, from 0 to 1.
     """
 
     body: Body
@@ -80,13 +79,13 @@ class Scenario:
     """The definition of a world.
 
     Attributes:
-        name: as on the command line.
-        placements: the bodies in their initial poses.
-        workspace: where the robot can put bodies, by the keys of settings files.
-        skill: what the robot does with bodies.
-        script: the motion of the robot without a planner.
-        placing: how it picks and places, if that is its skill.
-        scatter_m, scatter_rad: the maximum shift and rotation of each body by the seed.
+        name: name on the command line.
+        placements: bodies in their initial poses.
+        workspace: reach of the robot, by the keys of settings files.
+        skill: skill of the robot, "push" or "place".
+        script: motion of the robot without a planner.
+        placing: motion that picks and places a body, for the skill "place".
+        scatter_m, scatter_rad: maximum seeded shift and rotation of each body.
     """
 
     name: str
@@ -106,9 +105,9 @@ SAMPLES_PER_S = 30
 
 _TICKS_PER_SAMPLE = TICKS_PER_S // SAMPLES_PER_S
 _SETTLING_STEPS = 120
-"""Simulation steps before time 0, in which bodies come to rest."""
+"""Number of simulation steps before time 0, in which bodies come to rest."""
 _RUBBER, _OIL = 1.0, 0.02
-"""Friction of the fingers, normally and when they slip."""
+"""Friction coefficient of the fingers, normally and during a `slip`."""
 
 _Result = TypeVar("_Result")
 
@@ -117,12 +116,12 @@ class Tabletop:
     """The world of a scenario, simulated step by step; lengths are in metres.
 
     The robot's base is at (0, 0); x points forward, y to its left, z up; the table is z = 0. Methods that
-    advance time (`step`, `push`, `place`) pass each sample to the attached listener when it is due; the first
-    one, of time 0, when time starts to advance.
+    advance time (`step`, `push`, `place`) pass each due sample to the attached listener. They pass the sample
+    of time 0 when time starts to advance.
 
     Raises:
         UsageError: the simulator is not installed, the noise is below 0, an injection is impossible, or a
-            start is of no body.
+            start names no body.
     """
 
     def __init__(
@@ -175,12 +174,12 @@ class Tabletop:
 
     @property
     def workspace(self) -> Mapping[str, Any]:
-        """Where the robot can place objects, by the keys of settings files."""
+        """The reach of the robot, by the keys of settings files."""
         return self._scenario.workspace
 
     @property
     def time_ns(self) -> int:
-        """The simulated time, from 0."""
+        """The simulated time since the start, ns."""
         return self._ticks * 10**9 // TICKS_PER_S
 
     @property
@@ -193,9 +192,9 @@ class Tabletop:
         listen: Callable[[Sample], str | None],
         listen_to_tree: Callable[[TreeTick], None] = lambda tick: None,
     ) -> None:
-        """Pass samples to `listen` from now on, and ticks of behaviour trees to `listen_to_tree`.
+        """Pass further samples to `listen`, and ticks of behaviour trees to `listen_to_tree`.
 
-        A reason that `listen` returns stops a motion.
+        If `listen` returns a text, it stops the current motion with this reason.
         """
         self._listen, self._listen_to_tree = listen, listen_to_tree
 
@@ -227,7 +226,7 @@ class Tabletop:
             engine.step()
 
     def sample(self) -> Sample:
-        """Return the current sample: all bodies, with detection noise; repeated calls return the same."""
+        """Return the current sample of all bodies, with detection noise; repeated calls give equal samples."""
         self._open_engine()
         number = self._ticks // _TICKS_PER_SAMPLE
         errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
@@ -244,7 +243,7 @@ class Tabletop:
         self.run(self._scene.arm.wait(1 / SAMPLES_PER_S))
 
     def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Outcome:
-        """Push an object along a path of points (x, y) of its centre, and turn it there to `yaw` if given.
+        """Push an object's centre along points (x, y), and turn the object at the end to `yaw` if given.
 
         Raises:
             UsageError: no such object, or the robot does not push.
@@ -256,7 +255,7 @@ class Tabletop:
     def place(
         self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
     ) -> Outcome:
-        """Pick an object up, carry it along points and place its centre at (x, y); None keeps its yaw.
+        """Pick an object up, carry it along `via`, and place its centre at (x, y); None keeps its yaw.
 
         Raises:
             UsageError: no such object, or the robot does not pick.
@@ -271,7 +270,7 @@ class Tabletop:
     def run(
         self, motion: Generator[None, None, _Result], is_over: Callable[[], object] = lambda: False
     ) -> _Result | None:
-        """Run a motion to its end, and return its result; None if it is over before.
+        """Run a motion and return its result; None if `is_over` stops the motion before its end.
 
         Raises:
             UsageError: the world is closed.
@@ -299,9 +298,10 @@ class Tabletop:
         return Outcome(False, reason)
 
     def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:
-        """Run a motion for a time; the robot holds still after its end. Return None if it does not end.
+        """Run a motion for a time, and return its result; None if the motion does not end in that time.
 
-        Without a duration, run it to its end.
+        After the motion the robot holds still until the time is over. Without a duration, the motion runs to
+        its end.
         """
         if duration_ns is None:
             return self.run(motion)
@@ -331,7 +331,7 @@ class Tabletop:
             self._engine = None
 
     def _emit(self) -> None:
-        """Pass the current sample to the listener, once, if one is due."""
+        """Pass the current sample to the listener if a sample is due and was not passed yet."""
         if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled:
             self._last_sampled = self._ticks
             self._halt = self._listen(self.sample()) or ""
@@ -377,21 +377,22 @@ class Tabletop:
 
 
 def _displacements(radius_m: float, seed: int, sample: int, count: int) -> list[tuple[float, float]]:
-    """Return the detection error of each of `count` bodies in a sample, in metres along x and y.
+    """Return the detection error of each of `count` bodies in a sample, metres along x and y.
 
-    Errors are uniform on a disc, so that none exceeds the radius. They depend on the arguments alone:
-    repeating a sample gives the same errors.
+    Errors are uniform on a disc, so that no error exceeds the radius. They depend only on the arguments, so
+    that a repeated sample has equal errors.
     """
     if radius_m == 0:
         return [(0.0, 0.0)] * count
     polar = np.random.default_rng([seed, sample, 1]).random((count, 2))
+    # the square root makes the density uniform over the disc
     radii = (radius_m * np.sqrt(polar[:, 0])).tolist()
     angles = (2 * math.pi * polar[:, 1]).tolist()
     return [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
 
 
 SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
-"""Each has a module in `scenarios` and a specification next to it."""
+"""Names of the scenarios; each has a module and a specification in the folder `scenarios`."""
 
 
 def make_world(name: str, **conditions: Unpack[Conditions]) -> Tabletop:
@@ -418,7 +419,7 @@ def scenario_of(name: str) -> Scenario:
     """Return the definition of a scenario.
 
     Raises:
-        UsageError: there is no such scenario, or py_trees, which it needs, is not installed.
+        UsageError: there is no such scenario, or py_trees is not installed.
     """
     if name not in SCENARIOS:
         raise UsageError(f"there is no scenario {name!r}; there are {', '.join(SCENARIOS)}")

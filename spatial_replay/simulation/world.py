@@ -1,4 +1,4 @@
-"""Simulated worlds: shapes of bodies, what worlds consist of, and injected failures."""
+"""Parts of simulated worlds: shapes, poses, bodies, start poses and injected failures."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from spatial_replay.geometry.footprint import Footprint
 # ----------------------------------------------------------------------------------------------------- shapes
 
 UPRIGHT = 1e-2
-"""The lean, in radians, below which a body counts as upright."""
+"""Lean below which a body counts as upright, radians."""
 
 _LEVEL = 0.1
-"""The lean, in radians, up to which a body has a yaw: a knife with its handle on a mat does."""
+"""Lean up to which a body has a yaw, radians; enough for a knife with its handle on a mat."""
 
 _RIM = 16
-"""Corners of the polygon around the rim of a leaning cylinder."""
+"""Number of corners of the polygon around the rim of a leaning cylinder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Pose:
 
     Attributes:
         position: (3,) float64, metres.
-        rotation: (3, 3) float64, its columns the body's axes in the world.
+        rotation: (3, 3) float64, whose columns are the body's axes in the world frame.
     """
 
     position: Floats
@@ -60,16 +60,16 @@ class Pose:
 
     @property
     def yaw(self) -> float:
-        """The angle of the body's axis x in the plane, in radians, counter-clockwise from the world's."""
+        """The angle of the body's axis x in the plane, radians, counter-clockwise from the world's axis x."""
         return math.atan2(self.rotation[1, 0], self.rotation[0, 0])
 
     def turned_from(self, yaw: float) -> float:
-        """Return the difference of the body's yaw to `yaw`, -pi to pi."""
+        """Return the body's yaw minus `yaw`, -pi to pi."""
         return math.remainder(self.yaw - yaw, 2 * math.pi)
 
     @property
     def lean(self) -> float:
-        """The angle between the body's axis z and the vertical, 0 to pi."""
+        """The angle between the body's axis z and the vertical, radians, 0 to pi."""
         return math.acos(min(1.0, max(-1.0, float(self.rotation[2, 2]))))
 
     @property
@@ -79,7 +79,7 @@ class Pose:
 
     @property
     def is_level(self) -> bool:
-        """Whether the body's axis z is nearly vertical, so that its yaw means something."""
+        """Whether the body's axis z is nearly vertical, so that the body has a yaw."""
         return min(self.lean, math.pi - self.lean) < _LEVEL
 
 
@@ -96,7 +96,7 @@ def footprint(shape: Shape, pose: Pose) -> Footprint:
 
 
 def height(shape: Shape, pose: Pose) -> tuple[float, float]:
-    """Return the lowest and the highest z of a body."""
+    """Return the lowest and highest z of a body, metres."""
     z = float(pose.position[2])
     up = np.abs(pose.rotation[2])
     if isinstance(shape, Box):
@@ -114,13 +114,13 @@ def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Fo
 
 
 def _outline(shape: Shape, pose: Pose) -> Floats:
-    """Return points (n, 3) whose convex hull is the body, or contains it for a cylinder."""
+    """Return points (n, 3) whose convex hull is a box, or contains a cylinder."""
     if isinstance(shape, Box):
         signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], np.float64)
         points = signs * np.array([shape.length, shape.width, shape.height]) / 2
     else:
         angles = np.arange(_RIM) * (2 * math.pi / _RIM)
-        # the polygon is around the rim, so that the footprint covers the body
+        # a circumscribed polygon, so that the footprint covers the body
         rim = shape.radius / math.cos(math.pi / _RIM) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         points = np.concatenate([np.c_[rim, np.full(_RIM, z)] for z in (-shape.height / 2, shape.height / 2)])
     moved: Floats = points @ pose.rotation.T + pose.position
@@ -135,10 +135,10 @@ class Body:
     """An object of a world.
 
     Attributes:
-        name, class_name: as in the samples.
-        shape: in metres.
+        name, class_name: name and class in the samples.
+        shape: shape, metres.
         movable: whether the robot can push it, or pick and place it.
-        support: whether other objects may be placed on it, as on a plate. It is then not an obstacle to them,
+        support: whether other objects may be placed on it, as on a plate. A support is no obstacle to them,
             and has no height in samples, so that objects on it count as inside.
     """
 
@@ -154,7 +154,7 @@ class Body:
 Kind = Literal["drop", "slip"]
 
 DURATION_NS = {"drop": 400 * 10**6, "slip": 4 * 10**9}
-"""How long an injection with a start lasts."""
+"""Duration of an injection that has a start, ns."""
 
 _WRITTEN = re.compile(r"(?P<kind>\w+)(?:@(?P<number>\d+(?:\.\d+)?)(?P<unit>ms|s))?")
 
@@ -164,8 +164,8 @@ class Injection:
     """A failure of the gripper.
 
     Attributes:
-        kind: `drop`: the gripper opens; `slip`: the fingers are slippery, as if oiled.
-        at_ns: when it begins; None for the whole run.
+        kind: `drop`, the gripper opens; or `slip`, the fingers are slippery, as if oiled.
+        at_ns: start of the failure; None for the whole run.
     """
 
     kind: Kind
@@ -176,7 +176,7 @@ class Injection:
         """Parse `drop@7s`, `slip@2500ms`, or `slip` for the whole run.
 
         Raises:
-            UsageError: anything else.
+            UsageError: the text has another form.
         """
         match = _WRITTEN.fullmatch(text)
         kinds: tuple[Kind, ...] = get_args(Kind)
@@ -199,11 +199,11 @@ class Injection:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where a body is at the beginning, in place of where the seed puts it.
+    """The start pose of a body, which overrides the seeded pose.
 
     Attributes:
-        x, y: its centre, in metres.
-        turn: its yaw, in radians; None for that of the seed.
+        x, y: centre of the body, metres.
+        turn: yaw of the body, radians; None for the seeded yaw.
     """
 
     name: str
@@ -216,7 +216,7 @@ class Start:
         """Parse `red=0.47,-0.09` or `red=0.47,-0.09,0.4`.
 
         Raises:
-            UsageError: anything else.
+            UsageError: the text has another form.
         """
         name, _, place = text.partition("=")
         try:
@@ -236,14 +236,14 @@ class Start:
 
 
 class Conditions(TypedDict, total=False):
-    """How a world is simulated, as `make_world` takes it.
+    """Keyword arguments of `make_world`.
 
     Attributes:
-        seed: of the initial poses and of the noise, 0 if not given.
-        noise_m: the maximum error of detected positions, in metres; samples have it as uncertainty.
-        injections: failures, and when they happen.
-        starts: where bodies are at the beginning; the seed decides about the others.
-        gui: show a window, and run no faster than real time.
+        seed: seed of the start poses and of the noise; the default is 0.
+        noise_m: maximum error of detected positions, metres; samples have it as their uncertainty.
+        injections: injected failures.
+        starts: start poses; all other bodies have seeded start poses.
+        gui: whether to show a window, and to run no faster than real time.
     """
 
     seed: int

@@ -1,6 +1,6 @@
-"""A place at a table, and a robot that sets it: fork, knife and spoon beside the plate, a cup behind it.
+"""A robot that sets a table: fork, knife and spoon next to a plate, a cup behind it.
 
-The robot places bodies by a behaviour tree: detect, pick, carry, place, and recover from failures.
+A behaviour tree places bodies: detect, pick, carry, place, and recover from failures.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ from spatial_replay.simulation.world import Body, Box, Cylinder
 # ----------------------------------------------------------------------------------------- the behaviour tree
 
 Goal = tuple[Point, float | None]
-"""The target position of a body, and its yaw there; None for any yaw."""
+"""Target position and yaw of a body; None for any yaw."""
 
 _ATTEMPTS = 3
+"""Maximum number of attempts to place a body."""
 _TURNED = 0.15
-"""The tolerance of the yaw, in radians."""
+"""Tolerance of the yaw, radians."""
 
 
 def setting_by_tree(
     scene: Scene, goals: Mapping[str, Goal], via: Sequence[Point] = ()
 ) -> Generator[None, None, Outcome]:
-    """Place bodies one after the other, with a few attempts each; carry them along some points."""
+    """Place bodies one after the other, with up to `_ATTEMPTS` each; carry each body along `via`."""
     blackboard = _Blackboard()
     tasks = [_task(scene, name, goal, blackboard, via) for name, goal in goals.items()]
     tree = composites.Sequence("set", memory=True, children=tasks)
@@ -59,7 +60,7 @@ def setting_by_tree(
 
 
 class _Ticks:
-    """The ticks of a tree; those that change the status of a node are reported."""
+    """Runner of a tree, which reports each tick that changes the status of a node."""
 
     def __init__(self, scene: Scene, tree: Behaviour) -> None:
         self._scene, self._tree, self._count = scene, tree, 0
@@ -86,7 +87,7 @@ def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard, via: Seq
     point, _ = goal
 
     def recover() -> Generator[None, None, str]:
-        """Open the gripper, and fail, so that the tree starts another attempt."""
+        """Open the gripper, and return a failure, so that the tree starts another attempt."""
         yield from let_go(scene, _opening(blackboard, name))
         return "another attempt"
 
@@ -117,7 +118,7 @@ _Motion = Callable[[], Generator[None, None, str]]
 
 
 class _Moving(Behaviour):
-    """A motion as a leaf of the tree: each tick of the tree is one tick of the motion."""
+    """A motion as a leaf of the tree; each tick of the tree advances the motion by one tick."""
 
     def __init__(
         self, name: str, motion: _Motion, blackboard: _Blackboard | None, stage: Stage | None = None
@@ -163,7 +164,7 @@ class _Detecting(Behaviour):
 
 
 class _Placed(Behaviour):
-    """Whether a body is at its goal already."""
+    """The condition that a body is at its goal."""
 
     def __init__(self, scene: Scene, name: str, goal: Goal) -> None:
         super().__init__(f"is {name} placed?")
@@ -180,7 +181,7 @@ class _Placed(Behaviour):
 # ----------------------------------------------------------------------------------------------- the scenario
 
 _UPRIGHT = math.pi / 2
-"""Cutlery points along y, away from the diner."""
+"""Yaw of cutlery that points along y, away from the diner, radians."""
 _STEEL = (0.75, 0.77, 0.8)
 
 
@@ -217,7 +218,7 @@ SCENARIO = Scenario(
         _cutlery("spoon", 0.02, 0.5, 1.2),
         Placement(_CUP, 0.45, -0.38, 0.0, 0.12, (0.35, 0.5, 0.75)),
         Placement(_PLATE, 0.48, 0.0, 0.0, 0.8, (0.95, 0.95, 0.95), bottom=_MAT.shape.height),
-        # without a mass it is fixed
+        # mass 0 fixes the body
         Placement(_MAT, 0.48, 0.0, _UPRIGHT, 0.0, (0.3, 0.45, 0.4)),
     ),
     workspace={
