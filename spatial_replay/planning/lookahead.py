@@ -1,12 +1,12 @@
-"""Lookahead: the motions from a sample to acceptance, tried out in samples that the planner expects.
+"""Lookahead: a search for motions from a sample to acceptance, over predicted samples.
 
-A motion is expected to bring its object to the target, at once. Objects are moved one at a time where that is
-possible. Otherwise, or where a later motion would have to move something again, they are arranged together.
+A predicted motion brings its object to the target at once. Objects are moved one at a time if possible. They
+are arranged together if not, or if an object would have to be moved twice.
 
-An arrangement gives cells to several objects at once: a constraint satisfaction problem over the cells of a
-grid. The demands on one object are a map. The demands on two depend on the way from one to the other alone,
-and are a stencil. The object with the fewest cells left comes first; its cells are tried by their robustness,
-and by the number of cells that they leave to the others.
+An arrangement assigns cells to several objects: a constraint satisfaction problem over the cells of a grid.
+The demands on one object are a map. The demands on two objects depend only on the vector between them, and
+are a stencil. The object with the fewest cells left comes first. Its cells are ordered by their robustness,
+and by the number of cells that they leave to the other objects.
 """
 
 from __future__ import annotations
@@ -77,53 +77,55 @@ from spatial_replay.trace.trace import Sample, Trace
 # ----------------------------------------------------------------------------------------------- arrangements
 
 _MOST_SETS: Final = 200
-"""The most sets of objects that are tried for one conjunction."""
+"""Maximum number of sets of objects to try for one conjunction."""
 _MOST_VISITS: Final = 200
-"""The most cells tried for one set of objects."""
+"""Maximum number of cells to try for one set of objects."""
 _MOST_SOLUTIONS: Final = 6
-"""The most arrangements of one set of objects."""
+"""Maximum number of arrangements of one set of objects."""
 _WIDEST: Final = 360_000
-"""The most cells of a stencil, over all orientations; pairs with a larger one are compared at the end.
+"""Maximum number of cells of a stencil, over all orientations; larger pairs are only compared at the end.
 
-Two objects on 300 x 300 cells need as many, if they are not turned. Without stencils, most placements fail.
+Two objects on 300 x 300 cells need this number, if they are not turned. Without stencils, most placements
+fail.
 """
 _MISS: Final = 0.5
-"""Cost of a placement that does not meet all demands, in maps; it looks at all cells of the objects left."""
+"""Cost of a placement that does not meet all demands, maps; it checks all cells of the remaining objects."""
 _MOST_NAMED: Final = 3
-"""The most things that a sentence names."""
+"""Maximum number of objects that a sentence names."""
 _ENOUGH: Final = 0.5
-"""The share of its cells that each other object keeps after a choice by robustness."""
+"""Share of its cells that each other object must keep after a choice by robustness."""
 _STRICTLY: Final = 1e-12
-"""Least distance of a constraint from holding; it holds at 0."""
+"""Least margin of a constraint, because a constraint holds at robustness 0."""
 _MOST_BETWEEN: Final = 3
-"""The most sets of objects, and of their arrangements each, that are tried for places between cells."""
+"""Maximum number of sets, and of arrangements of each set, to try for places between cells."""
 _MOST_STEPS: Final = 12
-"""The most steps by which objects are moved from cells to places between them."""
+"""Maximum number of steps that move objects from cells to places between them."""
 _MOST_STALLED: Final = 2
-"""The most steps without a gain."""
+"""Maximum number of such steps without a gain."""
 _STEP: Final = 0.5
-"""Cost of such a step, in maps."""
+"""Cost of such a step, maps."""
 _TOWARDS: Final = (1.0 / 16.0, 1e-6)
-"""By how much places between cells are to meet demands, in cells; the first that can be met counts."""
+"""Margins of demands at places between cells, cells; the second margin is tried if the first fails."""
 _NUDGES: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-"""By how many small steps (x, y) an object is moved to measure slopes; the first is where it is."""
+"""Displacements (x, y) that measure slopes, in small steps; the first is the object's own place."""
 _OLDEST_CUTS: Final = 4
-"""The steps of which demands are kept, as they were there."""
+"""Number of previous steps whose linearized demands are kept."""
 
 Cell: TypeAlias = tuple[int, int, int]
-"""A turn of an object, by its number, and the row and column of its centre."""
+"""Index of an object's turn, and row and column of its centre."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Cells of one object, with all fixed objects in place.
+    """Values of one object's cells, with all other objects in place.
 
     Attributes:
-        turns: (A,) angles in radians.
-        clearance: (A, rows, columns), distance to what cannot be moved, less that needed; out of reach, -inf.
-        standing: for each thing that cannot be moved, "" for the workspace's obstacles, the distance to it.
-        apart: for each other movable object in the way, the distance to it less the clearance needed.
-        surplus: for each demand about the object, that with everything else where it is.
+        turns: (A,), angles by which the object is turned, radians.
+        clearance: (A, rows, columns), distance to immovable objects minus the required clearance; -inf out of
+            reach.
+        standing: distance to each immovable object; "" is for the workspace's obstacles.
+        apart: distance to each other movable object minus the required clearance.
+        surplus: surplus of each demand on the object.
     """
 
     turns: Floats
@@ -134,7 +136,7 @@ class _Field:
 
 
 class Arranger:
-    """The arrangements of movable objects in one sample that meet demands."""
+    """Search for arrangements of movable objects in one sample that meet demands."""
 
     def __init__(
         self,
@@ -153,7 +155,7 @@ class Arranger:
         self._fields: dict[str, _Field] = {}
         self._stencils: dict[tuple[object, ...], Floats] = {}
         self._visits = 0
-        # by how much a demand may be missed in the middle of a cell that meets it elsewhere
+        # shortfall at the centre of a cell up to which another place in the cell may meet a demand
         self._slack = 0.0
         self._is_placed = settings.refine and settings.skill == "place"
 
@@ -166,12 +168,12 @@ class Arranger:
         return tuple(demand for demand, value in met if value < 0.0)
 
     def _surplus_in(self, sample: Sample) -> list[float]:
-        """Return by how much a sample meets each demand."""
+        """Return the surplus of each demand in a sample."""
         values = values_in(sample, [demand.formula for demand in self._demands], self._regions)
         return list(map(surplus, *values, self._demands))
 
     def why_hopeless(self) -> str:
-        """Return why no arrangement at all meets the demands, if one object's cells show that; else ""."""
+        """Return why no arrangement can meet the demands; "" if no single object proves that."""
         for demand in self._unmet:
             if not self._about[demand]:
                 return "no object that can be moved matters to it"
@@ -196,11 +198,11 @@ class Arranger:
 
     @property
     def _in_cell(self) -> float:
-        """How far the middle of a cell is from its corners."""
+        """The distance from the centre of a cell to its corners."""
         return self._grid.cell_size / math.sqrt(2.0)
 
     def what_stands(self) -> str:
-        """Return what cannot be moved and stands where objects could go, as a sentence; "" for nothing."""
+        """Return a sentence on immovable objects at places where movable ones could go; "" without any."""
         names: dict[str, None] = {}
         for name, field in self._fields.items():
             cells = self._meeting_cells(field, name, tuple(self._movable))
@@ -209,16 +211,18 @@ class Arranger:
         return f"{_standing_text(list(names))} there" if names else ""
 
     def _standing(self, field: _Field, cells: Booleans) -> list[str]:
-        """Return what cannot be moved and stands in some cells, what is in most of them first."""
+        """Return the immovable objects that occupy some of `cells`, most cells first."""
         clearance = self._settings.workspace.clearance
         counts = {name: int((cells & (away <= clearance)).sum()) for name, away in field.standing.items()}
         return sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
 
     def arrangements(self, most: int) -> Iterator[dict[str, Pose]]:
-        """Yield arrangements of the least sets of objects first, places between cells if there are no others.
+        """Yield arrangements, those of the smallest sets of objects first.
+
+        If no arrangement over cells meets the demands, places between cells are tried.
 
         Args:
-            most: the most objects that are moved.
+            most: maximum number of moved objects.
         """
         poses = None
         for poses in self._over_cells(most):
@@ -227,7 +231,7 @@ class Arranger:
             yield from self._between_cells(most)
 
     def cell_hint(self, most: int) -> str:
-        """Return that smaller cells may help, if only places between cells meet the demands."""
+        """Return the advice to use smaller cells if only places between cells meet the demands, or ""."""
         fits = not self._is_placed and next(self._between_cells(most), None) is not None
         return "smaller cells (cell_size) may help" if fits else ""
 
@@ -257,7 +261,7 @@ class Arranger:
                     poses: dict[str, Pose] | None = {name: self._pose(name, cells[name]) for name in cells}
                     if self._slack and poses:
                         poses = self._settle(poses)
-                        # an attempt that fails spends maps, too
+                        # a failed attempt also counts, because it spends maps
                         effort += 1
                     if poses is not None and self.meets(move_objects(self._sample, poses)):
                         yield poses
@@ -275,7 +279,7 @@ class Arranger:
                         heapq.heappush(queue, (self._hubs_in(wider), len(wider), count, wider))
 
     def _bases(self, most: int) -> list[tuple[str, ...]]:
-        """Return the least sets of objects that matter to every unmet demand."""
+        """Return the smallest sets of objects of which every unmet demand concerns one."""
         sets: dict[tuple[str, ...], None] = {(): None}
         for demand in self._unmet:
             wider: dict[tuple[str, ...], None] = {}
@@ -287,25 +291,25 @@ class Arranger:
                     both = tuple(movable for movable in self._movable if movable in group or movable == name)
                     if len(both) <= most:
                         wider[both] = None
-            # a hub alone seldom meets all the demands about it, and its sets would crowd out the others
+            # sets without hubs first: moving only a hub seldom meets all its demands
             least = sorted(wider, key=self._hubs_in)
             sets = dict.fromkeys(least[:_MOST_SETS])
         return list(sets)
 
     def _hubs_in(self, group: Iterable[str]) -> int:
-        """Return how many objects of a set more than one unmet demand is about."""
+        """Return the number of hubs in a set: objects with unmet demands to several other objects."""
         return sum(name in self._hubs for name in group)
 
     @cached_property
     def _hubs(self) -> frozenset[str]:
         counts = Counter(name for demand in self._unmet for name in self._about[demand])
         pairs = {frozenset(self._about[demand]) for demand in self._unmet}
-        # several demands about the same pair make neither of it a hub
+        # several demands on the same pair make neither object a hub
         partners = Counter(name for pair in pairs for name in pair if len(pair) > 1)
         return frozenset(name for name in counts if partners[name] > 1)
 
     def _in_the_way(self, chosen: tuple[str, ...]) -> list[str]:
-        """Return other objects, those first that stand where the chosen ones could go."""
+        """Return up to four other objects that block the chosen ones, or take part in unmet demands."""
         counts = dict.fromkeys((movable for movable in self._movable if movable not in chosen), 0)
         for name in chosen:
             if (field := self._field(name)) is None:
@@ -313,7 +317,7 @@ class Arranger:
             is_open = field.clearance > -self._slack
             cells = is_open & self._meeting_cells(field, name, chosen)
             if not cells.any():
-                # no cell would do with all others away, but moving the other may meet a demand about two
+                # no cell is good even without all others, but moving the partner may meet a demand on both
                 cells = is_open
             for neighbour, apart in field.apart.items():
                 if neighbour in counts:
@@ -350,7 +354,7 @@ class Arranger:
         return _Field(maps.turns, clearance, standing, apart, met)
 
     def _meeting_cells(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
-        """Return the cells where the demands hold that no other chosen object matters to."""
+        """Return the cells that meet all demands that concern no other chosen object."""
         met = np.ones(field.clearance.shape, np.bool_)
         for demand, values in field.surplus.items():
             if all(movable == name or movable not in chosen for movable in self._about[demand]):
@@ -358,7 +362,7 @@ class Arranger:
         return met
 
     def _domains(self, chosen: tuple[str, ...]) -> dict[str, Booleans] | None:
-        """Return the cells of each chosen object, as far as the others do not matter."""
+        """Return the possible cells of each chosen object, without regard to the other chosen ones."""
         domains = {}
         for name in chosen:
             if (field := self._field(name)) is None:
@@ -375,9 +379,9 @@ class Arranger:
     def _conflicts(
         self, chosen: tuple[str, ...], domains: Mapping[str, Booleans]
     ) -> dict[tuple[str, str], Booleans]:
-        """Return for each pair the conflicts by the way from one to the other: (A, B, rows, columns)."""
+        """Return the conflicts of each pair by the vector between its objects, (A, B, rows, columns)."""
         conflicts = {}
-        # turns without any cell need not be measured
+        # turns without possible cells are not measured
         used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
         for first, second in combinations(chosen, 2):
             if (stencil := self._stencil(first, second, chosen, used)) is not None:
@@ -388,7 +392,7 @@ class Arranger:
     def _stencil(
         self, first: str, second: str, chosen: tuple[str, ...], used: Mapping[str, Booleans]
     ) -> Floats | None:
-        """Return the least surplus of the demands about two objects; -inf for turns that are not measured."""
+        """Return the least surplus of the demands on two objects; -inf for turns that are not measured."""
         demands = [
             demand
             for demand in self._demands
@@ -427,7 +431,7 @@ class Arranger:
         return met
 
     def _turned_in(self, grid: Grid, used: Booleans) -> tuple[Workspace, list[int]]:
-        """Return a workspace without obstacles for those turns that are used, and their numbers."""
+        """Return a workspace without obstacles for the used turns, and the indices of these turns."""
         yaws, keeps = self._settings.workspace.yaws, self._settings.workspace.keeps_yaw
         if len(used) == 1:
             return Workspace(grid, () if keeps else yaws), [0]
@@ -467,7 +471,7 @@ class Arranger:
         others: Mapping[str, Booleans],
         stencils: Mapping[tuple[str, str], Booleans],
     ) -> Iterator[Cell]:
-        """Yield some cells: the most robust one, the one that leaves most to the others, and corners."""
+        """Yield some cells: the most robust cell, the cell that leaves most to the others, and corners."""
         score = self._score(name)
         left = np.ones(domain.shape)
         for movable, cells in others.items():
@@ -482,14 +486,14 @@ class Arranger:
         yield from dict.fromkeys(choices)
 
     def _score(self, name: str) -> Floats:
-        """Return how good each cell of an object is, the other ones aside."""
+        """Return the score of each cell of an object, without regard to other chosen objects."""
         field, settings = self._fields[name], self._settings
         gaps = np.minimum.reduce([field.clearance, *field.apart.values()])
         room = gaps + settings.workspace.clearance
         surpluses = [field.surplus[demand] for demand in field.surplus if self._about[demand] == (name,)]
         if surpluses:
             score: Floats = np.minimum.reduce(surpluses)
-            # cells with too little room come after all others, and so do turns of what is pushed
+            # cells with too little room, and turns of pushed objects, come after all others
             is_last = room < settings.room
             is_last[1:] |= settings.workspace.keeps_yaw
             behind = 2.0 * float(abs(score[np.isfinite(score)]).max(initial=1.0))
@@ -502,15 +506,15 @@ class Arranger:
     # ------------------------------------------------------------------------------------------ poses
 
     def _pose(self, name: str, cell: Cell) -> Pose:
-        """Return x, y and turn of an object in a cell."""
+        """Return the pose of an object in a cell."""
         x, y = self._grid.centre(cell[1], cell[2])
         return x, y, float(self._fields[name].turns[cell[0]])
 
     def _settle(self, poses: Mapping[str, Pose]) -> dict[str, Pose] | None:
-        """Return poses near others that meet all demands, and are clear of everything; None if none is found.
+        """Return poses near `poses` that meet all demands and touch nothing; None if none are found.
 
-        Each step goes to the nearest places that meet the demands, linear as here and in the steps before.
-        A distance between two sides is that of the nearer one.
+        Each step goes to the nearest places that meet the demands, which are linearized at this step and at
+        previous steps.
         """
         workspace, size = self._settings.workspace, self._grid.cell_size
         obstacles = {
@@ -558,7 +562,7 @@ class Arranger:
     def _slopes(
         self, sample: Sample, demands: Sequence[Demand], poses: Mapping[str, Pose], places: Floats
     ) -> tuple[Floats, Floats]:
-        """Return (D,) by how much demands are met with objects at places (N, 2), and (D, N, 2) its slopes."""
+        """Return the surplus of demands (D,) with objects at places (N, 2), and its slopes (D, N, 2)."""
         step = 1e-4 * self._grid.cell_size
         objects: dict[str, TrackedObject] = {}
         nudges: list[tuple[str, TrackedObject]] = []
@@ -589,14 +593,14 @@ class Arranger:
 
 
 def _standing_text(names: Sequence[str]) -> str:
-    """Return the first of some things as the beginning of a sentence about what cannot be moved."""
+    """Return the beginning of a sentence on immovable objects, with the first names; "" without names."""
     said = [name or "an obstacle of the workspace" for name in names[:_MOST_NAMED]]
     verb = "stand" if len(said) > 1 else "stands"
     return f"{' and '.join(said)}, which cannot be moved, {verb}" if said else ""
 
 
 def _best(among: Booleans, values: Floats, then: Floats) -> Cell:
-    """Return the cell with the greatest value; of equal ones, the greatest of `then`."""
+    """Return the cell with the greatest value; among equal ones, the cell with the greatest `then`."""
     best = np.where(among, values, -np.inf)
     ties = best == best.max()
     place = int(np.argmax(np.where(ties, then, -np.inf)))
@@ -605,7 +609,7 @@ def _best(among: Booleans, values: Floats, then: Floats) -> Cell:
 
 
 def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> Booleans:
-    """Return the cells (B, rows, columns) of the second object in conflict with a cell of the first."""
+    """Return the cells (B, rows, columns) of the second object that conflict with a cell of the first."""
     conflicts = np.zeros(shape, np.bool_)
     if stencil is None:
         return conflicts
@@ -621,19 +625,22 @@ def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> 
 
 
 def _count_losses(cells: Booleans, stencil: Booleans) -> Floats:
-    """Return (A, rows, columns): how many cells of the second object each cell of the first takes away."""
+    """Return how many cells of the second object conflict with each cell of the first, (A, rows, columns).
+
+    The counts are correlations of cells and stencil, computed by Fourier transforms.
+    """
     half = stencil.shape[2] // 2
     rows, columns = cells.shape[1:]
     padded = np.fft.rfft2(np.pad(cells.astype(np.float64), ((0, 0), (half, half), (half, half))))
     shape = (rows + 2 * half, columns + 2 * half)
     kernels = np.fft.rfft2(stencil.astype(np.float64), s=shape)
     lost = np.fft.irfft2((padded[None] * kernels.conj()).sum(axis=1), s=shape)
-    # the counts are whole numbers, so rounding takes away what transforms add
+    # counts are whole numbers, so rounding removes the errors of the transforms
     return np.rint(lost[:, :rows, :columns])
 
 
 def _is_of(formula: Formula, names: Sequence[str]) -> bool:
-    """Return whether a formula is about some objects alone, whatever stands elsewhere."""
+    """Return whether a formula depends only on some objects."""
     for part in iter_formulas(formula):
         if isinstance(part, Quantified):
             return False
@@ -648,27 +655,27 @@ def _is_of(formula: Formula, names: Sequence[str]) -> bool:
 # ---------------------------------------------------------------------------------------------- motions ahead
 
 MOST_MAPS: Final = 230
-"""The most maps that one decision computes; a look at one sample counts as a quarter of a map."""
+"""Maximum number of maps of one decision; the evaluation of one sample counts as a quarter of a map."""
 _MOST_WHY_NOT: Final = 60
-"""The most maps that are computed to say what cannot be done, after a decision that found nothing."""
+"""Maximum number of maps for the reason of an infeasible task, after a decision without a result."""
 _JOINT_SHARE: Final = 0.4
-"""The share of the maps left that is spent on moving several objects for one edge, in one of its ways."""
+"""Maximum share of the remaining maps for one conjunction of demands on several objects."""
 _HOPELESS_SHARE: Final = 0.5
-"""The share of the maps left that is spent on finding edges that nothing can take."""
+"""Share of the remaining maps for finding edges that no arrangement can take."""
 _MOST_EDGES: Final = 12
-"""The most edges that are tried from one state that is foreseen."""
+"""Maximum number of edges to try from one predicted state."""
 _MOST_ORDERED: Final = 6
-"""The most arrangements of which the order of motions is looked for."""
+"""Maximum number of arrangements for which an order of motions is searched."""
 _NOT_FOUND: Final = "no arrangement of objects brings it about"
 _STILL_TURN: Final = math.radians(1.0)
-"""The widest turn of an object that stays as it is."""
+"""Turn up to which an object counts as staying, radians."""
 
 
 class Lookahead:
-    """Possible motions from one sample on; made for one decision."""
+    """Search for motions from one sample to acceptance, for one decision."""
 
     def __init__(self, expected: Expectations, sample: Sample) -> None:
-        """Begin with what is known about a run, and its newest sample."""
+        """Begin from the newest sample of a run."""
         self._expected, self._first = expected, PredictedState(sample)
         self._automaton, self._formulas = expected.automaton, expected.formulas
         self._regions, self._settings = expected.regions, expected.settings
@@ -688,15 +695,15 @@ class Lookahead:
         *,
         together: bool = False,
     ) -> Consideration:
-        """Return an edge with the candidate with which acceptance can be reached, or pruned.
+        """Return an edge with a candidate from which acceptance can be reached; pruned if there is none.
 
-        Where one object is moved for an edge at most, nothing is looked ahead.
+        With the setting `motions` = 1, there is no lookahead.
 
         Args:
-            consideration: the edge with the candidates that can take it by one motion, or pruned.
-            path: that begins with the edge.
-            pruned: the edges given up so far.
-            together: whether several motions may take the edge, or move an object twice.
+            consideration: edge with the candidates that can take it by one motion, or pruned.
+            path: path that begins with the edge.
+            pruned: pruned edges.
+            together: whether several motions may take the edge, and an object may be moved twice.
         """
         if self._settings.motions == 1:
             return consideration
@@ -721,7 +728,7 @@ class Lookahead:
     # ------------------------------------------------------------------------------------ one at a time
 
     def _ahead(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
-        """Return motions from a state to acceptance; None if there are none, or none were found."""
+        """Return motions from a state to acceptance; None if none are found."""
         if state in self._automaton.accepting:
             return ()
         key = state, scene.moved
@@ -748,7 +755,7 @@ class Lookahead:
             looked_into.append((path, consideration))
             pruned.add(consideration.edge)
             pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
-        # only once single motions lead nowhere: finding edges that no arrangement takes costs maps
+        # only after single motions have failed, because finding hopeless edges costs maps
         self._ruled_out = self._hopeless
         for path, consideration in looked_into:
             for sequence in islice(self._joint(scene, path, consideration), 2):
@@ -759,7 +766,7 @@ class Lookahead:
     def _ways(
         self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
     ) -> Iterator[Ordered]:
-        """Yield single motions that take the first edge of a path, and where they lead."""
+        """Yield single motions that take the first edge of a path, with the resulting scene and state."""
         movables = self._expected.movables(scene)
         candidates: list[Candidate] = []
         later = moved_later(path, self._expected.symbol(scene), self._formulas, movables.names)
@@ -778,7 +785,7 @@ class Lookahead:
             )
 
     def _after(self, target: Target, edge: Transition) -> tuple[Target, ...] | None:
-        """Return the motions that follow the first one to acceptance; none if what is seen does not say."""
+        """Return the motions to acceptance after a first motion; () if the state after it is uncertain."""
         scene = self._first.after(target.name, target.pose)
         states = self._expected.states_after(scene, edge.source)
         return () if len(states) > 1 else self._ahead(scene, *states)
@@ -788,7 +795,7 @@ class Lookahead:
     def _joint(
         self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
     ) -> Iterator[Ordered]:
-        """Yield motions of several objects that lead along a path, or take its first edge."""
+        """Yield motions of several objects that take a whole path, or its first edge."""
         if self._settings.motions < 2:
             return
         for length in dict.fromkeys((len(path), 1)):
@@ -798,7 +805,7 @@ class Lookahead:
             if scene is self._first:
                 yield from self._resume(aims, consideration)
             for demands in self._demands_of(scene, aims):
-                # this edge leaves a share of the maps to other edges
+                # a share of the maps is reserved for other edges
                 least = self._expected.budget.left * (1.0 - _JOINT_SHARE)
                 about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
                 if self._expected.budget.left <= 0 or about.why_hopeless():
@@ -807,15 +814,16 @@ class Lookahead:
                     about.arrangements(self._settings.motions), _MOST_ORDERED
                 )
                 if self._expected.attempts.are_any:
-                    # a motion may fail by chance: places where one did come again, after all others
+                    # a motion may fail by chance, so places of failed motions are tried after all others
                     arrangements = sorted(arrangements, key=self._is_near_failure)
                 for poses in arrangements:
                     yield from self._ordered_from(scene, aims, consideration, about, poses, least)
 
     def _resume(self, aims: Sequence[Transition], consideration: Consideration) -> Iterator[Ordered]:
-        """Yield the motions to the places that the last decision planned, if these still take some edges.
+        """Yield the motions to the places of the last decision, if they still take the edges.
 
-        A new arrangement may need more motions than are left, and the next one may undo its first motion.
+        A new arrangement may need more motions than the old plan has left, and its motions may undo earlier
+        motions.
         """
         scene, states = self._first, frozenset({aims[0].source})
         places: dict[str, Pose] = {}
@@ -832,7 +840,7 @@ class Lookahead:
                 return
 
     def _demands_of(self, scene: PredictedState, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
-        """Yield what has to hold for some edges to be taken, as conjunctions: all progress, no trap."""
+        """Yield conjunctions of demands that take all edges and avoid traps."""
         never = self._expected.traps(aims[0].source)
         safety_demands: list[Demand] = []
         least = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
@@ -850,7 +858,7 @@ class Lookahead:
                 yield (*demands, *safety_demands)
 
     def _is_near_failure(self, poses: Mapping[str, Pose]) -> bool:
-        """Return whether an arrangement brings an object near a place where that failed."""
+        """Return whether an arrangement brings an object near a place where its motion failed."""
         near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
         return any(
             math.dist(pose[:2], place) <= near
@@ -867,7 +875,7 @@ class Lookahead:
         poses: Mapping[str, Pose],
         least: float,
     ) -> Iterator[Ordered]:
-        """Yield the motions to an arrangement, in an order in which each is possible."""
+        """Yield the motions to an arrangement in a possible order, if one is found."""
         self._expected.budget.arrangements += 1
         poses = self._without_staying(scene, about, poses)
         robustness = self._expected.robustness(move_objects(scene.sample, poses), aims[0].guard)
@@ -881,7 +889,7 @@ class Lookahead:
     def _without_staying(
         self, scene: PredictedState, about: Arranger, poses: Mapping[str, Pose]
     ) -> Mapping[str, Pose]:
-        """Return an arrangement without the objects that may as well stay where they are."""
+        """Return an arrangement without objects that barely move, if it meets the demands without them."""
         for name in list(poses):
             x, y, turn = poses[name]
             others = {moved: pose for moved, pose in poses.items() if moved != name}
@@ -899,7 +907,7 @@ class Lookahead:
     ) -> Consideration:
         """Return an edge with the first of several motions as its chosen candidate."""
         first, sample = motions[0], self._first.sample
-        # an object that is parked first goes to its own place later
+        # a parked object goes to its own place later, so the pose of its first motion is not final
         poses = {motion.name: motion.pose for motion in motions[1:] if motion.name != first.name}
         settings, now = self._settings, self.movables.maps_of(first.name)
         then = proposition_maps(
@@ -933,7 +941,7 @@ class Lookahead:
         poses: Mapping[str, Pose],
         rest: tuple[Target, ...],
     ) -> Target:
-        """Return the first of several motions with a refined target, if the others lead on as before."""
+        """Return the first of several motions with a refined target, if the later states stay the same."""
         start, *way, end = target.waypoints
         way = way if self._settings.skill == "push" else []
         straight = replace(target, waypoints=(start, *way, end))
@@ -946,7 +954,7 @@ class Lookahead:
         return ways if before == after else target
 
     def _states_along(self, motions: Sequence[Target], state: int) -> list[frozenset[int]]:
-        """Return the states after each of some motions, from the newest sample on."""
+        """Return the possible states after each motion, from the newest sample on."""
         scene, states, visited = self._first, frozenset({state}), []
         for motion in motions:
             scene = scene.after(motion.name, motion.pose)
@@ -958,11 +966,11 @@ class Lookahead:
 
     @cached_property
     def _hopeless(self) -> frozenset[Edge]:
-        """The edges that need what no arrangement of the objects can bring about."""
+        """The edges that need a literal that no arrangement of the objects can fulfil."""
         return self._needing(self._hopeless_literals)
 
     def _needing(self, literals: Collection[tuple[int, bool]]) -> frozenset[Edge]:
-        """Return the edges that cannot be taken without some of these values of propositions."""
+        """Return the edges that need one of these literals in every cube."""
         if not self._automaton.is_listable:
             return frozenset()
         return frozenset(
@@ -973,7 +981,7 @@ class Lookahead:
 
     @cached_property
     def _hopeless_literals(self) -> tuple[tuple[int, bool], ...]:
-        """The values of propositions that no arrangement of the objects can bring about."""
+        """The literals that no arrangement of the objects can fulfil."""
         if not self._automaton.is_listable:
             return ()
         symbol = self._expected.symbol(self._first)
@@ -995,9 +1003,10 @@ class Lookahead:
         return tuple(hopeless)
 
     def why_not(self, state: int) -> str:
-        """Return what every path to acceptance needs and cannot hold, and what stands there.
+        """Return the infeasible condition of every path to acceptance, and the objects in the way.
 
-        Or else, which objects have places to which no order of motions was found; "" without either.
+        Without such a condition, return the objects with places but without an order of motions; "" without
+        these.
         """
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
@@ -1007,11 +1016,11 @@ class Lookahead:
         return f"{self._unordered}: there are places for all, but no order of motions to them was found"
 
     def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
-        """Return what of a proposition cannot hold in any arrangement, and what stands there."""
+        """Return the demands of a literal that no arrangement meets, and the objects in the way."""
         budget = Budget(_MOST_WHY_NOT)
         every = demands_of((literal,), self._formulas, self._settings.margin)
         demands = next(iter(every), ())
-        # leave out what the contradiction does not need, so that the reason names few demands
+        # demands that are not needed for the conflict are dropped, so that the reason names few demands
         core = list(demands)
         for demand in reversed(demands):
             fewer = tuple(member for member in core if member != demand)
@@ -1026,7 +1035,7 @@ class Lookahead:
         return f"{what}: {'; '.join(filter(None, said))}"
 
     def _why_impossible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> str:
-        """Return why demands hold in no arrangement, as far as that is looked for; "" if they do."""
+        """Return why no arrangement meets demands, or that none was found; "" if one was found."""
         about = Arranger(sample, self._regions, self._settings, demands, budget)
         why = about.why_hopeless()
         arrangement = None if why else next(about.arrangements(self._settings.motions), None)

@@ -1,7 +1,7 @@
-"""Motions: objects that could be moved to take an edge, samples expected after that, and orders of several.
+"""Motions: candidates that can take an edge, predicted samples, and orders of several motions.
 
-An object that is in the way of another one is parked: it goes aside first, and to its own place, if any,
-later. So two objects change places, and a pushed one gets past others.
+An object in the way of another one is parked: it goes aside first, and to its own place, if any, later. So
+two objects can change places, and a pushed object can pass others.
 """
 
 from __future__ import annotations
@@ -66,18 +66,18 @@ from spatial_replay.trace.trace import Sample
 # ------------------------------------------------------------------------------------------------- candidates
 
 _MOST_NAMED: Final = 2
-"""The most constraints that a reason names."""
+"""Maximum number of constraints that a reason names."""
 _LONGEST_NAME: Final = 60
-"""The most characters of one of them."""
+"""Maximum length of such a constraint, characters."""
 _DIGITS: Final = 9
-"""Decimal places to which equal lengths and equal robustness agree."""
+"""Number of decimal places at which lengths and robustness are compared."""
 
 
 @dataclass(eq=False)
 class Movables:
     """The movable objects of one sample.
 
-    An object's propositions are measured over the grid once and used for every edge.
+    The propositions of an object are measured over the grid once, and used for every edge.
     """
 
     propositions: Sequence[Formula]
@@ -89,7 +89,7 @@ class Movables:
 
     @property
     def names(self) -> list[str]:
-        """The movable objects, in the order of the settings."""
+        """The names of the movable objects, in the order of the settings."""
         movable, present = self.settings.movable, self.sample.objects
         return [name for name in (sorted(present) if movable is None else movable) if name in present]
 
@@ -108,18 +108,18 @@ class Movables:
         *,
         refine: bool = False,
     ) -> Candidate:
-        """Return an object with its map for an edge, and its target or why it has none.
+        """Return an object with its map for an edge, and with its target or the reason of its rejection.
 
         Args:
             later: objects that may still have to be moved after this motion.
-            refine: refine the target, if the settings want that.
+            refine: whether to refine the target, if the settings allow it.
         """
         tracked, settings = self.sample.objects[name], self.settings
         gradient = self.gradient(name, consideration.progress.cubes, consideration.constraints.cubes)
         keeps_all = settings.room_from == "all" or name in later or self.attempts.needs_room(name)
         room_from = None if keeps_all else later
         failed = self.attempts.places_of(name)
-        # if it cannot be picked up, no other target helps
+        # another target does not help an object that cannot be picked up
         target: Target | str = "it could not be picked up where it lies"
         if not self.attempts.failed_pick(name, self.sample, settings):
             room = gradient.made_of.now.room(room_from)
@@ -134,11 +134,11 @@ class Movables:
         return Candidate(name, gradient, possible_target, why, failed=failed, room_from=_tuple(room_from))
 
     def failed_here(self, name: str) -> tuple[Target, ...]:
-        """Return the targets for which motions of an object failed while everything stood as it does."""
+        """Return the targets of failed motions of an object in the current scene."""
         return self.attempts.failed_here(name, self.sample, self.settings)
 
     def is_repeated(self, target: Target) -> bool:
-        """Return whether a motion to a target would repeat one that failed while everything stood as now."""
+        """Return whether a motion to a target would repeat a failed motion in the current scene."""
         failures = self.failed_here(target.name)
         if self.settings.skill == "place":
             if self.attempts.failed_pick(target.name, self.sample, self.settings):
@@ -153,11 +153,11 @@ class Movables:
         room_from: Collection[str] | None,
         then: Mapping[str, Pose] | None = None,
     ) -> Target:
-        """Return a target of a placed object with more robustness nearby, if the settings want that.
+        """Return a more robust target near a target, if there is one and the settings allow refinement.
 
         Args:
-            room_from: the objects to keep room from; None for everything.
-            then: where other objects are moved to later, for the robustness, and as obstacles.
+            room_from: objects from which room is kept; None for all objects.
+            then: later poses of other objects, which count for the robustness and as obstacles.
         """
         settings, name = self.settings, target.name
         if not settings.refine:
@@ -175,7 +175,7 @@ class Movables:
         room_from: Collection[str] | None,
         then: Mapping[str, Pose] | None = None,
     ) -> Measured:
-        """Return what measures maps of an object for an edge over any grid; see `refine_target`."""
+        """Return the function that measures an object's maps for an edge, as `refine_target` needs it."""
         settings = self.settings
         progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
         later = self.sample if then is None else move_objects(self.sample, then)
@@ -194,7 +194,7 @@ class Movables:
         return measure
 
     def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
-        """Return whether nothing is in the way on the last stretch of a path, and while turning there."""
+        """Return whether the last leg of a path, and the turn at its end, are free."""
         gradient = self.gradient(target.name, ((),), constraints)
         size = gradient.grid.cell_size
         last = (gradient.grid.cell(*point) for point in points_along(target.waypoints[-2:], size / 2))
@@ -206,10 +206,11 @@ class Movables:
         return bool(can_turn_in(spot, gradient, target.turn, self.settings).all())
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
-        """Return the target of a carried object with a way that keeps the constraints, or why there is none.
+        """Return the target of a carried object with a path that keeps the constraints, or why there is none.
 
-        Where no constraint is about the object, its way does not matter. On the way, constraints stay away
-        from holding by the margin and half a cell; where there is no such way, by the margin; else at all.
+        If no constraint concerns the object, the robot may choose the path. On the path, constraints are
+        false by the margin plus half a cell's diagonal. If there is no such path, they are false by the
+        margin or, as a last resort, just false.
         """
         settings, name = self.settings, target.name
         about = sorted({number for cube in constraints for number, _ in cube})
@@ -226,10 +227,10 @@ class Movables:
             path = shortest_path(reached & (danger < -distance), grid.cell(*start), goals)
             if path is not None:
                 turns = [grid.centre(*cell) for cell in path.cells[1:-1].tolist()]
-                # two waypoints mean that the way does not matter, so a straight way has its middle, too
+                # a path of two waypoints would leave the path to the robot, so a straight path has a middle
                 middle = ((start[0] + end[0]) / 2.0, (start[1] + end[1]) / 2.0)
                 return replace(target, waypoints=(start, *(turns or [middle]), end))
-        # the reason names the constraints that the shortest way crosses
+        # the reason names the constraints that the shortest path crosses
         path = shortest_path(reached, grid.cell(*start), goals)
         if path is None:
             return "the robot does not reach all of any way there"
@@ -244,9 +245,9 @@ class Movables:
     def _danger_on_the_way(
         self, target: Target, constraints: Cubes, about: Sequence[int]
     ) -> tuple[np.ndarray, Grid, MapParts]:
-        """Return (rows, columns): the constraints' robustness with the object carried there.
+        """Return the constraints' robustness with the object carried over each cell, (rows, columns).
 
-        Also return the grid, and the maps that this was computed from, with the object turned last.
+        Also return the grid, and the underlying maps for the last orientation of the object.
         """
         settings, tracked = self.settings, self.sample.objects[target.name]
         if tracked.height is not None and settings.lift:
@@ -254,7 +255,7 @@ class Movables:
             tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
         centre = centre_of(tracked.footprint)
         grid = settings.workspace.grid.reaching(*centre)
-        # an object that is carried above the others has no obstacles
+        # the constraints decide here; all objects are supports, so none is an obstacle
         free = Workspace(grid, supports=frozenset(self.sample.objects))
         formulas = [self.propositions[number] for number in about]
         places = {number: place for place, number in enumerate(about)}
@@ -266,16 +267,16 @@ class Movables:
         return danger, grid, MapParts(maps[-1], maps[-1], (), cubes)
 
     def gradient(self, name: str, progress: Cubes, constraints: Cubes) -> GradientMap:
-        """Return the map of an object for a progress and a constraint set."""
+        """Return the map of an object for a progress set and a constraint set."""
         workspace, margin = self.settings.workspace, self.settings.constraint_margin
         return gradient_map(self.maps_of(name), progress, constraints, workspace, margin)
 
     def maps_of(self, name: str) -> PropositionMaps:
-        """Return the maps of all propositions over the cells of an object."""
+        """Return the maps of all propositions for an object."""
         if name not in self._maps:
             workspace = self.settings.workspace
             pushes = self.settings.skill == "push"
-            # a pushed object crosses all cells from where it lies, which may be outside the workspace
+            # a pushed object crosses all cells from its start, which may be outside the workspace
             centre = centre_of(self.sample.objects[name].footprint)
             grid = workspace.grid.reaching(*centre) if pushes else workspace.grid
             about = self.propositions, self.regions, self.sample, name
@@ -290,9 +291,9 @@ def _tuple(names: Collection[str] | None) -> tuple[str, ...] | None:
 def with_choice(
     consideration: Consideration, candidates: Sequence[Candidate], settings: Settings
 ) -> Consideration:
-    """Return an edge with its candidates, the best one chosen; pruned if no candidate has a target.
+    """Return an edge with its candidates and the best one chosen; pruned if no candidate has a target.
 
-    The best candidate is the first one of `by_cost`; of equal ones, the first candidate.
+    The best candidate is the first one of `by_cost`; among equal ones, the first candidate.
     """
     order = by_cost(candidates, settings)
     if not order:
@@ -305,7 +306,7 @@ def with_choice(
 def choose_candidate(
     consideration: Consideration, number: int | None, motions: tuple[Target, ...] = ()
 ) -> Consideration:
-    """Return an edge with one of its candidates or none chosen, and the motions planned with that."""
+    """Return an edge with one candidate chosen, or none, and with the planned motions."""
     marked = tuple(
         replace(candidate, is_chosen=place == number)
         for place, candidate in enumerate(consideration.candidates)
@@ -314,7 +315,7 @@ def choose_candidate(
 
 
 def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Target]:
-    """Return the targets of those candidates that have one, by number, the best first."""
+    """Return the targets of the candidates by the candidate's index, the best target first."""
     targets = [
         (number, candidate.target)
         for number, candidate in enumerate(candidates)
@@ -324,9 +325,9 @@ def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Ta
 
 
 def costs_of(target: Target, skill: Skill) -> tuple[float, float]:
-    """Return by what targets are compared, and by what equal ones are.
+    """Return the cost by which targets are compared, and the cost that decides between equal ones.
 
-    Pushes compare lengths of ways first, placed objects robustness. Numbers are rounded, since those of equal
+    Pushes compare path lengths first, placements compare robustness first. Numbers are rounded, because equal
     targets differ in their last digits.
     """
     length, robustness = round(target.length, _DIGITS), round(target.robustness, _DIGITS)
@@ -336,25 +337,25 @@ def costs_of(target: Target, skill: Skill) -> tuple[float, float]:
 # ----------------------------------------------------------------------------------------------- expectations
 
 _LOOK: Final = 0.25
-"""Cost of looking at one sample, in maps."""
+"""Cost of the evaluation of one sample, maps."""
 
 
 Moved: TypeAlias = tuple[tuple[str, Pose], ...]
-"""Poses of objects that were moved, by name and in order."""
+"""Poses of moved objects, sorted by name."""
 
 
 class PredictedState(NamedTuple):
-    """A sample that is expected after motions.
+    """A predicted sample after motions.
 
     Attributes:
-        moved: the poses of the objects moved, by name and in order, each with all its turns.
+        moved: poses of the moved objects, sorted by name; a turn is the sum of an object's turns.
     """
 
     sample: Sample
     moved: Moved = ()
 
     def after(self, name: str, pose: Pose) -> PredictedState:
-        """Return the scene after a motion of an object."""
+        """Return the predicted state after a motion of an object."""
         (x, y, turn), moved = pose, dict(self.moved)
         *_, turned = moved.get(name, (0.0, 0.0, 0.0))
         moved[name] = x, y, turned + turn
@@ -363,12 +364,13 @@ class PredictedState(NamedTuple):
 
 @dataclass(eq=False)
 class Expectations:
-    """The samples that one decision expects, each looked at once.
+    """The predicted samples of one decision, each evaluated once.
 
     Attributes:
-        automaton, formulas, regions, settings: of the planner; `formulas` are the automaton's propositions.
-        attempts: the motions of the run so far.
-        budget: the maps that may still be computed.
+        automaton, regions, settings: automaton, regions and settings of the planner.
+        formulas: propositions of the automaton.
+        attempts: earlier motions of the run.
+        budget: number of maps that may still be computed.
     """
 
     automaton: Automaton
@@ -390,12 +392,12 @@ class Expectations:
         return self._symbols[scene.moved]
 
     def values(self, sample: Sample, more: Sequence[Formula] = ()) -> tuple[list[float], list[float]]:
-        """Return the lower and the upper robustness of all propositions, and more formulas, in a sample."""
+        """Return bounds of the robustness of all propositions, and of `more` formulas, in a sample."""
         self.budget.spend(_LOOK)
         return values_in(sample, [*self.formulas, *more], self.regions)
 
     def clearances(self, sample: Sample, name: str, others: Collection[str]) -> list[float]:
-        """Return the distance of an object of a sample to each of others."""
+        """Return the distance of an object in a sample to each of the others."""
         self.budget.spend(_LOOK)
         apart = [distance_between(name, neighbour) for neighbour in others]
         return values_in(sample, apart, self.regions)[0] if apart else []
@@ -408,7 +410,7 @@ class Expectations:
         return self._movables[scene.moved]
 
     def states_after(self, scene: PredictedState, state: int) -> frozenset[int]:
-        """Return the states that the automaton can be in after a sample like a scene."""
+        """Return the possible states of the automaton after the sample of a scene."""
         return self.automaton.step_set({state}, self.symbol(scene))
 
     def robustness(self, sample: Sample, cubes: Cubes) -> float:
@@ -417,17 +419,17 @@ class Expectations:
         return max(min((lower[n] if w else -upper[n] for n, w in cube), default=0.0) for cube in cubes)
 
     def relations(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
-        """Return relations of which no conjunction must hold."""
+        """Return the constraints as conjunctions of relations, none of which may hold."""
         return [conjunction for cube in constraints for conjunction in demands_of(cube, self.formulas, 0.0)]
 
     def relations_about(self, name: str, constraints: Cubes) -> tuple[list[Formula], Cubes]:
-        """Return relations, and the conjunctions of them about an object of which none must hold."""
+        """Return relations, and the constraints on an object as cubes over these relations."""
         return _cubes_of(
             [conjunction for conjunction in self.relations(constraints) if _subjects_of(conjunction, [name])]
         )
 
     def traps(self, state: int) -> Cubes:
-        """Return the guards of the transitions by which acceptance is lost."""
+        """Return the guards of the transitions that lose acceptance."""
         lost = (self.automaton.transition(state, target) for target in self.automaton.successors[state])
         return tuple(
             cube
@@ -440,17 +442,17 @@ class Expectations:
 # ---------------------------------------------------------------------------------------- an order of several
 
 _MOST_PARKED: Final = 2
-"""The most objects that stand aside for others at once."""
+"""Maximum number of objects that are parked at the same time."""
 _MOST_PLACES: Final = 4
-"""The most places that are tried for an object that is brought aside."""
+"""Maximum number of places that are tried for a parked object."""
 _LOST: Final = -1
-"""Instead of a state: acceptance is lost, or may be."""
+"""Number instead of a state, if acceptance is or may be lost."""
 _ASTRAY: Final = -2
-"""Instead of a state: another edge is taken."""
+"""Number instead of a state, if another edge is taken."""
 
 
 class Ordered(NamedTuple):
-    """Motions in an order in which each is possible, and where they lead."""
+    """Motions in a possible order, with the resulting scene and state."""
 
     motions: tuple[Target, ...]
     scene: PredictedState
@@ -462,12 +464,12 @@ class MotionOrder:
     """The search for an order of the motions that bring objects to their places.
 
     Attributes:
-        begin: the scene before them.
-        aims: the transitions that the motions are to take: a whole path to acceptance, or one edge.
-        constraints: what must not hold on the way to the first of them.
-        places: where each object is to go.
-        robustness: of the progress set with all objects there.
-        least: how many maps the search leaves to the decision.
+        begin: scene before the motions.
+        aims: transitions that the motions must take: a whole path to acceptance, or one edge.
+        constraints: guards that must not hold before the first of these transitions.
+        places: target pose of each object.
+        robustness: robustness of the progress set with all objects at their places.
+        least: number of maps that the search reserves for the decision.
     """
 
     expected: Expectations
@@ -487,7 +489,7 @@ class MotionOrder:
         self._idle = idle_transitions(self.expected.automaton, self.aims[0].source, symbol).states
 
     def find(self) -> Ordered | None:
-        """Return the first order found, with as few objects brought aside as possible; None without one."""
+        """Return the first order with the fewest parked objects; None if none is found."""
         for self._most_parked in range(_MOST_PARKED + 1):
             self._dead.clear()
             self._has_parked = self._most_parked == 0
@@ -499,7 +501,7 @@ class MotionOrder:
     def _motions(
         self, scene: PredictedState, state: int, left: frozenset[str], parked: tuple[str, ...] = ()
     ) -> Ordered | None:
-        """Return the motions of the objects left, and the scene and the state after them."""
+        """Return the motions of the remaining objects, with the resulting scene and state."""
         if not left:
             return Ordered((), scene, state) if self._is_done(state) else None
         if (left, scene.moved) in self._dead or not self._spend(0):
@@ -508,7 +510,7 @@ class MotionOrder:
         for name in sorted(left):
             key = scene.moved, state, name
             if key not in self._targets:
-                # the next state of the automaton costs less than the path of the object
+                # checked first, because the automaton's next state costs less than the object's path
                 after = scene.after(name, self._place_of(scene, name))
                 leads_on = self._next_state(after, state, is_first) >= 0
                 self._targets[key] = self._target(scene, state, name, is_first) if leads_on else None
@@ -517,7 +519,7 @@ class MotionOrder:
             if (sequence := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
                 return sequence
         if len(parked) < self._most_parked:
-            # parking others does not help an object whose motion takes another edge
+            # parking does not help an object whose motion takes another edge
             places = {mover: scene.after(mover, self._place_of(scene, mover)) for mover in sorted(left)}
             able = [mover for mover in places if self._next_state(places[mover], state, is_first) != _ASTRAY]
             for name in able:
@@ -539,7 +541,7 @@ class MotionOrder:
         parked: tuple[str, ...],
         is_first: bool,
     ) -> Ordered | None:
-        """Return a motion and those of the objects left after it; None if either is not possible."""
+        """Return a motion and the motions of the remaining objects; None if any is impossible."""
         if target is None:
             return None
         after = scene.after(target.name, target.pose)
@@ -555,7 +557,7 @@ class MotionOrder:
         return state == self.aims[0].target or (state in automaton.can_accept and state not in self._idle)
 
     def _next_state(self, scene: PredictedState, state: int, is_first: bool) -> int:
-        """Return the state after a motion; `_LOST` or `_ASTRAY` if that is not one on the way."""
+        """Return the state after a motion; `_LOST` or `_ASTRAY` if it is not on the path."""
         aim, is_strict = self.aims[0].target, is_first or len(self.aims) == 1
         for _ in range(len(self.aims)):
             states = self.expected.states_after(scene, state)
@@ -567,35 +569,35 @@ class MotionOrder:
             if after == state:
                 break
             state = after
-            # once the edge is taken, time alone may lead on
+            # after the edge is taken, time alone may take further transitions
             is_strict = is_strict and state != aim
         return state
 
     def _aims_hold(self, scene: PredictedState, left: frozenset[str], parked: str) -> bool:
-        """Return whether the aims hold in the end if an object without a place of its own stays aside."""
+        """Return whether the aims hold in the end if a parked object without its own place stays aside."""
         if parked in self.places:
             return True
         final_sample = move_objects(scene.sample, {name: self._place_of(scene, name) for name in left})
         return all(self.expected.robustness(final_sample, aim.guard) >= 0.0 for aim in self.aims)
 
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
-        """Return where an object is to go, with the turn from how it is oriented in a scene."""
+        """Return the target pose of an object, with the turn from its orientation in a scene."""
         (x, y, turn), still = self.places[name], (0.0, 0.0, 0.0)
         turned = dict(scene.moved).get(name, still)[2] - dict(self.begin.moved).get(name, still)[2]
         return x, y, turn - turned
 
     def _constraints_at(self, state: int, is_first: bool) -> Cubes:
-        """Return what must not hold on the way of the next motion."""
+        """Return the guards that must not hold during the next motion."""
         is_strict = is_first or len(self.aims) == 1
         return self.constraints if is_strict else self.expected.traps(state)
 
     def _spend(self, maps: int) -> bool:
-        """Count maps; return whether there are any left for this search."""
+        """Subtract maps from the budget; return whether maps are left for this search."""
         self.expected.budget.spend(maps)
         return self.expected.budget.left >= self.least
 
     def _target(self, scene: PredictedState, state: int, name: str, is_first: bool) -> Target | None:
-        """Return the motion of an object to its place; None if it is not possible now."""
+        """Return the motion of an object to its place; None if it is impossible now."""
         settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
         if settings.skill == "place":
@@ -612,7 +614,7 @@ class MotionOrder:
     def _carry_target(
         self, scene: PredictedState, name: str, tracked: TrackedObject, constraints: Cubes
     ) -> Target | None:
-        """Return the motion of an object that is carried, if there is room for it at its place."""
+        """Return the motion of a carried object to its place; None if it is impossible."""
         settings, (x, y, turn) = self.expected.settings, self._place_of(scene, name)
         moved_sample = move_objects(scene.sample, {name: (x, y, turn)})
         others = [
@@ -649,7 +651,7 @@ class MotionOrder:
         parked: tuple[str, ...],
         is_first: bool,
     ) -> Iterator[tuple[str, Target]]:
-        """Yield motions that bring aside what is in the way of an object, or on its place."""
+        """Yield motions that park objects on the path of an object, or at its place."""
         constraints, settings = self._constraints_at(state, is_first), self.expected.settings
         names = [movable for movable in self.expected.movables(scene).names if movable != name]
         names = [movable for movable in names if movable in left or movable not in {*parked, *self.places}]
@@ -670,7 +672,7 @@ class MotionOrder:
                     self.expected.budget.parking_places += 1
                     after = scene.after(target.name, target.pose)
                     movables = self.expected.movables(scene)
-                    # a constraint may hold wherever the other object stands
+                    # a constraint may hold at every place of the blocker; then parking does not help
                     if not in_way and blocker in self._bound_by(after, {name: way}, constraints):
                         continue
                     if not self._aims_hold(after, left, blocker):
@@ -682,7 +684,7 @@ class MotionOrder:
     def _way_past(
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
     ) -> TrackedObject | None:
-        """Return all that an object covers on its way as if none of some others was in it."""
+        """Return the area that an object covers on its path, without regard to `others`."""
         settings, tracked = self.expected.settings, scene.sample.objects[name]
         place = self._place_of(scene, name)
         if settings.skill == "place":
@@ -701,7 +703,7 @@ class MotionOrder:
         target = target_in(gradient, tracked, settings, place)
         if isinstance(target, str):
             return None
-        # footprints that overlap by half leave no gap in which another object could stand
+        # the step is half a radius, so that successive footprints leave no gap for another object
         step = max(workspace.grid.cell_size, radius_of(tracked) / 2.0)
         parts = [
             part
@@ -714,7 +716,7 @@ class MotionOrder:
     def _bound_by(
         self, scene: PredictedState, covered: Mapping[str, TrackedObject], constraints: Cubes
     ) -> set[str]:
-        """Return the objects because of which a constraint would hold with another one where it is to go."""
+        """Return the objects in the constraints that would hold with a moved object on its path."""
         ((name, way),) = covered.items()
         relations, cubes = self.expected.relations_about(name, constraints)
         lower, upper = self.expected.values(with_objects(scene.sample, {name: way}), relations)
@@ -728,7 +730,7 @@ class MotionOrder:
         }
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
-        """Return the objects so near to one that could not be moved that they may be why."""
+        """Return the neighbours of an object that may have blocked its failed motion."""
         if not self.expected.movables(scene).failed_here(name):
             return set()
         near = BESIDE * radius_of(scene.sample.objects[name])
@@ -738,7 +740,7 @@ class MotionOrder:
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
     ) -> tuple[Booleans, PropositionMaps]:
-        """Return (A, rows, columns) where an object is clear and no constraint holds, and its maps."""
+        """Return the cells (A, rows, columns) where an object is clear without a constraint, and its maps."""
         settings = self.expected.settings
         maps = proposition_maps(formulas, self.expected.regions, sample, name, settings.workspace, grid)
         is_kept = danger_of(maps, constraints) < -settings.constraint_margin
@@ -754,10 +756,10 @@ class MotionOrder:
         is_first: bool,
         is_beside: bool,
     ) -> Iterator[Target]:
-        """Yield motions of an object to places where it is in no one's way, the nearest first.
+        """Yield motions of an object to parking places, the nearest first.
 
-        There, nothing that must not hold does, neither now nor with the others where they are to go.
-        Neighbours of an object that could not be moved are moved away from it.
+        At a parking place no constraint holds, neither now nor with the other objects at their places. If
+        `is_beside`, the object is moved away from the object whose motion failed.
         """
         settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
@@ -773,15 +775,15 @@ class MotionOrder:
             after, _ = self._is_kept(final_sample, name, now.grid, *later)
             onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
             if name in self.places:
-                # behind objects that are at their places by then, it could not be pushed to its own
+                # the other objects are then at their places, and must not block its path to its own place
                 onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
             after &= onwards
             good &= after
-        # what is picked up or pushed again needs room
+        # an object that is picked up or pushed again needs room
         room = np.minimum(maps.clearance, gradient.clearance)
         roomy = good & (room >= settings.room)
         if settings.skill == "place":
-            # where a constraint nearly holds, the next motion may have to stop
+            # near a constraint, the next motion might have to stop
             spare = settings.constraint_margin + 2.0 * now.grid.cell_size
             far = roomy & (danger_of(maps, later[1]) < -spare)
             roomy = far if far.any() else roomy
@@ -793,7 +795,7 @@ class MotionOrder:
         free = np.ones_like(good)
         for is_at_edge in (False, True) if settings.skill == "push" else (False,):
             if is_at_edge:
-                # in a corridor no place is clear of a way through its middle: others give way at its edges
+                # in a corridor no place is clear of a path through the middle, so its edges are tried
                 if is_beside:
                     return
                 good = roomy = (gradient.blocked == FREE) & after & free
@@ -811,14 +813,16 @@ class MotionOrder:
 
 
 def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> Booleans:
-    """Return (rows, columns) the cells that are joined to a point's by free ones (A, rows, columns); all if
-    that is not free itself."""
+    """Return the cells (rows, columns) connected to a point's cell by free cells (A, rows, columns).
+
+    If the point's cell is not free, return all cells.
+    """
     cell = grid.cell(*point)
     return reachable(free[0], cell) if free[0][cell] else np.ones(grid.shape, np.bool_)
 
 
 def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
-    """Return the relations of conjunctions, and these as cubes over them."""
+    """Return the relations of conjunctions, and the conjunctions as cubes over these relations."""
     formulas = list(dict.fromkeys(demand.formula for way in ways for demand in way))
     return formulas, tuple(
         tuple((formulas.index(demand.formula), demand.wanted) for demand in way) for way in ways
@@ -826,10 +830,10 @@ def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]
 
 
 def _danger(cube: Cube, lower: Sequence[float], upper: Sequence[float]) -> float:
-    """Return the greatest robustness that a conjunction may have, by bounds of its members."""
+    """Return the greatest possible robustness of a conjunction, by bounds of its members."""
     return min((upper[number] if value else -lower[number] for number, value in cube), default=0.0)
 
 
 def _subjects_of(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:
-    """Return which of some objects demands are about."""
+    """Return the objects among `names` that demands concern."""
     return {name for name in names if any(concerns(demand.formula, name) for demand in demands)}
