@@ -1,4 +1,4 @@
-"""Decisions of a planner as values: steps, the edges and objects considered, targets, outcomes."""
+"""Decisions of a planner as values: steps, considered edges and objects, targets, outcomes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.text import time_text
 
 if TYPE_CHECKING:
-    # a report reads reasons without loading the kernels behind maps
+    # only for types, so that a report reads reasons without loading the kernels of maps
     from spatial_replay.planning.maps import Cubes, GradientMap
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
 """The kind of a step: move an object, hold because the specification is satisfied, wait, or stop because no
-path to acceptance is left. A step waits for an observation, for time to pass or for others that move."""
+path to acceptance is left. A wait is for an observation, for time to pass, or for moving objects."""
 
 Stage: TypeAlias = Literal["pick", "way", "place"]
 """Stages of a motion: picking the object, moving it, placing it at the target."""
@@ -30,11 +30,11 @@ Edge: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why an edge was pruned.
+    """The reason why an edge was pruned.
 
     Attributes:
-        kind: the same text for all edges pruned for the same cause.
-        detail: what differs from edge to edge, such as the cause for each object; may be empty.
+        kind: text that is the same for all edges with the same cause.
+        detail: text that differs between edges, such as the cause for each object; may be empty.
     """
 
     kind: str
@@ -42,7 +42,7 @@ class Reason:
 
     @classmethod
     def from_text(cls, text: str) -> Reason:
-        """Read a reason from the text that `str` gives, as logs hold it."""
+        """Parse a reason from its text in a log, which `str` returns."""
         kind, _, detail = text.partition(" (")
         return cls(kind, detail.removesuffix(")"))
 
@@ -52,11 +52,11 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Guards:
-    """A set of guards: in a progress set one of them has to hold, in a constraint set none may.
+    """A set of guards. One guard of a progress set must hold; no guard of a constraint set may hold.
 
     Attributes:
-        cubes: over the automaton's propositions.
-        texts: each cube as text.
+        cubes: guards as cubes over the automaton's propositions.
+        texts: text of each cube.
     """
 
     cubes: Cubes
@@ -73,15 +73,15 @@ def either(texts: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The pose that an object is to be moved to.
+    """The target pose of an object.
 
     Attributes:
-        name: of the object.
-        x, y: of its centre at the target, in footprint units.
-        turn: angle in radians to turn the object by.
-        yaw: its orientation at the target, in radians; None if it has none.
-        waypoints: points (x, y) of the path, both ends included; only the ends if the path does not matter.
-        robustness: of the progress set with the object at the target.
+        name: name of the object.
+        x, y: centre of the object at the target, footprint units.
+        turn: angle by which the object is turned, radians.
+        yaw: orientation of the object at the target, radians; None if it has none.
+        waypoints: points (x, y) of the path with both ends; only the ends if the robot may choose the path.
+        robustness: robustness of the progress set with the object at the target.
     """
 
     name: str
@@ -99,12 +99,12 @@ class Target:
 
     @property
     def length(self) -> float:
-        """Length of the path, in footprint units."""
+        """Length of the path, footprint units."""
         return sum(math.dist(start, end) for start, end in pairwise(self.waypoints))
 
 
 def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:
-    """Yield points on a way, no farther apart than a step."""
+    """Yield points along a path, at most `step` apart."""
     yield waypoints[0]
     for (u, v), (x, y) in pairwise(waypoints):
         count = max(1, math.ceil(math.dist((u, v), (x, y)) / step))
@@ -116,13 +116,13 @@ class Candidate:
     """An object that could be moved to take an edge.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         map: robustness of the progress set over the positions of the object.
-        target: where it would go; None if it was rejected.
-        rejected: why it was rejected; empty if it was not.
+        target: target of the object; None if it was rejected.
+        rejected: reason of the rejection; empty if it was not rejected.
         is_chosen: whether this is the object to move.
-        failed: places (x, y) where earlier motions failed, from which a target stays away.
-        room_from: the objects from which its target keeps room; None for everything.
+        failed: places (x, y) of earlier failed motions, which a target avoids.
+        room_from: names of the objects from which the target keeps room; None for all objects.
     """
 
     name: str
@@ -139,18 +139,18 @@ class Consideration:
     """An edge that a planner considered.
 
     Attributes:
-        path: states from the current one to an accepting one; the edge is its first transition.
+        path: states from the current state to an accepting state; the edge is its first transition.
         edge: source and target state.
-        progress: what has to hold for the edge to be taken.
-        constraints: what must not hold on the way, since it takes another edge.
-        candidates: the objects considered, in the order of the settings' `movable`; without it, by name.
-        pruned: why the edge was pruned; None if it was not.
-        motions: the motions planned from here to acceptance, the chosen candidate's first; empty if the
-            planner does not look ahead.
-        is_joint: whether objects are moved together for the edge; the chosen candidate's map then has the
-            others where these motions bring them.
-        failed: how many motions for the edge have failed before, of those that count as attempts.
-        order: why the edge comes before those on paths that are as short; empty without any.
+        progress: guard of the edge, which has to hold to take it.
+        constraints: guards of other edges, which must not hold on the way.
+        candidates: considered objects in the order of the settings' `movable` or, without it, by name.
+        pruned: reason why the edge was pruned; None if it was not pruned.
+        motions: planned motions to acceptance, beginning with the chosen candidate's; empty if the planner
+            does not look ahead.
+        is_joint: whether several objects are moved for the edge. The chosen candidate's map then has the
+            other objects at the ends of their motions.
+        failed: number of failed motions for the edge that count as attempts.
+        order: reason why the edge precedes edges of equally short paths; empty if there are none.
     """
 
     path: tuple[int, ...]
@@ -166,12 +166,12 @@ class Consideration:
 
 
 class Search(NamedTuple):
-    """How much was searched for a decision.
+    """The search effort of a decision.
 
     Attributes:
-        maps: maps computed, up to a limit; a look at one sample counts as a quarter of a map.
-        arrangements: of several objects, of which an order of motions was looked for.
-        parking_places: that were tried for objects in the way of others.
+        maps: number of computed maps; the evaluation of one sample counts as a quarter of a map.
+        arrangements: number of arrangements of several objects for which an order of motions was searched.
+        parking_places: number of parking places tried for objects in the way of others.
     """
 
     maps: float = 0.0
@@ -181,11 +181,11 @@ class Search(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """How acceptance was lost.
+    """The loss of acceptance.
 
     Attributes:
-        time_ns: of the sample after which the specification could not be satisfied any more.
-        text: what it had that the specification forbids; empty if too little was known to say.
+        time_ns: time of the sample from which on the specification cannot be satisfied any more.
+        text: forbidden condition that held in this sample; empty if unknown propositions leave it open.
     """
 
     time_ns: int
@@ -197,17 +197,17 @@ class Step(Displayed):
     """A decision.
 
     Attributes:
-        number: counts the decisions of a run from 0.
-        time_ns: of the sample that it was made on.
-        kind: what to do.
-        states: where the automaton can be; more than one if propositions are unknown.
-        considered: the edges considered, in order; the last one is the aim unless it was pruned.
-        target: what to move where, if anything.
-        pruned: all edges pruned so far, each with its reason.
-        reason: the decision as a sentence.
-        ahead: the states that a wait expects from time alone; empty if it waits for something else.
-        lost: when and by what acceptance was lost; None while the specification can be satisfied.
-        search: how much was searched.
+        number: number of the decision in its run, from 0.
+        time_ns: time of the newest sample.
+        kind: kind of the step.
+        states: possible states of the automaton; more than one if propositions are unknown.
+        considered: considered edges, in order; the last one is the aim unless it was pruned.
+        target: object to move and its target pose; None without a motion.
+        pruned: all pruned edges with their reasons.
+        reason: sentence on the decision.
+        ahead: states that a wait expects from time alone; empty if it waits for something else.
+        lost: time and cause of the loss of acceptance; None while the specification can be satisfied.
+        search: search effort.
     """
 
     number: int
@@ -224,14 +224,14 @@ class Step(Displayed):
 
     @property
     def aim(self) -> Consideration | None:
-        """The edge that the step is for, if any."""
+        """The edge that the step works towards; None without one."""
         return self.considered[-1] if self.considered and not self.considered[-1].pruned else None
 
     def alternatives(self, count: int) -> tuple[Target, ...]:
-        """Return the best places besides the target, the most robust first.
+        """Return the best other places, the most robust first.
 
-        They are middles of free cells for any object of the aim, at least two cells from the target and from
-        each other. Whether a way leads there, and what follows, is not checked.
+        They are centres of free cells for any candidate of the aim, at least two cells from the target and
+        from each other. Paths to them and later motions are not checked.
         """
         targets = []
         for candidate in self.candidates:
@@ -255,28 +255,28 @@ class Step(Displayed):
 
     @property
     def progress(self) -> Guards:
-        """Progress set: propositions that have to hold next; empty without an aim."""
+        """Progress set: guards of which one must hold next; empty without an aim."""
         return self.aim.progress if self.aim is not None else Guards((), ())
 
     @property
     def constraints(self) -> Guards:
-        """Constraint set: propositions that must not hold on the way; empty without an aim."""
+        """Constraint set: guards that must not hold on the way; empty without an aim."""
         return self.aim.constraints if self.aim is not None else Guards((), ())
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """The objects considered for the aim."""
+        """The considered objects of the aim."""
         return self.aim.candidates if self.aim is not None else ()
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How the execution of a step ended, according to the controller.
+    """The result of the execution of a step, according to the controller.
 
     Attributes:
-        succeeded: whether the controller takes the object to be at its target.
-        reason: what happened, as a sentence.
-        at: the stage at which it failed; None if it is not known.
+        succeeded: whether the object is at its target, according to the controller.
+        reason: sentence on the result.
+        at: stage at which the motion failed; None if it is unknown.
     """
 
     succeeded: bool
@@ -287,7 +287,7 @@ class Outcome:
         """Check the stage.
 
         Raises:
-            UsageError: another stage.
+            UsageError: `at` is no stage.
         """
         if self.at is not None and self.at not in get_args(Stage):
             raise UsageError(f'a motion fails at {self.at!r}; give at="pick", "way" or "place", or None')
@@ -296,7 +296,7 @@ class Outcome:
 def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
     """Return the outcome of a wait that ended with the automaton in these states."""
     if not step.ahead:
-        # only a wait for others is for an edge
+        # only a wait for moving objects has an aim
         reason = "enough is seen" if step.aim is None else "nothing is in the way any more"
         return Outcome(succeeded=True, reason=reason)
     if states == step.ahead[-1:]:
@@ -305,7 +305,7 @@ def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
 
 
 def sentence_of(step: Step) -> str:
-    """Return the reason of a step, with when and by what acceptance was lost."""
+    """Return the reason of a step, with the time and cause of a loss of acceptance."""
     if step.lost is None:
         return step.reason
     why = f", when this held: {step.lost.text}" if step.lost.text else ""
@@ -318,6 +318,7 @@ class Executor(Protocol):
     def execute(self, step: Step) -> Outcome:
         """Move `step.target.name` to its target, along the waypoints if the path matters to the robot.
 
-        Return once the robot is at rest. The planner observes samples during the motion, or after it. If its
-        `stop_reason` is not empty after one, stop, and return that as the reason of a failure.
+        Return when the robot is at rest. The planner must observe samples during the motion or after it. If
+        the planner's `stop_reason` is not empty after a sample, stop the motion and return a failure with
+        this reason.
         """

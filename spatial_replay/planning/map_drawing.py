@@ -1,4 +1,4 @@
-"""A planner's map and path as a scene: contour at the margin, axes, colour bar, target and path."""
+"""Scenes of a planner's map and path: contour at the margin, axes, colour bar, target and path."""
 
 from __future__ import annotations
 
@@ -24,28 +24,29 @@ from spatial_replay.text import number_text
 _MAP, _PATH, _TRAVELLED = "plan/map", "plan/way", "plan/travelled"
 
 DEPTH: Final = 0.1
-"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
+"""Depth of a map below the plane, cells; at depth 0 the map would hide regions in the plane."""
 _FRAME_DEPTH: Final = 0.5 * DEPTH
-"""Depth of lines on a map, in cells."""
+"""Depth of lines on a map, cells."""
 
 _PIXELS: Final = 3.0
 _CASING_PIXELS: Final = 6.0
 _THIN_PIXELS: Final = 1.5
-"""Widths of lines on the screen."""
+"""Line widths on the screen, pixels: path, white line below the path, axes and contour."""
 
 _INK: Final = (0.1, 0.1, 0.1)
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 _FONT, _TICK, _GAP, _BAR = 0.028, 0.012, 0.03, 0.04
-"""Height of texts, lengths of ticks, distance of the colour bar and its width, by the size of a map."""
+"""Text height, tick length, and distance and width of the colour bar, as shares of the map's size."""
 
 _SHADES: Final = 17
-"""Steps of the colour bar."""
+"""Number of colours on the colour bar."""
 _MOST_TICKS: Final = 6
+"""Maximum number of ticks on an axis."""
 
 
 class MapFrame(NamedTuple):
-    """The lines, texts and faces that a viewer draws with a map, and their height in footprint units."""
+    """Lines, texts and faces around a map, and their height, footprint units."""
 
     entity: SceneEntity
     height: float
@@ -56,7 +57,7 @@ def map_frame(gradient: GradientMap, turn: int, margin: float) -> MapFrame:
 
     Args:
         turn: index of the map's orientation.
-        margin: the robustness that a target needs.
+        margin: required robustness of a target.
     """
     grid, values = gradient.grid, gradient.values[turn]
     low = grid.xmin, grid.ymin
@@ -77,9 +78,9 @@ def map_frame(gradient: GradientMap, turn: int, margin: float) -> MapFrame:
 def map_drawing(
     frame: MapFrame | None, target: Target | None, tracked: TrackedObject | None, time_ns: int
 ) -> SceneUpdate:
-    """Return what a viewer draws with the newest map, if there is any, as a complete message.
+    """Return the message that draws the newest map, or an empty message without a map.
 
-    A white line below the path and the outline at the target makes these visible on blue cells.
+    White lines below the path and below the outline at the target make both visible on blue cells.
     """
     message = SceneUpdate()
     if frame is not None:
@@ -92,14 +93,14 @@ def map_drawing(
 
 
 def _contour(values: Floats, margin: float) -> Floats:
-    """Return the edges between cells that reach a margin and free ones that do not, (2 N, 2) in cells."""
+    """Return the borders (2 N, 2), cells, between free cells that reach a margin and other free cells."""
     across = _run_ends(values[:-1], values[1:], margin) + np.array([1.0, 0.0])
     along = _run_ends(values[:, :-1].T, values[:, 1:].T, margin) + np.array([1.0, 0.0])
     return np.concatenate([across[:, ::-1], along])
 
 
 def _run_ends(before: Floats, after: Floats, margin: float) -> Floats:
-    """Return (2 N, 2): row and ends of each run of cells of which one of two rows reaches the margin."""
+    """Return the row and ends (2 N, 2) of each run of columns where one of two rows reaches the margin."""
     parted: Booleans = np.isfinite(before) & np.isfinite(after) & ((before >= margin) != (after >= margin))
     changes = np.diff(np.pad(parted, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     return np.argwhere(changes).astype(np.float64)
@@ -108,7 +109,7 @@ def _run_ends(before: Floats, after: Floats, margin: float) -> Floats:
 def _add_axes(
     entity: SceneEntity, low: tuple[float, float], high: tuple[float, float], height: float
 ) -> None:
-    """Add a frame, with ticks and their coordinates below and on the left."""
+    """Add a frame with ticks and coordinates below and on the left."""
     size = max(high[0] - low[0], high[1] - low[1])
     corners = [low, (high[0], low[1]), high, (low[0], high[1])]
     entity.lines.append(_line(corners, height, NEUTRAL, LinePrimitive.LINE_LOOP, pixels=_THIN_PIXELS))
@@ -161,7 +162,7 @@ def _add_scale(
 
 
 def _half_width(text: str) -> float:
-    """Return half the width of a number, by the size of a map; digits are half as wide as high."""
+    """Return half the width of a number as a share of the map's size; a digit is half as wide as high."""
     return 0.25 * _FONT * (len(text) + 1)
 
 
@@ -177,7 +178,7 @@ def _round_numbers(low: float, high: float) -> Iterator[float]:
 def _add_text(
     entity: SceneEntity, text: str, place: tuple[float, float], height: float, font_size: float
 ) -> None:
-    """Add a text that is as large as the map is, however far away a viewer looks from."""
+    """Add a text that scales with the map, at any distance of the viewer's camera."""
     label = entity.texts.add(billboard=True, font_size=font_size, text=text)
     label.pose.position.x, label.pose.position.y, label.pose.position.z = *place, height
     label.pose.orientation.w = 1.0
@@ -190,9 +191,9 @@ def path_message(
     time_ns: int,
     travelled: Sequence[tuple[float, float]] = (),
 ) -> SceneUpdate:
-    """Return the path to a target, the object's outline there and the path travelled, as a message.
+    """Return the message with the planned path, the object's outline at the target, and the travelled path.
 
-    Without a target, the message deletes what was drawn before.
+    Without a target, the message deletes the earlier drawing.
     """
     lines: dict[str, list[LinePrimitive]] = {_PATH: [], _TRAVELLED: []}
     if target is not None and tracked is not None:
@@ -218,7 +219,7 @@ def _path_lines(
     colour: tuple[float, float, float],
     pixels: float = _PIXELS,
 ) -> list[LinePrimitive]:
-    """Return the path to a target, then the object's outlines there."""
+    """Return the path to a target, and the object's outlines at the target."""
     at_target = moved_object(tracked, target.x, target.y, target.turn)
     rings = [ring.tolist() for ring in outlines_of(at_target.footprint)]
     outlines = [_line(ring, height, colour, LinePrimitive.LINE_LOOP, pixels=pixels) for ring in rings]

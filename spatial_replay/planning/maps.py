@@ -1,8 +1,8 @@
 """Gradient maps (Def. 19): robustness of guards with one object at every cell of a grid.
 
-The positions of the grid become the samples of traces in which only that object moves. So the kernels that
-evaluate a log evaluate a map, and a cell has the number that a sample of a log would have. Layers say which
-conjunct limits a cell, and what blocks it.
+The positions of the grid become the samples of traces in which only that object moves. A map is evaluated by
+the kernels that evaluate a log, so a cell and an equal sample of a log have the same robustness. Layers name
+the conjunct that limits a cell, and the cause that blocks it.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from spatial_replay.spec.walks import (
 from spatial_replay.trace.trace import Sample, Trace
 
 Cube: TypeAlias = tuple[tuple[int, bool], ...]
-"""A conjunction of literals: number of a proposition, and whether it has to hold. The empty one is true."""
+"""A conjunction of literals (number of a proposition, whether it must hold); the empty cube is true."""
 
 Cubes: TypeAlias = tuple[Cube, ...]
-"""A disjunction of cubes. The empty one is false."""
+"""A disjunction of cubes; without cubes it is false."""
 
 FREE: Final = 0
 CONSTRAINED: Final = 1
@@ -61,10 +61,10 @@ OCCUPIED: Final = 2
 OUT_OF_REACH: Final = 3
 UNKNOWN: Final = 4
 REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
-"""Why a cell is blocked, by its number in `GradientMap.blocked`."""
+"""Reason why a cell is blocked, by its number in `GradientMap.blocked`."""
 
 _AT_ONCE: Final = 1 << 20
-"""So many values are measured at once: what that takes is about 60 MB."""
+"""Number of values that are measured at once, which takes about 60 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +72,13 @@ class GradientMap(Displayed):
     """The robustness of a progress set with an object at each cell of a grid (Def. 19).
 
     Attributes:
-        name: of the object.
-        grid: the cells; larger than the workspace's if an object to be pushed lies outside.
-        robustness: (A, rows, columns), in the unit of the relations; also at blocked cells.
-        blocked: (A, rows, columns) uint8, `FREE` or why the object must not be there (see `REASONS`).
+        name: name of the object.
+        grid: cells; more than the workspace's if a pushed object starts outside.
+        robustness: (A, rows, columns), in the unit of the relations, also at blocked cells.
+        blocked: (A, rows, columns) uint8, `FREE` or the reason why the cell is blocked (see `REASONS`).
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
-        turns: (A,) angles in radians by which the object is turned.
-        made_of: what it was computed from, for `map_layers`.
+        turns: (A,), angles by which the object is turned, radians.
+        made_of: inputs of the map, for `map_layers`.
     """
 
     name: str
@@ -91,21 +91,21 @@ class GradientMap(Displayed):
 
     @property
     def values(self) -> Floats:
-        """(A, rows, columns): the robustness, NaN at blocked cells."""
+        """(A, rows, columns), the robustness, NaN at blocked cells."""
         return np.where(self.blocked == FREE, self.robustness, np.nan)
 
     def best(self) -> float:
-        """Return the greatest robustness at a free cell; -inf without one."""
+        """Return the greatest robustness at a free cell; -inf without free cells."""
         free = self.blocked == FREE
         return float(self.robustness[free].max()) if free.any() else -np.inf
 
     def best_poses(
         self, count: int, avoided: Sequence[tuple[float, float]] = ()
     ) -> list[tuple[float, float, float, float]]:
-        """Return the best free cells (x, y, turn, robustness), at least two cells from each other.
+        """Return the best poses in free cells (x, y, turn, robustness), at least two cells from each other.
 
         Args:
-            avoided: places (x, y) that they are to be as far from.
+            avoided: places (x, y) from which the poses are also at least two cells away.
         """
         order = np.argsort(
             -np.where(self.blocked == FREE, self.robustness, -np.inf), axis=None, kind="stable"
@@ -122,7 +122,7 @@ class GradientMap(Displayed):
         return poses
 
     def cell_of(self, x: float, y: float, turn: float) -> tuple[int, int, int]:
-        """Return the turn, row and column of a pose."""
+        """Return the indices of turn, row and column of a pose."""
         return (int(np.argmin(np.abs(self.turns - turn))), *self.grid.cell(x, y))
 
     def __repr__(self) -> str:
@@ -138,21 +138,20 @@ def gradient_map(
     margin: float = 0.0,
     after: PropositionMaps | None = None,
 ) -> GradientMap:
-    """Return the map of a progress set, blocked where the constraint set would hold.
+    """Return the map of a progress set, with cells blocked at which the constraint set would hold.
 
     Args:
-        progress: one of these cubes has to hold.
-        constraints: the robustness of each of these has to be less than -`margin`; unknown values count as
-            holding.
-        margin: in the unit of the relations, at least 0.
-        after: the maps when other objects have been moved, too, for the robustness; cells are blocked as now.
+        progress: cubes of which one must hold.
+        constraints: cubes whose robustness must be less than -`margin`; an unknown value counts as holding.
+        margin: margin of the constraints, in the unit of the relations, at least 0.
+        after: maps after motions of other objects, for the robustness; blocked cells follow from `maps`.
     """
     shape = maps.clearance.shape
     then = maps if after is None else after
     robustness = _greatest(then.lower, then.upper, progress, shape)
     danger = danger_of(maps, constraints)
     blocked = np.zeros(shape, np.uint8)
-    # later assignments win: a cell is reported as constrained even if it is also occupied or out of reach
+    # later assignments take precedence: a constrained cell is reported as such, even if it is also occupied
     blocked[robustness == -np.inf] = UNKNOWN
     blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
@@ -162,7 +161,7 @@ def gradient_map(
 
 
 def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
-    """Return (A, rows, columns): the greatest robustness that a constraint may have in each cell."""
+    """Return the greatest robustness that a constraint may have in each cell, (A, rows, columns)."""
     return _greatest(maps.upper, maps.lower, constraints, maps.clearance.shape)
 
 
@@ -176,7 +175,7 @@ def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple
     """Return the robustness of a cube: the minimum over its literals.
 
     Args:
-        positive, negative: bounds of propositions, for those that have to hold, and that must not.
+        positive, negative: bounds of propositions: for literals that must hold, and that must not hold.
     """
     literal_values = (positive[number] if value else -negative[number] for number, value in cube)
     return reduce(np.minimum, literal_values, np.full(shape, np.inf))
@@ -187,14 +186,14 @@ class PropositionMaps:
     """The robustness of P propositions with one object at every cell of a grid, in A orientations.
 
     Attributes:
-        name: of the object.
-        grid: the cells.
+        name: name of the object.
+        grid: cells.
         lower, upper: (P, A, rows, columns), bounds of the robustness; -inf and +inf if it is unknown.
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
-        distances: (O, A, rows, columns), that to each of `obstacles`.
-        turns: (A,) angles in radians by which the object is turned.
-        obstacles: names of what may be in the way; the last one, "", stands for those of the workspace.
-        about: what was measured.
+        distances: (O, A, rows, columns), signed distance to each of `obstacles`.
+        turns: (A,), angles by which the object is turned, radians.
+        obstacles: names of objects; the last name, "", is for the obstacles of the workspace.
+        about: subject of the maps.
     """
 
     name: str
@@ -208,13 +207,13 @@ class PropositionMaps:
     about: MapSubject = field(repr=False)
 
     def room(self, others: Collection[str] | None) -> Floats:
-        """Return (A, rows, columns): the distance to the nearest of some objects; of all for None."""
+        """Return the distance to the nearest of some objects, (A, rows, columns); None for all objects."""
         mask = [others is None or name in others for name in self.obstacles]
         return np.asarray(self.distances[mask].min(axis=0, initial=np.inf))
 
 
 class MapSubject(NamedTuple):
-    """Subject of maps: propositions with their regions, and the sample whose object moves."""
+    """Subject of maps: propositions, regions, and the sample in which one object is moved."""
 
     propositions: tuple[Formula, ...]
     regions: Mapping[str, Outline]
@@ -222,7 +221,7 @@ class MapSubject(NamedTuple):
 
 
 class MapParts(NamedTuple):
-    """Inputs of a gradient map: maps of now and after other motions, progress, constraints."""
+    """Inputs of a gradient map: maps now, maps after motions of other objects, progress and constraints."""
 
     now: PropositionMaps
     then: PropositionMaps
@@ -241,7 +240,7 @@ def proposition_maps(
     """Return the robustness of propositions with the object `name` of a sample at every cell of a grid.
 
     Args:
-        grid: cells to use instead of the workspace's.
+        grid: grid to use instead of the workspace's grid.
 
     Raises:
         UsageError: the sample does not have the object, or a proposition looks at earlier samples.
@@ -275,7 +274,7 @@ def proposition_maps(
         pieces.append((places, values[:, : len(concerned)]))
     # propositions that do not depend on the object have the same value in every cell
     fixed = leaf_values(TraceScene(trace, regions), others, {})[:2, :, :, None]
-    # where all is known, as in most maps, both ends are one array
+    # if everything is known, as in most maps, one array has both bounds
     ends = max(len(fixed), *(len(values) for _, values in pieces))
     bounds: Floats = np.empty((ends, len(propositions), *shape))
     bounds[:, ~moves] = fixed
@@ -289,23 +288,23 @@ def proposition_maps(
 
 
 def _slices(count: int, values: int) -> Iterator[slice]:
-    """Yield slices of `count` places, which have `values` values in all, of a bounded size each."""
+    """Yield slices of `count` places with a total of `values` values, each of at most `_AT_ONCE` values."""
     size = max(1, count * _AT_ONCE // max(values, 1))
     yield from (slice(first, first + size) for first in range(0, count, size))
 
 
 def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: Sequence[str]) -> list[Atom]:
-    """Return atoms for the distance from the object to each other object in its way.
+    """Return atoms for the signed distance from the object to each obstacle.
 
-    A distance is at most 0 exactly if the object's centre lies in the Minkowski sum of the other object and
-    the mirrored one, the usual configuration-space obstacle.
+    The distance is at most 0 exactly if the object's centre is in the Minkowski sum of the obstacle and the
+    mirrored object, the usual configuration-space obstacle.
     """
     atoms_read = (
         part for proposition in propositions for part in iter_formulas(proposition) if isinstance(part, Atom)
     )
     measured = {part for atom in atoms_read for part in iter_expressions(atom.expression)}
     pairs = ((distance_between(name, obstacle), distance_between(obstacle, name)) for obstacle in obstacles)
-    # in the order of a proposition's own measurement, so that the kernel computes it only once
+    # operands in the order in which a proposition measures them, so that the kernel measures them only once
     return [swapped if swapped.expression in measured else atom for atom, swapped in pairs]
 
 
@@ -315,7 +314,7 @@ def distance_between(first: str, second: str) -> Atom:
 
 
 def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) -> Floats:
-    """Return (T,): the distance from an object to the nearest of obstacles; +inf without any."""
+    """Return the distance from an object to the nearest obstacle, (T,); +inf without obstacles."""
     if not obstacles:
         return np.full(len(trace), np.inf)
     batch = FootprintBatch.concatenate([trace.footprints, FootprintBatch.from_footprints(obstacles)])
@@ -327,7 +326,7 @@ def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) ->
 def _trace_over_poses(
     trace: Trace, tracked: TrackedObject, name: str, centres: Floats, turns: Floats
 ) -> Trace:
-    """Return a trace with the one sample of a trace for each turn and position, the object moved there."""
+    """Return a trace with a copy of the only sample for each turn and position of the object."""
     footprints = with_poses(trace.footprints, tracked, centres, turns)
     count, column = len(footprints) - len(trace.footprints), trace.names.index(name)
     object_rows = np.full(count, trace.rows[0, column])
@@ -363,15 +362,15 @@ def _is_about(term: Term, name: str) -> bool:
 
 
 def refuse_delays(propositions: Sequence[Formula]) -> None:
-    """Check that propositions depend on one sample each.
+    """Check that each proposition depends on one sample.
 
     Raises:
-        UsageError: one looks at earlier samples, which moving an object now does not change.
+        UsageError: a proposition depends on earlier samples, which a motion does not change.
     """
     for proposition in propositions:
         for part in iter_formulas(proposition):
             if is_about_having_rates(part):
-                # it asks whether a rate exists; the rate itself follows, and is refused
+                # this part only tests whether a rate exists; the rate itself is a later part, and is refused
                 continue
             terms = list(terms_of(part.expression)) if isinstance(part, Atom) else []
             terms += [part.group] if isinstance(part, Quantified) else []
@@ -383,10 +382,10 @@ def refuse_delays(propositions: Sequence[Formula]) -> None:
 
 
 def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:
-    """Check that objects are in a sample, or in a proposition, since these may appear later.
+    """Check that objects are in a sample or in a proposition, whose objects may appear later.
 
     Raises:
-        UsageError: with every name that is in neither.
+        UsageError: names every object that is in neither.
     """
     faults = []
     for name in names:
@@ -404,29 +403,29 @@ def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[
 # ----------------------------------------------------------------------------------------------------- layers
 
 AVOIDED_CELLS: Final = 2.0
-"""Distance in cells that a new target keeps from a place where an attempt failed."""
+"""Distance of a new target from a place where a motion failed, cells."""
 MOST_LAYERS: Final = 12
-"""Conjuncts that get a layer in a log, those that vary first; the others are named there."""
+"""Maximum number of conjuncts with a layer in a log, varying ones first; the log only names the others."""
 MOST_CAUSES: Final = 1000
-"""Causes that are listed; cells of any further ones name the last."""
+"""Maximum number of listed causes; cells with a further cause refer to the last listed one."""
 
 CauseKind: TypeAlias = Literal["constraint", "object", "obstacle", "reach", "unknown", "failed"]
-"""Reasons why a cell is blocked: a member of the constraint set would hold, an object or obstacle stands
-there, the robot cannot reach it, the progress set is unknown, or a motion to a nearby place failed."""
+"""Reason why a cell is blocked: a constraint would hold, an object or obstacle occupies the cell, the robot
+cannot reach it, the progress set is unknown, or a motion to a nearby place failed."""
 
 _KINDS: Final[tuple[CauseKind, ...]] = ("constraint", "object", "reach", "unknown", "failed")
 _KIND_OF: Final = {CONSTRAINED: 0, OCCUPIED: 1, OUT_OF_REACH: 2, UNKNOWN: 3}
 _FAILED: Final = 4
 _NUMBERS: Final = 1 << 24
-"""Numbers of a kind that a code has room for."""
+"""Size of the range of codes of each kind of cause."""
 
 
 class BlockedBy(NamedTuple):
-    """Reasons why cells are blocked.
+    """A cause that blocks cells.
 
     Attributes:
-        name: of the object, or what of the constraint set would hold; else empty.
-        cells: how many, over all orientations.
+        name: name of the object, or text of the constraint that would hold; else empty.
+        cells: number of blocked cells, over all orientations.
     """
 
     kind: CauseKind
@@ -436,15 +435,15 @@ class BlockedBy(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapLayers:
-    """A gradient map taken apart.
+    """The conjuncts of a gradient map, and the causes that block its cells.
 
     Attributes:
-        conjuncts: as text, the L relations that the progress set is made of, or their negations.
-        robustness: (L, A, rows, columns), of each conjunct; -inf where it is unknown.
-        limiting: (A, rows, columns), the conjunct whose robustness the progress set has, from 0; -1 where
-            there is none.
-        causes: what blocks cells, most cells first.
-        blocked_by: (A, rows, columns), the cause of each cell, from 0; -1 where the cell is free.
+        conjuncts: texts of the L relations in the progress set, or of their negations.
+        robustness: (L, A, rows, columns), robustness of each conjunct; -inf if it is unknown.
+        limiting: (A, rows, columns), index of the conjunct whose robustness equals the progress set's; -1
+            without one.
+        causes: causes that block cells, most cells first.
+        blocked_by: (A, rows, columns), index of each cell's cause; -1 for a free cell.
     """
 
     conjuncts: tuple[str, ...]
@@ -457,11 +456,11 @@ class MapLayers:
 def map_layers(
     gradient: GradientMap, settings: Settings, failed: Collection[tuple[float, float]] = ()
 ) -> MapLayers:
-    """Take a gradient map apart.
+    """Split a gradient map into the layers of its conjuncts and causes.
 
     Args:
-        settings: of the planner.
-        failed: places (x, y) where motions of the object failed, from which it stays away.
+        settings: settings of the planner.
+        failed: places (x, y) where motions of the object failed, which the object avoids.
     """
     parts, shape = gradient.made_of, gradient.blocked.shape
     formulas = parts.then.about.propositions
@@ -482,18 +481,18 @@ def map_layers(
 
 
 _Limit: TypeAlias = tuple[Floats, NDArray[np.int64]]
-"""Robustness in each cell, and the number of the relation that has it; -1 if there is none."""
+"""Robustness in each cell, and the index of the relation with this robustness; -1 without one."""
 
 
 class _Part(NamedTuple):
-    """A formula about one sample that has to hold, or must not."""
+    """A formula without temporal operators that must hold, or must not hold."""
 
     formula: Formula
     wanted: bool
 
     @classmethod
     def of(cls, formula: Formula, wanted: bool) -> _Part:
-        """Return a part without definitions and negations around it."""
+        """Return the part without outer definitions and negations."""
         formula = expand(formula)
         if isinstance(formula, Boolean) and formula.operator == "not":
             return cls.of(formula.operands[0], not wanted)
@@ -505,34 +504,34 @@ class _Part(NamedTuple):
 
     @property
     def brief(self) -> str:
-        """Its text, with the name of a named formula in place of what it stands for."""
+        """Its text; a named formula is replaced by its name."""
         name = self.formula.name
         return self.text if name is None else name if self.wanted else f"not {name}"
 
     @property
     def members(self) -> list[_Part]:
-        """The parts that it is made of; none of a relation."""
+        """The operands of a Boolean formula as parts; none for a relation."""
         operands = self.formula.operands if isinstance(self.formula, Boolean) else ()
         return [_Part.of(operand, self.wanted) for operand in operands]
 
     @property
     def is_every(self) -> bool:
-        """Whether all its members have to hold, not any one."""
+        """Whether all members must hold, instead of any one."""
         return not isinstance(self.formula, Boolean) or (self.formula.operator == "and") == self.wanted
 
     def leaves(self) -> Iterator[_Part]:
-        """Iterate over the relations that it is made of."""
+        """Iterate over all relations in the part."""
         members = self.members
         yield from chain.from_iterable(member.leaves() for member in members) if members else (self,)
 
     def options(self) -> Iterator[_Part]:
-        """Iterate over parts of which any one has to hold for this to hold."""
+        """Iterate over alternatives: the part holds if any one of them holds."""
         yield from (
             (self,) if self.is_every else chain.from_iterable(member.options() for member in self.members)
         )
 
     def limit(self, layers: Floats, places: Mapping[_Part, int]) -> _Limit:
-        """Return its robustness, and which of its relations has it, by layers of these."""
+        """Return the robustness of the part, and the index of the relation with this robustness."""
         shape = layers.shape[1:]
         if (place := places.get(self)) is not None:
             return layers[place], np.full(shape, place, np.int64)
@@ -541,7 +540,7 @@ class _Part(NamedTuple):
 
 
 def literal_text(formula: Formula, wanted: bool) -> str:
-    """Return a formula that has to hold, or its negation, as text."""
+    """Return the text of a formula that must hold, or of its negation."""
     text = format_formula(formula)
     return text if wanted else f"not ({text})"
 
@@ -559,7 +558,7 @@ def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floa
     about = maps.about
     tracked = about.sample.objects[maps.name]
     yaw = tracked.yaw or 0.0 if isinstance(tracked, TrackedObject) else 0.0
-    # with all objects as supports, obstacles are not measured a second time
+    # all objects are declared supports, so that the distances of obstacles are not measured again
     everything = frozenset(about.sample.objects)
     free = Workspace(maps.grid, yaws=tuple((maps.turns + yaw).tolist()), supports=everything)
     part_maps = proposition_maps(formulas, about.regions, about.sample, maps.name, free)
@@ -567,7 +566,7 @@ def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floa
 
 
 def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
-    """Return what blocks cells, and the number of its cause for each."""
+    """Return the causes that block cells, and the index of each cell's cause."""
     maps, blocked = gradient.made_of.now, gradient.blocked
     codes = np.full(blocked.shape, -1, np.int64)
     for reason, family in _KIND_OF.items():
@@ -597,9 +596,9 @@ def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, 
 
 
 def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, ...], NDArray[np.int64]]:
-    """Return what may hold of the constraint set, as text, and by number that with the greatest robustness.
+    """Return the texts of the constraints, and the index of the most robust constraint in each cell.
 
-    A guard of one proposition is split into those of its parts of which any one makes it hold.
+    A guard of one proposition is split into its alternatives.
     """
     formulas = parts.now.about.propositions
     guards: list[tuple[_Part, ...]] = []
@@ -622,12 +621,12 @@ def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, 
 
 
 def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:
-    """Return (rows, columns): whether each cell is near a place where an attempt failed."""
+    """Return whether each cell is near a place where a motion failed, (rows, columns)."""
     return distance_to(failed, grid) <= AVOIDED_CELLS * grid.cell_size
 
 
 def distance_to(places: Collection[tuple[float, float]], grid: Grid) -> Floats:
-    """Return (rows, columns): the distance from each cell to the nearest of some places."""
+    """Return the distance from each cell to the nearest of some places, (rows, columns)."""
     away = np.full(grid.shape, np.inf)
     centres = grid.centres()
     for place in places:
@@ -638,11 +637,11 @@ def distance_to(places: Collection[tuple[float, float]], grid: Grid) -> Floats:
 def avoided_cells(
     gradient: GradientMap, settings: Settings, failed: Collection[tuple[float, float]]
 ) -> Booleans:
-    """Return (rows, columns): the cells that a target avoids after failed motions."""
+    """Return whether a target avoids each cell after failed motions, (rows, columns)."""
     avoided = near(failed, gradient.grid)
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
     if holds.any() and not (holds & ~avoided).any():
-        # a motion may fail by chance: then places come again, those farther from the failures first
+        # a motion may fail by chance, so places are tried again, those far from the failures first
         away = distance_to(failed, gradient.grid)
         return np.asarray(away < away[holds.any(axis=0)].max() / 2.0)
     return avoided

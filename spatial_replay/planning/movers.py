@@ -1,6 +1,7 @@
-"""Objects that move by themselves: where everything is next, and how long a motion stays safe beside them.
+"""Prediction of objects that move by themselves, and of how long a motion near them stays safe.
 
-An object goes on as between its newest two samples. The one that the robot moves goes on along its way.
+An object is expected to repeat its motion between the newest two samples. The object that the robot moves is
+expected to continue along its path.
 """
 
 from __future__ import annotations
@@ -33,25 +34,27 @@ from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.trace import Sample, Trace
 
 AHEAD: Final = 90
-"""How many samples ahead the motion of other objects is expected to go on, at least."""
+"""Minimum number of predicted samples."""
 MOST_AHEAD: Final = 600
-"""How many samples ahead, at most, if a motion takes long."""
+"""Maximum number of predicted samples, for long motions."""
 _BEGINNINGS: Final = 15
-"""The samples between two beginnings of a motion that are looked at."""
+"""Interval between the tested start times of a motion, samples."""
 _MOST_BEGINNINGS: Final = 9
+"""Maximum number of tested start times of a motion."""
 _CORNER: Final = math.radians(2.0)
-"""The least change of direction at which a robot that pushes takes hold again."""
+"""Least change of direction at which a pushing robot takes hold again, radians."""
 _UNSURE: Final = 2
-"""By how many of its steps an object may be elsewhere than expected; it may have turned back."""
+"""Maximum deviation of an object from its prediction, in its motions per sample; it may have turned back."""
 _JITTER: Final = 1.0 / 30.0
-"""Motion of standing objects between two samples, in cells."""
+"""Motion between two samples up to which an object counts as standing, cells."""
 _DIRECTIONS: Final = 16
+"""Number of tested directions of a motion aside."""
 _LENGTHS: Final = (8, 15, 30)
-"""How far an object goes aside, in samples."""
+"""Tested durations of a motion aside, samples."""
 
 
 def motions_between(before: Sample, sample: Sample) -> dict[str, Pose]:
-    """Return by how much (x, y, turn) objects moved between two samples; those that stood are left out."""
+    """Return the motions (x, y, turn) of all objects that moved between two samples."""
     motions = {}
     for name, now in sample.objects.items():
         was = before.objects.get(name)
@@ -61,7 +64,7 @@ def motions_between(before: Sample, sample: Sample) -> dict[str, Pose]:
 
 
 def _motion(was: TrackedObject, now: TrackedObject) -> Pose:
-    """Return by how much an object moved, beyond the uncertainty of its position, and turned."""
+    """Return the motion (x, y, turn) of an object; x and y are 0 within the uncertainty of its position."""
     (u, v), (x, y) = centre_of(was.footprint), centre_of(now.footprint)
     turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau)
     if math.hypot(x - u, y - v) <= was.uncertainty + now.uncertainty:
@@ -70,7 +73,7 @@ def _motion(was: TrackedObject, now: TrackedObject) -> Pose:
 
 
 def next_sample(before: Sample, sample: Sample, target: Target, skill: Skill) -> Sample:
-    """Return the sample that is expected after two others while an object is moved to a target."""
+    """Return the expected next sample after two samples while an object is moved to a target."""
     motions = motions_between(before, sample)
     objects = {name: _advance(sample.objects[name], motion) for name, motion in motions.items()}
     if target.name in motions:
@@ -86,7 +89,7 @@ def _advance(tracked: TrackedObject, motion: Pose) -> TrackedObject:
 
 
 def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: Skill) -> TrackedObject:
-    """Return the object that is moved, one sample later, no farther than its target unless it strays."""
+    """Return the moved object one sample later, at most at its target unless it strays from its path."""
     turned = 0.0
     if target.turn and target.yaw is not None and tracked.yaw is not None:
         left = math.remainder(target.yaw - tracked.yaw, math.tau)
@@ -101,7 +104,7 @@ def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: 
         return moved_object(tracked, x + motion[0], y + motion[1], turned)
     if skill == "push" or len(target.waypoints) > 2:
         return moved_object(tracked, *_place_on_way(target.waypoints, (x, y), length), turned)
-    # where the way does not matter, only its end is known
+    # the robot chose the path, so only its end is known
     share = min(1.0, math.dist((x, y), target.waypoints[-1]) / length)
     return moved_object(tracked, x + share * motion[0], y + share * motion[1], turned)
 
@@ -109,7 +112,7 @@ def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: 
 def _place_on_way(
     waypoints: Sequence[tuple[float, float]], place: tuple[float, float], length: float
 ) -> tuple[float, float]:
-    """Return the place that is farther along a way by a length, as far beside it as a place is now."""
+    """Return a place advanced along a path by a length, with the same offset from the path."""
     passed, foot = _nearest_on_way(waypoints, place)
     x, y = _point_at(waypoints, passed + length)
     return x + place[0] - foot[0], y + place[1] - foot[1]
@@ -118,7 +121,7 @@ def _place_on_way(
 def _way_from(
     waypoints: Sequence[tuple[float, float]], tracked: TrackedObject
 ) -> tuple[tuple[float, float], ...]:
-    """Return the part of a way that an object has not passed yet, from where it is."""
+    """Return the rest of a path, from an object's current place."""
     place = centre_of(tracked.footprint)
     passed, _ = _nearest_on_way(waypoints, place)
     ahead, begin = [], 0.0
@@ -130,14 +133,14 @@ def _way_from(
 
 
 def _beside_way(waypoints: Sequence[tuple[float, float]], place: tuple[float, float]) -> float:
-    """Return how far a place is from a way."""
+    """Return the distance of a place from a path."""
     return math.dist(place, _nearest_on_way(waypoints, place)[1])
 
 
 def _nearest_on_way(
     waypoints: Sequence[tuple[float, float]], place: tuple[float, float]
 ) -> tuple[float, tuple[float, float]]:
-    """Return the point of a way that is nearest to a place, and how far it is from the way's beginning."""
+    """Return the point of a path nearest to a place, after its distance from the start along the path."""
     begin, nearest, at = 0.0, math.inf, (0.0, place)
     for (u, v), (x, y) in pairwise(waypoints):
         whole = math.dist((u, v), (x, y))
@@ -152,7 +155,7 @@ def _nearest_on_way(
 
 
 def _point_at(waypoints: Sequence[tuple[float, float]], length: float) -> tuple[float, float]:
-    """Return the point of a way that is a length from its beginning, or its end."""
+    """Return the point at a length along a path, or the end of a shorter path."""
     for (u, v), (x, y) in pairwise(waypoints):
         whole = math.dist((u, v), (x, y))
         if length <= whole and whole > 0.0:
@@ -162,12 +165,12 @@ def _point_at(waypoints: Sequence[tuple[float, float]], length: float) -> tuple[
 
 
 class Timing(NamedTuple):
-    """How a robot moves an object; times are numbers of samples.
+    """Speed and delays of a robot's motion; times are numbers of samples.
 
     Attributes:
-        step: the length by which the object is moved between two samples.
-        rest: the longest time until the object moves, or moves on.
-        approach: the longest time until an object moves once a motion has begun.
+        step: distance that the object moves between two samples.
+        rest: longest time until the object starts to move, or moves again.
+        approach: longest time from the beginning of a motion until its object moves.
     """
 
     step: float
@@ -177,10 +180,10 @@ class Timing(NamedTuple):
 
 @dataclass
 class MotionTimes:
-    """Times of a robot's motions so far, from which those of the next one are expected.
+    """Measured speeds and delays of a robot's motions, which predict the timing of the next motion.
 
     Attributes:
-        approach: the longest time for which an object stood before it was moved, or moved on, in samples.
+        approach: longest time for which an object stood before it moved, or moved again, samples.
     """
 
     approach: int = 0
@@ -194,7 +197,7 @@ class MotionTimes:
         self._newest, self._stood = 0.0, 0
 
     def observe(self, length: float, least: float) -> None:
-        """Take the length by which the object was moved between two samples; at most `least` is none."""
+        """Add the distance that the object moved between two samples; up to `least` it counts as standing."""
         if length <= least:
             self._newest = 0.0
             self._stood += 1
@@ -205,9 +208,9 @@ class MotionTimes:
         self._samples += 1
 
     def timing(self, cell_size: float) -> Timing:
-        """Return how the robot is expected to go on with a motion, or to begin one.
+        """Return the expected timing of the current motion, or of the next one.
 
-        Without an earlier motion, an object moves by a cell between two samples.
+        Without an earlier motion, the expected step is one cell.
         """
         mean = self._length / self._samples if self._samples else cell_size
         rest = 0 if self._newest else max(self.approach - self._stood, 0)
@@ -215,12 +218,12 @@ class MotionTimes:
 
 
 class Course(NamedTuple):
-    """Where an object is in some later samples.
+    """Predicted poses of an object.
 
     Attributes:
-        places: (N, 2).
-        turn: the angle by which the object turns between two samples.
-        uncertainty: (N,), of the places.
+        places: (N, 2), predicted places.
+        turn: turn of the object between two samples, radians.
+        uncertainty: (N,), uncertainty of the places.
     """
 
     places: Floats
@@ -229,11 +232,11 @@ class Course(NamedTuple):
 
 
 class Prospect(NamedTuple):
-    """After how many samples acceptance would be lost; infinite if it would not be.
+    """Number of samples until acceptance is lost; infinite if it is not lost.
 
     Attributes:
-        perhaps: if others may also stop, or turn back.
-        surely: if others go on as they do.
+        perhaps: number of samples if other objects may also stop or turn back.
+        surely: number of samples if other objects continue their motions.
     """
 
     perhaps: float
@@ -241,11 +244,11 @@ class Prospect(NamedTuple):
 
 
 class Evasion(NamedTuple):
-    """How an object keeps out of the way of others.
+    """The evasion of other objects by an object.
 
     Attributes:
-        aside: where it goes; None if it stays.
-        reason: why.
+        aside: target of a motion aside; None if the object stays.
+        reason: sentence on the reason.
     """
 
     aside: Target | None
@@ -253,7 +256,7 @@ class Evasion(NamedTuple):
 
 
 class Lookout:
-    """Keeps an object out of the way of others that move by themselves."""
+    """Chooses how an object evades other objects that move by themselves."""
 
     def __init__(
         self,
@@ -273,11 +276,11 @@ class Lookout:
         target: Target,
         timing: Timing,
     ) -> Evasion | None:
-        """Return how an object keeps out of the way of others; None if its motion to a target may go on.
+        """Return how an object evades other objects; None if its motion to a target may continue.
 
         Args:
-            motions: of all objects, for each sample.
-            timing: of the motion to the target.
+            motions: motions of all objects between two samples.
+            timing: timing of the motion to the target.
         """
         others = self._others(motions, target)
         if not others:
@@ -287,7 +290,7 @@ class Lookout:
         skill = self._settings.skill
         numbers = _numbers_ahead(way, timing, skill)
         about = sample, states, others, name, numbers
-        # the robot may begin soon or late
+        # the start of the motion is not known, so several start times are tested
         ways = [_places(way, timing, share, numbers, skill) for share in _beginnings(way, timing, skill)]
         *prospects, staying = self._prospects(*about, [*ways, np.tile(start, (len(numbers), 1))])
         going = Prospect(*map(min, zip(*prospects, strict=True)))
@@ -297,7 +300,7 @@ class Lookout:
         aside: Target | None = None
         if best.perhaps < math.inf:
             clear_ways = self._clear_ways(sample, name, _ways_aside(start, timing.step))
-            # another motion has to begin first
+            # a motion aside is a new motion, so it begins with the full approach
             afresh = timing._replace(rest=timing.approach)
             ways = [_places(clear_way, afresh, 1.0, numbers, skill) for clear_way in clear_ways]
             for aside_way, prospect in zip(clear_ways, self._prospects(*about, ways), strict=True):
@@ -316,12 +319,12 @@ class Lookout:
         aim: Consideration,
         timing: Timing,
     ) -> Target:
-        """Return the target of a push with fewer corners, if others that go on leave such a way free.
+        """Return the target of a push with fewer corners, if other objects move away from such a path.
 
         Args:
-            motions: of all objects, for each sample.
-            aim: the edge that the push takes.
-            timing: of the push.
+            motions: motions of all objects between two samples.
+            aim: edge of the push.
+            timing: timing of the push.
         """
         skill, others = self._settings.skill, self._others(motions, target)
         stops = _stops(target.waypoints, skill)
@@ -341,7 +344,7 @@ class Lookout:
         return replace(target, waypoints=(*direct.waypoints[:-1], (target.x, target.y)))
 
     def _others(self, motions: Mapping[str, Pose], target: Target) -> dict[str, Pose]:
-        """Return the motions of objects that move by themselves."""
+        """Return the motions of all other objects that do not stand."""
         least = least_motion(self._settings)
         return {
             name: motion
@@ -352,7 +355,7 @@ class Lookout:
     def _clear_ways(
         self, sample: Sample, name: str, ways: Sequence[Sequence[tuple[float, float]]]
     ) -> list[Sequence[tuple[float, float]]]:
-        """Return the ways on which nothing stands where an object would go."""
+        """Return the paths that are free for an object."""
         settings = self._settings
         movables = Movables(self._formulas, self._regions, sample, settings, Attempts())
         gradient = movables.gradient(name, ((),), ())
@@ -360,7 +363,7 @@ class Lookout:
         clear = []
         for way in ways:
             points = list(points_along(way, grid.cell_size))
-            # what is carried passes over others
+            # a carried object passes over others, so only the end of its path must be free
             points = points if settings.skill == "push" else points[-1:]
             if grid.contains(np.array(points)).all() and all(free[grid.cell(*point)] for point in points):
                 clear.append(way)
@@ -375,11 +378,11 @@ class Lookout:
         numbers: Sequence[int],
         ways: Sequence[Floats],
     ) -> list[Prospect]:
-        """Return the prospects of moving an object along some ways (N, 2), its places in samples ahead.
+        """Return the prospect of each path (N, 2), which has the places of an object in predicted samples.
 
         Args:
-            motions: of the other objects, for each sample.
-            numbers: of the samples ahead.
+            motions: motions of the other objects between two samples.
+            numbers: numbers of the predicted samples, counted from now.
         """
         if not ways:
             return []
@@ -388,6 +391,7 @@ class Lookout:
         courses[name] = Course(np.concatenate(ways))
         trace = _trace_ahead(replace(sample, objects=certain, reported_ns={}), courses, numbers)
         leaves = leaf_values(TraceScene(trace, self._regions), self._formulas, {})
+        # the first two rows are bounds without uncertainty, the last two with it
         surely, perhaps = (leaves[0], leaves[min(1, len(leaves) - 1)]), (leaves[-2 % len(leaves)], leaves[-1])
         count = len(numbers)
         return [
@@ -401,7 +405,7 @@ class Lookout:
         ]
 
     def _until_loss(self, states: frozenset[int], bounds: Sequence[Floats], numbers: Sequence[int]) -> float:
-        """Return after how many samples acceptance may be lost, by bounds (P, N) of the propositions."""
+        """Return the number of samples until acceptance may be lost, by bounds (P, N) of the propositions."""
         can_accept = self._automaton.can_accept
         is_sure = states <= can_accept
         passed = 0
@@ -409,7 +413,7 @@ class Lookout:
         for number, (lower, upper) in zip(numbers, rows, strict=True):
             values = zip(lower, upper, strict=True)
             symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
-            # samples in between are taken to be the same
+            # the samples since the previous predicted one are assumed equal to this one
             for _ in range(number - passed):
                 before, states = states, self._automaton.step_set(states, symbol)
                 if states == before:
@@ -421,12 +425,12 @@ class Lookout:
 
 
 def least_motion(settings: Settings) -> float:
-    """Return the length of a motion between two samples that standing objects do not make by jittering."""
+    """Return the distance between two samples up to which an object counts as standing."""
     return settings.workspace.grid.cell_size * _JITTER
 
 
 def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> tuple[int, ...]:
-    """Return the samples ahead that are looked at, until a motion has ended: the later, the fewer."""
+    """Return the numbers of the predicted samples until a motion has ended; later ones are sparser."""
     length = sum(math.dist(begin, end) for begin, end in pairwise(way))
     ended = timing.rest + len(_stops(way, skill)) * timing.approach + length / timing.step
     last = math.ceil(min(max(ended, AHEAD), MOST_AHEAD))
@@ -434,14 +438,14 @@ def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Sk
 
 
 def _beginnings(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> list[float]:
-    """Return shares of the longest times of rest that are looked at."""
+    """Return the tested start times of a motion, as shares of its longest rests."""
     longest = max(timing.rest, timing.approach if _stops(way, skill) else 0)
     count = min(1 + math.ceil(longest / _BEGINNINGS), _MOST_BEGINNINGS)
     return np.linspace(0.0, 1.0, count).tolist() if longest else [0.0]
 
 
 def _stops(way: Sequence[tuple[float, float]], skill: Skill) -> list[int]:
-    """Return the numbers of the points of a way at which a robot takes hold again: corners of a push."""
+    """Return the indices of the points of a path at which a robot takes hold again: corners of a push."""
     if skill != "push":
         return []
     angles = [math.atan2(y - v, x - u) for (u, v), (x, y) in pairwise(way)]
@@ -452,7 +456,7 @@ def _stops(way: Sequence[tuple[float, float]], skill: Skill) -> list[int]:
 def _places(
     way: Sequence[tuple[float, float]], timing: Timing, share: float, numbers: Sequence[int], skill: Skill
 ) -> Floats:
-    """Return (N, 2): where an object on a way is in samples ahead, with a share of the longest rests."""
+    """Return the places (N, 2) of an object on a path in predicted samples, for a share of its rests."""
     points = np.array(way)
     lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     rests = np.zeros(len(way))
@@ -466,16 +470,16 @@ def _places(
 
 
 def _course_ahead(tracked: TrackedObject, motion: Pose, numbers: Sequence[int]) -> Course:
-    """Return where an object that moves by itself is in samples ahead."""
+    """Return the predicted course of an object that moves by itself."""
     steps, length = np.array(numbers, np.float64), math.hypot(*motion[:2])
     places = np.array(centre_of(tracked.footprint)) + steps[:, None] * np.array(motion[:2])
     return Course(places, motion[2], np.minimum(steps, _UNSURE) * length)
 
 
 def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequence[int]) -> Trace:
-    """Return a trace whose samples repeat a sample but for objects on courses.
+    """Return a trace that repeats a sample, with some objects moved along courses.
 
-    The longest course is as long as the trace. A shorter one, over `numbers`, comes again and again.
+    The trace is as long as the longest course. A shorter course, over `numbers`, is repeated.
     """
     now = Trace.from_samples([sample])
     count = max(len(course.places) for course in courses.values())
@@ -509,12 +513,12 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequenc
 
 
 def _ways_aside(start: tuple[float, float], pace: float) -> list[tuple[tuple[float, float], ...]]:
-    """Return straight ways from a place in all directions, short ones first."""
+    """Return straight paths from a place in all directions, short paths first."""
     angles = [math.tau * number / _DIRECTIONS for number in range(_DIRECTIONS)]
     return [
         (
             start,
-            # two waypoints would mean that the way does not matter
+            # a path of only two waypoints would leave the path to the robot
             (start[0] + length / 2.0 * math.cos(angle), start[1] + length / 2.0 * math.sin(angle)),
             (start[0] + length * math.cos(angle), start[1] + length * math.sin(angle)),
         )

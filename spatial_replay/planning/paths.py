@@ -1,8 +1,8 @@
 """Shortest paths over the free cells of a grid, by jump-point search (Harabor and Grastien, 2011).
 
-A step goes to one of the eight neighbours, a diagonal one only if both cells beside it are free too, so that
-no corner is cut. Among paths that differ only in the order of their steps, the search follows the one that
-goes diagonally first. It stops only at cells where a path may have to turn, and at goals.
+A step goes to one of the eight neighbours. A diagonal step needs both adjacent cells free, so that no corner
+is cut. Among paths with the same steps in another order, the search follows only the path with its diagonal
+steps first. It expands only goals and cells where a path may have to turn.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Path:
     """A path over cells.
 
     Attributes:
-        cells: (K, 2) rows and columns of its start, turns and end; between them it follows a row, a column or
-            a diagonal.
-        length: in cells.
+        cells: (K, 2), rows and columns of the start, the turns and the end. Between them the path follows a
+            row, a column or a diagonal.
+        length: length, cells.
     """
 
     cells: Integers
@@ -35,12 +35,12 @@ class Path:
 
 
 def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Path | None:
-    """Return the shortest path from a cell to any goal over free cells, if there is one.
+    """Return the shortest path over free cells from a cell to any goal; None if there is no path.
 
     Args:
-        free: (R, C), whether the path may cross a cell; the start need not be free.
+        free: (R, C), whether a path may cross each cell; the start need not be free.
         start: row and column.
-        goals: (R, C), whether it may end in a cell, if that is free.
+        goals: (R, C), whether a path may end in each cell, if the cell is free.
     """
     row, column = start
     is_free = free.copy()
@@ -61,13 +61,14 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
 
 
 def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
-    """Return the cells (rows, columns) to which a path leads from a free cell over free ones."""
+    """Return the cells (rows, columns) that paths over free cells reach from a free cell."""
     reached = np.zeros(free.shape, np.bool_)
     reached[cell] = True
     while True:
         count = np.count_nonzero(reached)
+        # four directions suffice, because a diagonal step needs both adjacent cells free
         for turns in range(4):
-            # free cells that follow one that is found, with no other cell between
+            # free cells behind a reached cell, without a blocked cell in between
             open_cells, view = np.rot90(free, turns), np.rot90(reached, turns)
             place = np.arange(len(view))[:, None]
             last_reached = np.maximum.accumulate(np.where(view, place, -1))
@@ -85,12 +86,12 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
     """Return the shortest path from a cell to any goal.
 
     Args:
-        free: (R, C), 1 for cells that a path may cross; the border has to be 0.
-        goals: (R, C), 1 for cells where it may end; they have to be free.
-        box: (4,): first and last row, first and last column with a goal.
+        free: (R, C), 1 for cells that a path may cross; the border must be 0.
+        goals: (R, C), 1 for cells where a path may end; these cells must be free.
+        box: (4,), first and last row with a goal, first and last column with a goal.
 
     Returns:
-        (K, 2), the start, the cells where the path turns, and the goal; (0, 2) if there is no path.
+        (K, 2), the start, the turns and the goal; (0, 2) if there is no path.
     """
     rows, columns = free.shape
     straight = np.full(rows * columns, -1, np.int64)
@@ -132,7 +133,7 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
             cell = (row + steps * down) * columns + column + steps * right
             new_straight = straight[current] + (0 if is_diagonal else steps)
             new_diagonal = diagonal[current] + (steps if is_diagonal else 0)
-            # sums of step counts, unlike sums of lengths, make equal paths equal to the last bit
+            # computed from step counts, so that equally long paths have bitwise equal lengths
             length = new_straight + ROOT_2 * new_diagonal
             if straight[cell] >= 0 and straight[cell] + ROOT_2 * diagonal[cell] <= length:
                 continue
@@ -145,7 +146,7 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
 
 @piece
 def _at_least(row: int, column: int, box: Integers) -> float:
-    """Return a lower bound of the distance to the goals: the one to their bounding box without obstacles."""
+    """Return a lower bound of the distance to the goals: the distance to their box without obstacles."""
     rows = max(box[0] - row, row - box[1], 0)
     columns = max(box[2] - column, column - box[3], 0)
     return float(abs(rows - columns) + ROOT_2 * min(rows, columns))
@@ -153,7 +154,7 @@ def _at_least(row: int, column: int, box: Integers) -> float:
 
 @piece
 def _directions(free: Flags, row: int, column: int, down: int, right: int, ways: Integers) -> int:
-    """Write the directions in which a path may go on from a cell reached in a direction; return how many."""
+    """Write the possible next directions after a step into `ways`, and return their number."""
     if down != 0 and right != 0:
         ways[0, 0], ways[0, 1] = down, 0
         ways[1, 0], ways[1, 1] = 0, right
@@ -173,7 +174,7 @@ def _directions(free: Flags, row: int, column: int, down: int, right: int, ways:
 
 @piece
 def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
-    """Return the steps along a diagonal to the next cell where a path may turn or end; 0 for none."""
+    """Return the number of diagonal steps to the next cell where a path may turn or end; 0 for none."""
     steps = 0
     while True:
         if not (free[row + down, column] and free[row, column + right] and free[row + down, column + right]):
@@ -191,7 +192,7 @@ def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, 
 
 @piece
 def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
-    """Return the steps along a row or column to the next cell where a path may turn or end; 0 for none."""
+    """Return the number of straight steps to the next cell where a path may turn or end; 0 for none."""
     steps = 0
     while True:
         row += down
@@ -203,7 +204,7 @@ def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, 
             return steps
         for side in (-1, 1):
             beside_row, beside_column = row + side * right, column + side * down
-            # the cell beside is free and the one before it is not: no shorter way leads there
+            # the side cell is free, but the cell before it is blocked: its shortest path turns here
             if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
                 return steps
 
@@ -216,7 +217,7 @@ def _sign(value: int) -> int:
 
 @piece
 def _turns(parent: Integers, last: np.int64, columns: int) -> Integers:
-    """Return (K, 2): the cells from the start to the last one."""
+    """Return the cells (K, 2) from the start to `last`, by their parents."""
     count = 1
     at = last
     while parent[at] >= 0:

@@ -1,7 +1,7 @@
-"""Settings of a planner and its workspace: their text in a log, and the files and options of users.
+"""Settings of a planner and its workspace: their text in a log, settings files and options.
 
 The workspace is a grid of positions, orientations, reach and obstacles. Checks collect the faults of all
-values, so that these are reported together.
+values, so that one error reports all of them.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from spatial_replay.trace.trace import Sample
 # ---------------------------------------------------------------------------------------------- the workspace
 
 MOST_CELLS = 1_000_000
-"""The most cells of a grid, over all orientations. Their maps take a gigabyte; more is a typing error."""
+"""Maximum number of cells over all orientations, whose maps take 1 GB; more cells are a typing error."""
 
 CELLS_AROUND = 80
-"""Cells along the longer side of a default workspace."""
+"""Number of cells along the longer side of a default workspace."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A grid of square cells in the plane; a map has a value for the middle of each cell.
+    """A grid of square cells in the plane; a map has a value for the centre of each cell.
 
     Attributes:
-        xmin, ymin: the corner of the first cell, in footprint units.
-        cell_size: side of a cell, in footprint units.
-        columns, rows: number of cells along x and along y.
+        xmin, ymin: corner of the first cell, footprint units.
+        cell_size: side of a cell, footprint units.
+        columns, rows: numbers of cells along x and along y.
 
     Raises:
         UsageError: invalid numbers, or more than `MOST_CELLS` cells.
@@ -77,7 +77,7 @@ class Grid:
             raise UsageError(f"{box} is empty; give xmin, ymin, xmax, ymax")
         if not (is_number(cell_size) and cell_size > 0.0):
             raise UsageError(f"cell_size is {cell_size!r}; give a number above 0")
-        # rounding must not add a cell to a box that is a whole number of cells long
+        # the tolerance keeps rounding from adding a cell to a box of a whole number of cells
         columns, rows = (math.ceil(length / cell_size - 1e-9) for length in (xmax - xmin, ymax - ymin))
         return cls(xmin, ymin, cell_size, columns, rows)
 
@@ -87,7 +87,7 @@ class Grid:
         return self.rows, self.columns
 
     def centres(self) -> Floats:
-        """Return (rows * columns, 2): the middle of each cell, row by row."""
+        """Return the centre of each cell, (rows * columns, 2), row by row."""
         x = self.xmin + (np.arange(self.columns) + 0.5) * self.cell_size
         y = self.ymin + (np.arange(self.rows) + 0.5) * self.cell_size
         centres = np.empty((*self.shape, 2))
@@ -95,19 +95,19 @@ class Grid:
         return centres.reshape(-1, 2)
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
-        """Return the middle (x, y) of a cell."""
+        """Return the centre (x, y) of a cell."""
         x = self.xmin + (column + 0.5) * self.cell_size
         return x, self.ymin + (row + 0.5) * self.cell_size
 
     def contains(self, points: Floats) -> Booleans:
-        """Return whether each of the points (…, 2) lies in a cell, as (…)."""
+        """Return whether each point (…, 2) is in a cell, (…)."""
         cells = (points - np.array([self.xmin, self.ymin])) / self.cell_size
         return np.asarray(((cells >= 0.0) & (cells < np.array([self.columns, self.rows]))).all(axis=-1))
 
     def reaching(self, x: float, y: float) -> Grid:
-        """Return this grid, extended on up to two sides so that a point lies in it.
+        """Return this grid, extended on up to two sides so that it contains a point.
 
-        A point farther away than the grid is long does not extend it.
+        A point that is farther away than the length of the grid does not extend it.
         """
         row, column = self._cell(x, y)
         left, below = max(-column, 0), max(-row, 0)
@@ -120,33 +120,33 @@ class Grid:
         return Grid(xmin, ymin, self.cell_size, columns, rows)
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
-        """Return the cell (row, column) of a point, or the nearest one to a point outside the grid."""
+        """Return the cell (row, column) of a point, or the cell nearest to a point outside the grid."""
         row, column = self._cell(x, y)
         return min(max(row, 0), self.rows - 1), min(max(column, 0), self.columns - 1)
 
     def _cell(self, x: float, y: float) -> tuple[int, int]:
-        """Return the cell (row, column) of a point, as if the grid had no end."""
+        """Return the cell (row, column) of a point in the unbounded grid."""
         return math.floor((y - self.ymin) / self.cell_size), math.floor((x - self.xmin) / self.cell_size)
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """The poses that a robot can bring objects to.
+    """The poses to which a robot can bring objects.
 
     Attributes:
-        grid: the positions considered for the centre of an object.
-        yaws: orientations in radians that an object may be given; empty to keep orientations. An object of
-            unknown orientation is turned by these angles.
-        keeps_yaw: whether an object may also keep the orientation that it has, and one of unknown
-            orientation has to; settings that push say so.
+        grid: possible positions of an object's centre.
+        yaws: possible orientations of objects, radians; empty to keep orientations. An object of unknown
+            orientation is turned by these angles.
+        keeps_yaw: whether an object may also keep its orientation. An object of unknown orientation then
+            always keeps it. Settings with the skill "push" set this.
         base: position (x, y) of the robot.
-        nearest, farthest: the range of distances from the base that the robot reaches, in footprint units.
-        obstacles: static obstacles, besides the objects of a sample.
-        supports: names of objects on which others may be put; they are not obstacles.
-        clearance: the least distance between objects, in footprint units.
+        nearest, farthest: range of distances from the base within the robot's reach, footprint units.
+        obstacles: static obstacles, in addition to the objects of a sample.
+        supports: names of objects on which others may be placed; they are no obstacles.
+        clearance: least distance between objects, footprint units.
 
     Raises:
-        UsageError: invalid values, all of them reported.
+        UsageError: invalid values; the message lists all of them.
     """
 
     grid: Grid
@@ -191,7 +191,7 @@ class Workspace:
 
     @classmethod
     def around(cls, sample: Sample) -> Workspace:
-        """Return a workspace over all objects of a sample, with a margin of half their extent on each side.
+        """Return a workspace around all objects of a sample, with a margin of half their extent on each side.
 
         Raises:
             UsageError: the sample has no object.
@@ -206,15 +206,15 @@ class Workspace:
         return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
 
     def turns(self, yaw: float | None) -> Floats:
-        """Return (A,): the angles in radians by which an object of an orientation may be turned."""
+        """Return the angles by which an object with an orientation may be turned, (A,), radians."""
         if not self.keeps_yaw:
             return np.array(self.yaws) - (yaw or 0.0) if self.yaws else np.zeros(1)
-        # the shorter way round
+        # the shorter direction of each turn
         turned = () if yaw is None else (math.remainder(angle - yaw, math.tau) for angle in self.yaws)
         return np.array([0.0, *turned])
 
     def within_reach(self, grid: Grid) -> Booleans:
-        """Return (rows, columns): whether the robot reaches the middle of each cell of a grid.
+        """Return whether the robot reaches the centre of each cell of a grid, (rows, columns).
 
         Cells outside the workspace's own grid are out of reach.
         """
@@ -230,7 +230,7 @@ def refuse_faults(faults: Iterable[str]) -> None:
     """Check that there are no faults.
 
     Raises:
-        UsageError: with each fault on a line.
+        UsageError: the message has each fault on a line.
     """
     message = "\n".join(faults)
     if message:
@@ -243,7 +243,7 @@ def is_number(value: object) -> bool:
 
 
 def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
-    """Return what keeps values, by name, from being finite numbers of at least `least`."""
+    """Return a sentence for each value, by name, that is not a finite number of at least `least`."""
     expected = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
     return [
         f"{name} is {value!r}; give {expected}"
@@ -253,7 +253,7 @@ def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[s
 
 
 def count_faults(values: Mapping[str, Any]) -> list[str]:
-    """Return what keeps values, by name, from being whole numbers of at least 1."""
+    """Return a sentence for each value, by name, that is not a whole number of at least 1."""
     return [
         f"{name} is {value!r}; give a whole number of at least 1"
         for name, value in values.items()
@@ -262,14 +262,14 @@ def count_faults(values: Mapping[str, Any]) -> list[str]:
 
 
 def kind_faults(name: str, value: object, kind: type, wanted: str) -> list[str]:
-    """Return what keeps a value from being of a type."""
+    """Return a sentence if a value is not of a type."""
     return [] if isinstance(value, kind) else [f"{name} is {value!r}; give {wanted}"]
 
 
 def member_faults(
     name: str, members: Collection[Any], collection: type, member: type, wanted: str
 ) -> list[str]:
-    """Return what keeps a value from being a collection with members of one type."""
+    """Return sentences if a value is not a collection, or has members that are not of a type."""
     return kind_faults(name, members, collection, wanted) or [
         f"{name} has {value!r}; give {wanted}" for value in members if not isinstance(value, member)
     ]
@@ -278,10 +278,10 @@ def member_faults(
 # --------------------------------------------------------------------------------------------------- settings
 
 Skill: TypeAlias = Literal["push", "place"]
-"""Motion of the robot: push an object along a path in the plane, or pick and place it."""
+"""Skill of the robot: push an object along a path in the plane, or pick and place it."""
 
 RoomFrom: TypeAlias = Literal["later", "all"]
-"""From what a placed object keeps the preferred room: from what may still be moved, or from everything."""
+"""Objects from which a placed object keeps the preferred room: those that may still be moved, or all."""
 
 _SKILLS = ("push", "place")
 _ROOM_FROM = ("later", "all")
@@ -290,30 +290,31 @@ _ROOM_FROM = ("later", "all")
 @named_arguments
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a planner, besides the specification.
+    """The settings of a planner.
 
     Attributes:
-        workspace: where objects can be put.
-        skill: "push" (the path matters) or "place" (only the target does).
+        workspace: poses to which objects can be brought.
+        skill: "push" (the path matters) or "place" (only the target matters).
         movable: names of the objects that the robot can move; None for all objects of a sample.
-        margin: the least robustness of progress at a target, in the unit of the relations, at least 0.
-        constraint_margin: how far constraints have to stay from holding, in the same unit, at least 0.
-        room: preferred clearance of a placed object, in footprint units, so that it and its neighbours can be
-            grasped later; at least 0. Targets with less are used if there is no other.
-        room_from: "later" keeps room only from objects that may still have to be moved on the way to
-            acceptance, and from everything if the object itself may. Elsewhere robustness counts. "all"
-            always keeps it from everything, whatever robustness that costs.
-        attempts: how many failed motions of one object prune an edge, refused ones included; at least 1.
-        motions: how many objects are moved for one edge at most, at least 1. With 1, the planner takes one
-            edge by one motion and looks no further, as in the paper.
-        lift: how high above where it stood an object is carried, in footprint units, at least 0. Its way then
-            keeps what must not hold at a distance, over other things where heights allow. None leaves the way
-            to the robot.
-        refine: whether targets are refined near their cell, and, between several orientations, to turns in
-            between; without it, they are middles of cells.
+        margin: least robustness of progress at a target, in the unit of the relations, at least 0.
+        constraint_margin: margin by which constraints must be false, in the same unit, at least 0.
+        room: preferred clearance of a placed object, footprint units, at least 0, so that the object and its
+            neighbours can be grasped later. Targets with less room are used if there are no others.
+        room_from: "later" keeps room from objects that may still have to be moved before acceptance, and from
+            all objects if the placed object is one of them; otherwise only robustness counts. "all" always
+            keeps room from all objects, regardless of the robustness that it costs.
+        attempts: number of failed motions of one object, including refused ones, that prune an edge; at
+            least 1.
+        motions: maximum number of objects that are moved for one edge, at least 1. With 1, the planner takes
+            each edge by one motion and does not look ahead, as in the paper.
+        lift: height by which an object is raised while it is carried, footprint units, at least 0. Its path
+            then avoids constraints, and may cross objects that are low enough. None leaves the path to the
+            robot.
+        refine: whether targets are refined near the centre of their cell and, with several orientations,
+            between these. Otherwise targets are centres of cells.
 
     Raises:
-        UsageError: invalid values, all of them reported.
+        UsageError: invalid values; the message lists all of them.
     """
 
     workspace: Workspace
@@ -350,7 +351,7 @@ class Settings:
 
 
 _PLAIN: Final = tuple(each.name for each in fields(Settings) if each.name != "workspace")
-"""Settings that stand in the text as they are."""
+"""Settings that are written to the text without conversion."""
 
 
 def text_from_settings(settings: Settings) -> str:
@@ -378,7 +379,7 @@ def settings_from_text(text: str) -> Settings:
     """Read settings from the text of `text_from_settings`.
 
     Raises:
-        LogError: any other text.
+        LogError: the text is not valid.
     """
     try:
         return _settings(json.loads(text))
@@ -403,11 +404,11 @@ def _settings(read: dict[str, Any]) -> Settings:
 
 
 def load_settings(path: str | PathLike[str], base: Settings | None = None) -> Settings:
-    """Load a settings file (YAML), which changes some settings of others.
+    """Load a settings file (YAML), which changes some of the settings `base`.
 
     Args:
-        path: of the file, or its address.
-        base: the settings to change; without them, the file has to give `area` and `cell_size`.
+        path: path or address of the file.
+        base: settings to change; without them, the file must have `area` and `cell_size`.
 
     Raises:
         MissingFileError: there is no such file.
@@ -417,10 +418,10 @@ def load_settings(path: str | PathLike[str], base: Settings | None = None) -> Se
 
 
 def parse_settings(text: str, name: str = "settings") -> Mapping[str, Any]:
-    """Parse the text of a settings file, and return what it changes, by setting.
+    """Parse the text of a settings file, and return its changes by setting.
 
     Args:
-        name: of the file, for errors.
+        name: name of the file, for errors.
 
     Raises:
         UsageError: the text is not valid; all errors are listed.
@@ -431,7 +432,7 @@ def parse_settings(text: str, name: str = "settings") -> Mapping[str, Any]:
 
 
 def parse_setting(text: str) -> Mapping[str, Any]:
-    """Parse one setting, KEY=VALUE with a value as in a settings file; a list needs no brackets.
+    """Parse one setting, KEY=VALUE, with the syntax of a settings file; a list needs no brackets.
 
     Raises:
         UsageError: there is no such setting, or the value is not valid.
@@ -449,16 +450,16 @@ def parse_setting(text: str) -> Mapping[str, Any]:
     try:
         return parse_settings(f"{key}: {value}", option)
     except UsageError as error:
-        # there is one line, and the option names the key
+        # the only line has no useful number, and the option already names the key
         message = str(error).replace(f"{option}:1: {key}", option, 1).replace(f"{option}:1", option)
         raise UsageError(message) from None
 
 
 def changed_settings(base: Settings | None, changes: Mapping[str, Any]) -> Settings:
-    """Return settings with some changed, by the keys and values of a settings file.
+    """Return settings with changes, by the keys and values of a settings file.
 
     Raises:
-        UsageError: values that do not go together, or no grid.
+        UsageError: values that contradict each other, or no grid.
     """
     grid = _changed_grid(None if base is None else base.workspace.grid, changes)
     workspace = Workspace(grid) if base is None else replace(base.workspace, grid=grid)
@@ -515,7 +516,7 @@ _OF_WORKSPACE: Final[Mapping[str, Callable[[Any], Any]]] = MappingProxyType(
 
 
 def changes_text(before: Settings, after: Settings) -> tuple[str, ...]:
-    """Return what differs between two settings, such as "room 0.09 -> 0.02"."""
+    """Return the differences between two settings, such as "room 0.09 -> 0.02"."""
     old, new = (json.loads(text_from_settings(settings)) for settings in (before, after))
     return tuple(f"{key} {_brief(old[key])} -> {_brief(new[key])}" for key in old if old[key] != new[key])
 
