@@ -1,7 +1,7 @@
-"""Edges of an automaton for a planner: progress and constraint sets, idle transitions, motions tried.
+"""Edges of an automaton for a planner: progress and constraint sets, idle transitions, and attempts.
 
-Idle transitions are those that the automaton takes while all propositions keep their values: `X` and bounds
-in samples count samples, so time alone moves the automaton.
+The automaton takes idle transitions while all propositions keep their values. `X` and bounds in samples count
+samples, so time alone moves the automaton.
 """
 
 from __future__ import annotations
@@ -56,16 +56,16 @@ from spatial_replay.trace.trace import Sample, Trace
 # ---------------------------------------------------------------------------------------------------- demands
 
 Pose: TypeAlias = tuple[float, float, float]
-"""x, y and turn of an object."""
+"""Position and turn of an object, (x, y, turn)."""
 
 _Value = TypeVar("_Value", float, Floats)
 
 MOST_ALTERNATIVES: Final = 32
-"""The most conjunctions that a formula is written as; further ones are not tried."""
+"""Maximum number of conjunctions of a formula; further ones are not tried."""
 
 
 class Demand(NamedTuple):
-    """A formula about one sample that has to hold, or must not, by at least a margin."""
+    """A formula without temporal operators that must hold, or must not hold, by at least a margin."""
 
     formula: Formula
     wanted: bool
@@ -73,7 +73,7 @@ class Demand(NamedTuple):
 
 
 def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bool], ...]]:
-    """Return conjunctions of atoms, each of which makes a formula hold, or its negation; a few at most."""
+    """Return conjunctions of atoms of which each implies a formula, or its negation if not `wanted`."""
     formula = expand(formula)
     match formula:
         case Truth():
@@ -90,7 +90,7 @@ def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bo
 
 
 def demands_of(cube: Cube, formulas: Sequence[Formula], least: float) -> list[tuple[Demand, ...]]:
-    """Return the ways to make a cube of propositions hold, as conjunctions of demands."""
+    """Return alternatives that imply a cube of propositions, as conjunctions of demands."""
     parts = [alternatives(formulas[number], value) for number, value in cube]
     return [tuple(Demand(*literal, least) for literal in conjunction) for conjunction in _conjoin(parts)]
 
@@ -112,23 +112,23 @@ def _conjoin(
 def values_in(
     sample: Sample, formulas: Sequence[Formula], regions: Mapping[str, Outline]
 ) -> tuple[list[float], list[float]]:
-    """Return the lower and the upper robustness of formulas in a sample; infinite if it is unknown."""
+    """Return lower and upper bounds of the robustness of formulas in a sample; infinite if it is unknown."""
     leaves = leaf_values(TraceScene(Trace.from_samples([sample]), regions), formulas, {})
     return leaves[0][:, 0].tolist(), leaves[min(1, len(leaves) - 1)][:, 0].tolist()
 
 
 def surplus(lower: _Value, upper: _Value, demand: Demand) -> _Value:
-    """Return by how much a demand is met, less its margin; an unknown one is not met."""
+    """Return the robustness of a demand minus its margin; negative if the demand is not met, or unknown."""
     return (lower if demand.wanted else -upper) - demand.least
 
 
 class Budget:
-    """How many maps a decision may compute.
+    """The number of maps that a decision may compute.
 
     Attributes:
-        left: the maps left.
-        arrangements: of several objects, of which an order of motions was looked for.
-        parking_places: that were tried for objects in the way of others.
+        left: number of maps left.
+        arrangements: number of arrangements of several objects for which an order of motions was searched.
+        parking_places: number of parking places tried for objects in the way of others.
     """
 
     def __init__(self, maps: float) -> None:
@@ -137,11 +137,11 @@ class Budget:
 
     @property
     def search(self) -> Search:
-        """The effort so far."""
+        """The search effort until now."""
         return Search(self._maps - self.left, self.arrangements, self.parking_places)
 
     def spend(self, maps: float = 1.0) -> bool:
-        """Count maps; return whether there are any left."""
+        """Subtract maps from the budget; return False if it is exceeded."""
         self.left -= maps
         return self.left >= 0.0
 
@@ -153,7 +153,7 @@ def move_objects(sample: Sample, poses: Mapping[str, Pose], later_ns: int = 0) -
 
 
 def with_objects(sample: Sample, objects: Mapping[str, TrackedObject], later_ns: int = 0) -> Sample:
-    """Return a sample with some objects instead of those that it has."""
+    """Return a sample with some objects replaced or added."""
     time_ns = sample.time_ns + later_ns
     return Sample(time_ns, {**sample.objects, **objects}, sample.signals, sample.unknown)
 
@@ -164,30 +164,30 @@ Symbol: TypeAlias = tuple[bool | None, ...]
 """The value of each proposition; None if it is unknown."""
 
 MOST_MOTIONS: Final = 100
-"""The most motions for an edge, successful and refused ones included.
+"""Maximum number of motions for an edge, including successful and refused ones.
 
-Six objects are sorted in at most 14, if three motions in ten fail.
+Six objects are sorted in at most 14 motions, if three motions in ten fail.
 """
 _TURNED: Final = math.radians(10.0)
-"""By how much an object that stands as before may be turned."""
+"""Turn up to which an object counts as standing, radians."""
 BESIDE: Final = 1.5
-"""How near an object stands to another one that may keep it from being pushed, in radii of that one."""
+"""Distance up to which a neighbour may block the push of an object, in radii of the object."""
 _LISTED: Final = 4
-"""The most edges that a reason names; the others are counted."""
+"""Maximum number of edges that a reason names; it counts the others."""
 _TRIED: Final = "tried "
-"""The beginning of a kind of reason that counts motions."""
+"""First word of each kind of reason that counts motions."""
 LATER: Final = "what has to come after it cannot be done"
-"""The kind of reason of an edge that could be taken now, and leads nowhere."""
+"""Kind of reason of an edge that could be taken now, but from which acceptance cannot be reached."""
 
 
 class Observer:
-    """Propositions of sample after sample: true where their robustness is at least 0.
+    """Values of propositions, sample by sample: true if the robustness is at least 0.
 
-    As for a `value`, uncertainty does not count: a robot acts on the most likely state.
+    Uncertainty is ignored, as in a `value`, because a robot acts on the most likely state.
     """
 
     def __init__(self, formulas: Sequence[Formula], regions: Mapping[str, Outline]) -> None:
-        # propositions need not be atoms, and leaves are any formulas without temporal operators
+        # a leaf may be any formula without temporal operators, so also a proposition that is no atom
         leaves: list[Any] = list(formulas)
         self._leaves = SampleLeaves([leaves], regions)
 
@@ -202,10 +202,10 @@ class Observer:
 def unknown_reasons(
     formulas: Iterable[Formula], sample: Sample, seen: Mapping[str, int], regions: Mapping[str, Outline]
 ) -> list[str]:
-    """Return why propositions are unknown in a sample, each reason once.
+    """Return the reasons why propositions are unknown in a sample, without duplicates.
 
     Args:
-        seen: the objects of this sample and of those before, with the newest time of each in nanoseconds.
+        seen: newest time of each object in this sample or earlier ones, ns.
     """
     scene = TraceScene(Trace.from_samples([sample]), regions)
     reasons: dict[str, None] = {}
@@ -223,7 +223,7 @@ def unknown_reasons(
 
 
 def groups_without_members(formula: Formula, sample: Sample) -> list[Group]:
-    """Return the open groups without members that a proposition is about; none if it is about others, too."""
+    """Return the open groups without enough members in a proposition; none if any part has members."""
     empty: list[Group] = []
     for leaf in _leaves_of([formula]):
         count = 1
@@ -238,7 +238,7 @@ def groups_without_members(formula: Formula, sample: Sample) -> list[Group]:
 
 
 def absence_text(groups: Iterable[Group], sample: Sample) -> str:
-    """Return which groups have no members, with the nearest class of the sample."""
+    """Return the names of groups without members, with the most similar class name in the sample."""
     classes = sorted({tracked.class_name for tracked in sample.objects.values() if tracked.class_name})
     hints = {
         format_term(replace(group, name="")): nearest_hint(group.class_name or "", classes)
@@ -269,7 +269,7 @@ def refuse_template(specification: Specification, name: str) -> None:
     """Check that a spec names its objects.
 
     Raises:
-        UsageError: a template, since its objects are known only at the end of a log.
+        UsageError: the spec is a template, whose objects are known only at the end of a log.
     """
     for spec in specification.specs:
         if spec.name == name and spec.parameter is not None:
@@ -280,7 +280,7 @@ def refuse_template(specification: Specification, name: str) -> None:
 
 
 def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str]]:
-    """Return for each proposition the names of the innermost specs in a formula that it is part of."""
+    """Return the names of the innermost specs in a formula that contain each proposition."""
     parts = {
         spec.name: list(iter_formulas(spec))[1:] for spec in list(iter_formulas(formula))[1:] if spec.name
     }
@@ -291,11 +291,11 @@ def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str
 
 
 class IdleTransitions(NamedTuple):
-    """The states that an automaton visits while every sample has the propositions of the newest one.
+    """The states that an automaton visits while all propositions keep their newest values.
 
     Attributes:
-        states: from the current one on, each once. The automaton stays in the last one, or its next state
-            depends on unknown propositions.
+        states: visited states from the current state on, without repetition. The last state leads back to a
+            visited state, or its next state depends on unknown propositions.
     """
 
     states: tuple[int, ...]
@@ -306,13 +306,13 @@ class IdleTransitions(NamedTuple):
         return frozenset(pairwise(self.states))
 
     def along(self, path: Sequence[Transition]) -> tuple[int, ...]:
-        """Return the states at the beginning of a path that time alone reaches; none if its first is not."""
+        """Return the targets of a path's first transitions, as far as time alone takes them."""
         steps = zip(path, self.states[1:], strict=False)
         return tuple(state for _, state in takewhile(lambda step: step[0].target == step[1], steps))
 
 
 def idle_transitions(automaton: Automaton, state: int, symbol: Symbol) -> IdleTransitions:
-    """Return the transitions that time alone takes from a state."""
+    """Return the transitions from a state that time alone takes."""
     visited = {state: None}
     after = automaton.step_set({state}, symbol)
     while len(after) == 1 and not after <= visited.keys():
@@ -328,9 +328,9 @@ def consideration_of(
     """Return the first edge of a path with its progress and constraint sets.
 
     Args:
-        pruned: edges that the constraint set leaves out.
-        symbol: the newest sample's propositions. The constraint set also leaves out the edge that these would
-            take, unless acceptance is lost by it.
+        pruned: edges that are left out of the constraint set.
+        symbol: values of the propositions in the newest sample. The edge that these values take is also left
+            out of the constraint set, unless it loses acceptance.
     """
     states, edge = (
         (path[0].source, *(transition.target for transition in path)),
@@ -341,10 +341,10 @@ def consideration_of(
 
 
 def order_text(automaton: Automaton, path: Sequence[Transition], without: Collection[Edge]) -> str:
-    """Return why the first edge of a path comes before one on a path as short; empty if there is none.
+    """Return the reason why a path's first edge precedes an edge of an equally short path; "" without one.
 
     Args:
-        without: edges that were given up, or that time alone takes.
+        without: pruned edges, and edges that time alone takes.
     """
     first = path[0]
     rival = next(automaton.paths(first.source, {*without, (first.source, first.target)}), ())
@@ -360,10 +360,10 @@ def equivalent_edges(
     pruned: Collection[Edge],
     symbol: Symbol,
 ) -> Iterator[Edge]:
-    """Iterate over the edges from idle states that take as much: equal progress, and all constraints.
+    """Iterate over edges from idle states with an equal progress set and at least the same constraints.
 
-    A deadline unrolls one edge into a copy for each sample left. If one copy is impossible now, so are the
-    later ones, and the planner need not try each of them.
+    A deadline unrolls one edge into a copy for each remaining sample. If one copy is impossible now, the
+    later copies are impossible too, and the planner skips them.
     """
     constraints = set(consideration.constraints.cubes)
     for edge in ((source, target) for source in idle.states[1:] for target in automaton.successors[source]):
@@ -377,10 +377,10 @@ def equivalent_edges(
 def _other_edges(
     automaton: Automaton, edge: Edge, pruned: Collection[Edge], symbol: Symbol
 ) -> Iterator[Transition]:
-    """Iterate over the transitions that must not be taken on the way to an edge.
+    """Iterate over the transitions that must not be taken before an edge.
 
     Raises:
-        NoAutomatonError: a guard that is cut, since what it leaves out would not be avoided.
+        NoAutomatonError: a guard is cut, so its missing cubes would not be avoided.
     """
     source = edge[0]
     allowed = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}
@@ -405,11 +405,12 @@ def _guards(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:
 
 
 def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, symbol: Symbol) -> str:
-    """Return what a sample has that takes the automaton where it cannot accept; empty if it is not known.
+    """Return the condition in a sample that loses acceptance; empty if unknown propositions leave it open.
 
     Args:
-        states: of the automaton before the sample.
-        before, symbol: the propositions of the sample before, () if there is none, and of this one.
+        states: states of the automaton before the sample.
+        before: values of the propositions in the previous sample; () without one.
+        symbol: values of the propositions in this sample.
     """
     cubes = [
         cube
@@ -420,7 +421,7 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
         if all(symbol[number] is value for number, value in cube)
     ]
     cube = min(cubes, key=len, default=())
-    # what has just changed says more than what was so before
+    # a condition that has just become true explains more than a condition that held before
     changed = [literal for literal in cube if before and before[literal[0]] is not symbol[literal[0]]]
     return " and ".join(automaton.propositions[number].literal(value) for number, value in changed or cube)
 
@@ -428,24 +429,24 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
 def moved_later(
     path: Sequence[Transition], symbol: Symbol, formulas: Sequence[Formula], names: Iterable[str]
 ) -> frozenset[str]:
-    """Return the objects that the rest of a path, without its first edge, may ask to be moved."""
+    """Return the objects that later edges of a path, after its first edge, may require to be moved."""
     literals = (literal for transition in path[1:] for cube in transition.guard for literal in cube)
     unmet = {number for number, value in literals if symbol[number] is not value}
     return frozenset(name for name in names if any(concerns(formulas[number], name) for number in unmet))
 
 
 def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
-    """Return the state farthest from acceptance; None if no state can reach it."""
+    """Return the state farthest from acceptance; None if no state can reach acceptance."""
     paths = {state: next(automaton.paths(state), None) for state in states}
     distances = {state: len(path) for state, path in paths.items() if path is not None}
     return max(distances, key=lambda state: (distances[state], -state), default=None)
 
 
 def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason], why: str = "") -> str:
-    """Return the sentence that every path from a state was pruned, with edges for each kind of reason.
+    """Return the sentence that every path from a state was pruned, with the edges of each kind of reason.
 
     Args:
-        why: what cannot be done; without it, what has to come after one of the edges.
+        why: infeasible part of the task; if empty, the detail of a reason `LATER`.
     """
     ahead, reachable = [state], {state}
     while ahead:
@@ -455,7 +456,7 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason],
     edges: dict[str, list[str]] = {}
     for (source, target), reason in sorted(pruned.items()):
         if source in reachable:
-            # the last failure of an edge says more than how often it was tried
+            # the last failure of an edge explains more than its number of attempts
             kind = str(reason) if reason.kind.startswith(_TRIED) else reason.kind
             edges.setdefault(kind, []).append(f"{source} -> {target}")
     reasons = "; ".join(f"{_edges_text(texts)}: {kind}" for kind, texts in edges.items())
@@ -480,11 +481,11 @@ class FailedMotion(NamedTuple):
     """A motion that failed.
 
     Attributes:
-        target: what it was for.
-        before: the newest sample when it began.
-        stayed: whether its object stayed where it was.
+        target: target of the motion.
+        before: newest sample at the beginning of the motion.
+        stayed: whether the object did not move.
         refused: whether no sample came during the motion.
-        at: the stage at which it failed; None if it is not known.
+        at: stage at which the motion failed; None if it is unknown.
     """
 
     target: Target
@@ -495,17 +496,16 @@ class FailedMotion(NamedTuple):
 
 
 class Attempts:
-    """The motions of a run, by the edge that they were for.
+    """The motions of a run, by edge.
 
-    Failures count by edge and object: a robot that often fails, and does the rest, is not given up.
+    Failures count separately for each edge and object, so that a robot that often fails can go on.
 
     Attributes:
-        motions: the number of motions concluded, without refused ones.
-        planned: the motions that were to follow the last one; none if that failed.
+        motions: number of concluded motions, without refused ones.
+        planned: motions that were planned after the last motion; empty if that motion failed.
     """
 
     def __init__(self) -> None:
-        """Begin with none."""
         self.motions = 0
         self.planned: tuple[Target, ...] = ()
         self._failed: dict[Edge, Counter[str]] = {}
@@ -518,28 +518,28 @@ class Attempts:
 
     @property
     def are_any(self) -> bool:
-        """Whether anything was tried."""
+        """Whether any motion was tried."""
         return bool(self._total)
 
     def forgiven(self) -> Attempts:
-        """Return the same attempts with only the refused motions as failures, so that others are repeated."""
+        """Return these attempts with only refused motions as failures, so that other motions are repeated."""
         attempts = copy(self)
         attempts._motions, attempts._places = [motion for motion in self._motions if motion.refused], {}
         return attempts
 
     def why_not_again(self, edge: Edge, most_failed: int) -> Reason | None:
-        """Return why an edge is not tried again; None if it may be."""
+        """Return the reason why an edge is not tried again; None if it may be tried."""
         if (failed := self.failures(edge)) >= most_failed:
             return Reason(_count_text(failed), self._last.get(edge, ""))
-        # a motion that succeeds clears the failures, so that G F … would go on without end
+        # a successful motion resets the failures, so without this limit `G F …` could continue forever
         return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
 
     def failures(self, edge: Edge) -> int:
-        """Return how many motions for an edge have failed that count, of the object with most failures."""
+        """Return the number of failed motions for an edge of the object with the most failures."""
         return max(self._failed.get(edge, Counter()).values(), default=0)
 
     def begin(self, edge: Edge, name: str, sample: Sample, settings: Settings) -> None:
-        """Count a motion of an object for an edge, as failed until it is concluded."""
+        """Count a motion of an object for an edge; it counts as failed until it is concluded."""
         self._failed.setdefault(edge, Counter())[name] += 1
         self._total[edge] += 1
         self._begin = sample, settings
@@ -554,10 +554,12 @@ class Attempts:
         *,
         is_stopped: bool = False,
     ) -> None:
-        """Take the outcome of a motion, and the automaton's states and the newest sample after it.
+        """Record the outcome of a motion.
 
         Args:
-            is_stopped: whether it was stopped because of where it led, and not by how it began.
+            states: states of the automaton after the motion.
+            sample: newest sample after the motion.
+            is_stopped: whether the planner stopped the motion; the object then counts as moved.
         """
         before, settings = self._begin
         refused = before is sample and not outcome.succeeded
@@ -569,7 +571,7 @@ class Attempts:
             self._last[aim.edge] = "; ".join(filter(None, said))
             stayed = not is_stopped and _stands(target.name, before, sample, settings)
             self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
-            # a motion that failed at its place may succeed at another one
+            # a motion that failed at its target may succeed at another place
             if outcome.at in (None, "place") and not (settings.skill == "push" and stayed):
                 self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
@@ -578,51 +580,51 @@ class Attempts:
             place = "({:.4g}, {:.4g})".format(*centre_of(sample.objects[target.name].footprint))
             self._last[aim.edge] = f"moved, but then not at its target: {target.name} at {place}"
         elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
-            # one of several motions, and fewer are left than ever before
+            # one of several motions succeeded, and fewer motions are left than ever before
             self._left[aim.edge] = len(aim.motions)
             self._failed[aim.edge].clear()
         elif aim.is_joint:
-            # a detour after a failure; all motions for an edge are bounded, too
+            # a successful detour after a failure; `MOST_MOTIONS` still bounds all motions for the edge
             del self._failed[aim.edge][target.name]
 
     def withdraw(self, edge: Edge, name: str) -> None:
-        """Count the motion of an object that begins, or began last, as no attempt."""
+        """Do not count the newest motion of an object for an edge as an attempt."""
         self._failed[edge][name] -= 1
         self._total[edge] -= 1
 
     def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
-        """Return the places (x, y) where moving an object failed, whatever it was for."""
+        """Return the places (x, y) where motions of an object failed, for any edge."""
         return self._places.get(name, ())
 
     def needs_room(self, name: str) -> bool:
-        """Return whether an object could not be moved to a place, perhaps for lack of room there."""
+        """Return whether an object could not be moved to a place, perhaps for lack of room at the place."""
         return any(
             motion.target.name == name and motion.stayed and motion.at in (None, "place")
             for motion in self._motions
         )
 
     def failed_pick(self, name: str, sample: Sample, settings: Settings) -> bool:
-        """Return whether an object could not be picked up while everything stood as in a sample."""
+        """Return whether a pick-up of an object failed in the scene of a sample."""
         return settings.skill == "place" and any(
             motion.at == "pick" for motion in self._here(name, sample, settings)
         )
 
     def failed_here(self, name: str, sample: Sample, settings: Settings) -> tuple[Target, ...]:
-        """Return the targets for which motions of an object failed while everything stood as in a sample.
+        """Return the targets of failed motions of an object in the scene of a sample.
 
-        After a push that did not move its object, only neighbours of the object are considered.
+        For a push that did not move its object, the scene is only the object and its neighbours.
         """
         return tuple(motion.target for motion in self._here(name, sample, settings))
 
     def _here(self, name: str, sample: Sample, settings: Settings) -> Iterator[FailedMotion]:
-        """Yield the failed motions of an object that began with everything as in a sample."""
+        """Yield the failed motions of an object that began in the scene of a sample."""
         for motion in self._motions:
             if motion.target.name == name and _is_same_scene(motion, sample, settings):
                 yield motion
 
 
 def _is_at(target: Target, sample: Sample, settings: Settings) -> bool:
-    """Return whether an object is at its target, or not in a sample."""
+    """Return whether an object is at its target; True for an object that is not in the sample."""
     tracked = sample.objects.get(target.name)
     allowed = settings.workspace.grid.cell_size + (0.0 if tracked is None else tracked.uncertainty)
     return tracked is None or math.dist(centre_of(tracked.footprint), (target.x, target.y)) <= allowed
@@ -633,7 +635,7 @@ def _count_text(count: int) -> str:
 
 
 def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:
-    """Return whether nothing that a failed motion began with is elsewhere in a sample."""
+    """Return whether a sample has the scene in which a failed motion began, with no object moved."""
     moved_name, before = motion.target.name, motion.before
     tracked = before.objects[moved_name]
     names = list(dict.fromkeys([moved_name, *before.objects, *sample.objects]))
@@ -650,7 +652,7 @@ def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> 
 
 
 def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
-    """Return about how far an object is from another one; infinite if that is not seen."""
+    """Return the approximate distance between two objects; infinite if the other is missing."""
     if other is None:
         return math.inf
     centres = math.dist(centre_of(tracked.footprint), centre_of(other.footprint))
@@ -658,7 +660,7 @@ def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
 
 
 def _stands(name: str, before: Sample, sample: Sample, settings: Settings) -> bool:
-    """Return whether an object is where it was in an earlier sample, or is in neither."""
+    """Return whether an object has not moved since an earlier sample; True if it is in neither sample."""
     was, now = before.objects.get(name), sample.objects.get(name)
     if was is None or now is None:
         return was is now

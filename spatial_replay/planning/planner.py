@@ -1,4 +1,4 @@
-"""The planner (Algorithm 1 of the paper): takes one edge of the automaton at a time by moving one object."""
+"""The planner (Algorithm 1 of the paper), which takes one edge of the automaton at a time by motions."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ from spatial_replay.text import named_arguments, plural, times_apart
 from spatial_replay.trace.trace import Sample, require_sample
 
 _LONGEST_WANTED: Final = 60
-"""The most characters of a proposition that a reason shows if it has a spec to name instead."""
+"""Maximum length of a proposition in a reason, characters; the name of a spec replaces a longer one."""
 
 
 @named_arguments
@@ -81,16 +81,15 @@ class Planner:
             if outcome is not None:
                 planner.conclude(outcome)
 
-    It has to observe every sample, also during an execution: each one moves the automaton. A run ends: an
-    edge is pruned after `Settings.attempts` failed motions of one object, and after `MOST_MOTIONS` in all.
-    Equal samples and outcomes give equal steps.
+    The planner must observe every sample, also during an execution, because each sample moves the automaton.
+    Every run ends: an edge is pruned after `Settings.attempts` failed motions of one object, and after a
+    total of `MOST_MOTIONS`. Equal samples and outcomes give equal steps.
 
     Attributes:
-        specification: what is planned for.
-        automaton: of the specification.
-        rate_hz: how many samples a second has, by which bounds in seconds count samples; None if there are
-            no such bounds.
-        bounds: what these bounds have become, in words; empty without any.
+        specification: specification to plan for.
+        automaton: automaton of the planned spec.
+        rate_hz: sampling rate that converts bounds in seconds; None without such bounds.
+        bounds: sentence on bounds in seconds and their numbers of samples; empty without such bounds.
     """
 
     def __init__(
@@ -104,15 +103,15 @@ class Planner:
         """Begin before the first sample.
 
         Args:
-            settings: where and how to plan; without them, every object can be picked up, and placed around
-                the objects of the first sample.
-            name: the spec of the file to plan for; without it, its only result.
-            rate_hz: how many samples come a second, for bounds in seconds.
+            settings: settings of the planner. Without them, every object can be picked up and placed anywhere
+                around the objects of the first sample.
+            name: name of the spec to plan for; None for the only result of the specification.
+            rate_hz: sampling rate, for bounds in seconds.
 
         Raises:
             NoAutomatonError: past operators, bounds in seconds without a rate, or too large a formula.
-            UsageError: no such spec, several to choose from, a template, propositions about earlier samples,
-                or a wrong type of settings.
+            UsageError: no such spec, several results without `name`, a template, propositions about earlier
+                samples, or a wrong type of settings.
         """
         if settings is not None:
             refuse_faults(kind_faults("settings", settings, Settings, "Settings(workspace), or None"))
@@ -127,7 +126,7 @@ class Planner:
         self._formulas = [proposition.formula for proposition in self.automaton.propositions]
         refuse_delays(self._formulas)
         self._specs = specs_of(formula, self._formulas)
-        # in words, a long proposition goes by the spec that it alone is part of, unless that always holds
+        # in sentences, a spec names a long proposition that is its only one, unless the spec is `G …`
         uses = Counter(name for names in self._specs for name in names)
         temporal = (part for part in iter_formulas(formula) if isinstance(part, Temporal))
         uses += Counter(part.name for part in temporal if part.name and part.operator == "G")
@@ -140,10 +139,10 @@ class Planner:
         ]
         self._words = self.automaton.with_propositions(named)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
-        # the same, where what only groups without members satisfy may still be to do
+        # the states if goals that only empty groups satisfy are still open
         self._tested = self._states
         self._awaited: list[Group] = []
-        # when each object was seen last
+        # time of the newest observation of each object
         self._seen: dict[str, int] = {}
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
@@ -151,17 +150,17 @@ class Planner:
         self._stop_reason = ""
         self._lost: Loss | None = None
         self._pruned: dict[Edge, Reason] = {}
-        # those of them that several motions may take
+        # pruned edges that several motions may still take
         self._passed: set[Edge] = set()
         self._attempts = Attempts()
         self._running: Step | None = None
-        # of the objects, between the newest two samples
+        # motions of the objects between the newest two samples
         self._motions: dict[str, Pose] = {}
         self._times = MotionTimes()
         self._decided: Sample | None = None
-        # whether the motion has to stop because of objects that move by themselves
+        # whether the motion must stop because of objects that move by themselves
         self._is_evaded = False
-        # the motion that is put off until others have passed
+        # the motion that is delayed until other objects have passed
         self._delayed: Target | None = None
         # whether no sample came during the last motion aside
         self._is_idle = False
@@ -169,15 +168,15 @@ class Planner:
         self._waiting: Step | None = None
         self._ahead: tuple[int, ...] = ()
         self._steps = 0
-        # of the newest decision
+        # the budget of the newest decision
         self._budget = Budget(MOST_MAPS)
 
     @property
     def settings(self) -> Settings:
-        """Where and how to plan.
+        """The settings of the planner.
 
         Raises:
-            UsageError: they depend on the first sample, which has not been observed yet.
+            UsageError: the settings depend on the first sample, which was not observed yet.
         """
         if self._settings is None:
             raise UsageError("where to plan depends on the first sample; observe one first, or give settings")
@@ -185,39 +184,38 @@ class Planner:
 
     @property
     def states(self) -> tuple[int, ...]:
-        """The states that the automaton can be in; one if all propositions were known."""
+        """The possible states of the automaton; one state if all propositions were known."""
         return tuple(sorted(self._states))
 
     @property
     def motions(self) -> int:
-        """The number of motions concluded, without refused ones, during which no sample came."""
+        """The number of concluded motions; refused motions, during which no sample came, do not count."""
         return self._attempts.motions
 
     @property
     def has_observed(self) -> bool:
-        """Whether it has observed a sample."""
+        """Whether the planner has observed a sample."""
         return self._sample is not None
 
     @property
     def is_accepting(self) -> bool:
-        """Whether the samples observed satisfy the specification, by its propositions."""
+        """Whether the observed samples satisfy the specification, by its propositions."""
         return self._sample is not None and self._states <= self.automaton.accepting
 
     @property
     def stop_reason(self) -> str:
-        """Why a motion has to stop now; empty while it may go on.
+        """The reason why a motion must stop now; empty while it may continue.
 
-        A motion has to stop when one more sample would lose acceptance. In that sample every object moves by
-        as much as between the newest two, and the moved one no farther than its way leads. It also has to
-        stop when another object that moves may come too near before its end, if waiting or going aside is
-        better. A robot that asks after each sample ends the motion with
-        `Outcome(False, planner.stop_reason)`.
+        A motion must stop if the predicted next sample loses acceptance. In this sample every object repeats
+        its motion between the newest two samples, and the moved object stays within its path. A motion must
+        also stop if a moving object may come too near before its end, and waiting or a motion aside is safer.
+        A robot that checks after each sample ends the motion with `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether they satisfy it unless it was violated while propositions were unknown.
+        """Whether the samples satisfy the specification, unless unknown propositions hid a violation.
 
         No later sample can resolve this doubt.
         """
@@ -227,12 +225,12 @@ class Planner:
         return bool(open_states) and open_states.isdisjoint(self.automaton.can_accept)
 
     def observe(self, sample: Sample) -> None:
-        """Take the next sample.
+        """Observe the next sample.
 
         Raises:
-            TraceError: its time is not after that of the last one.
-            UsageError: not a sample; or, at the first one, the settings name unknown objects, or there are
-                neither settings nor objects.
+            TraceError: its time is not after the previous sample's time.
+            UsageError: not a sample, or a first sample with objects missing that the settings name, or a
+                first sample without objects if there are no settings.
         """
         require_sample(sample)
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
@@ -258,11 +256,11 @@ class Planner:
             text = loss_text(self._words, states, symbol, self._symbol)
             self._lost = Loss(sample.time_ns, text)
         self._stop_reason = self._why_stop(before, sample)
-        # a wait ends early if the automaton is not where time alone should have taken it
+        # a wait ends early if the automaton is not in the state to which time alone should have led
         self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
 
     def _test(self, sample: Sample) -> None:
-        """Step the states in which groups without members have done nothing, unless that loses acceptance."""
+        """Update `_tested`: propositions of empty groups count as open, unless that loses acceptance."""
         groups = [groups_without_members(formula, sample) for formula in self._formulas]
         closed = self.automaton.step_set(self._tested, self._symbol)
         symbol = [None if empty else value for empty, value in zip(groups, self._symbol, strict=True)]
@@ -277,7 +275,7 @@ class Planner:
         return bool(self._awaited) and self._states <= accepting and not self._tested <= accepting
 
     def _why_stop(self, before: Sample | None, sample: Sample) -> str:
-        """Return why the motion has to stop on a sample that follows another one; "" if it need not."""
+        """Return the reason why the motion must stop after two consecutive samples; "" if it may continue."""
         target = None if self._running is None else self._running.target
         if before is None or target is None or self._states.isdisjoint(self.automaton.can_accept):
             return ""
@@ -300,13 +298,13 @@ class Planner:
         )
 
     def _is_about_movers(self, numbers: Iterable[int], name: str) -> bool:
-        """Return whether some propositions are about another object that has moved since the decision."""
+        """Return whether a proposition concerns another object that has moved since the decision."""
         moved = {} if self._decided is None else motions_between(self._decided, self._newest())
         formulas = [self._formulas[number] for number in numbers]
         return any(concerns(formula, mover) for mover in moved.keys() - {name} for formula in formulas)
 
     def _evasion(self, target: Target) -> Evasion | None:
-        """Return how to keep out of the way of others that move; None if a motion to a target may go on."""
+        """Return how to evade moving objects; None if a motion to a target may continue."""
         return self._lookout.evasion(self._newest(), self._states, self._motions, target, self._timing)
 
     @property
@@ -320,11 +318,11 @@ class Planner:
     def next_step(self) -> Step:
         """Return the next decision (Algorithm 1).
 
-        Edges that no movable object can take now are pruned, and the next shortest path is tried, until an
-        edge can be taken or no path is left. A wait is returned as the same step until it is over.
+        The planner prunes edges that no movable object can take now, and tries the next shortest path, until
+        an edge can be taken or no path is left. During a wait it returns the same step.
 
         Raises:
-            UsageError: nothing was observed yet, or the last step was not concluded.
+            UsageError: no sample was observed yet, or the last step was not concluded.
         """
         self._newest()
         if self._running is not None:
@@ -344,9 +342,9 @@ class Planner:
         return step
 
     def conclude(self, outcome: Outcome) -> None:
-        """Take the outcome of the last step, after the samples of its execution.
+        """Record the outcome of the last step, after the samples of its execution.
 
-        Later targets for the same progress avoid the place of a failed motion.
+        Later targets of the object avoid the place of a failed motion.
 
         Raises:
             UsageError: not an outcome, or no step is being executed.
@@ -358,15 +356,15 @@ class Planner:
             raise UsageError("no step is being executed; call next_step() first")
         self._running = None
         self._times.end()
-        # it stands from here on
+        # a concluded motion is over, so the object counts as standing
         self._motions.pop(step.target.name, None)
         is_stopped = not outcome.succeeded and outcome.reason == self._stop_reason
         if self._delayed is not None:
-            # a motion aside is for no edge
+            # a motion aside is no attempt at an edge
             self._attempts.motions += 1
             self._is_idle = self._decided is self._newest()
         elif is_stopped and self._is_evaded and self._yielded < MOST_YIELDED:
-            # another object is in the way: the motion did not fail
+            # stopped for a moving object, which does not count as a failure
             self._attempts.motions += 1
             self._attempts.withdraw(step.aim.edge, step.target.name)
         else:
@@ -375,7 +373,7 @@ class Planner:
             self._yielded = 0 if outcome.succeeded else self._yielded
 
     def _yielding(self, step: Step, target: Target) -> Step:
-        """Return the step of a motion, or the one that keeps out of the way of others before it."""
+        """Return the step of a motion, or a step that first evades moving objects."""
         if step.aim is None:
             return step
         target = self._lookout.past_others(self._newest(), self._motions, target, step.aim, self._timing)
@@ -385,7 +383,7 @@ class Planner:
         self._attempts.withdraw(step.aim.edge, target.name)
         self._delayed = target
         self._yielded += 1
-        # the robot takes it to be there already: time has to pass
+        # without a sample during the last motion aside, the robot did not move; so wait instead
         aside = None if self._is_idle else evasion.aside
         self._is_idle = False
         if aside is None:
@@ -402,7 +400,7 @@ class Planner:
         return bool(self._ahead) if step.ahead else self._is_blind() or self._lacks_members
 
     def _is_blind(self) -> bool:
-        """Return whether unknown propositions leave the automaton's state open."""
+        """Return whether unknown propositions leave several states possible that do not all accept."""
         is_accepting = self._states <= self.automaton.accepting
         return len(self._states) > 1 and None in self._symbol and not is_accepting
 
@@ -414,7 +412,7 @@ class Planner:
         if self._states <= self.automaton.accepting:
             if self._tested <= self.automaton.accepting:
                 return self._decision("hold", (), "the specification is satisfied: hold")
-            # members have come, and have not done it yet
+            # groups have members now, which do not satisfy the goal yet
             self._states = self._tested
         if self._is_blind():
             return self._decision("wait", (), f"not enough is seen: {self._unknown()}")
@@ -427,12 +425,12 @@ class Planner:
         return self._step_from(state)
 
     def _step_from(self, state: int) -> Step:
-        """Return the step for the first edge, over the paths by length, that can be taken."""
+        """Return the step for the first edge that can be taken, over paths of increasing length."""
         idle = idle_transitions(self.automaton, state, self._symbol)
         foresight = self._foresight(self._attempts)
         considered: list[Consideration] = []
         undecided: dict[int, tuple[Consideration, tuple[Transition, ...], frozenset[Edge]]] = {}
-        # time takes idle transitions without any object being moved, so they stay possible
+        # time takes idle transitions without any motion, so they remain possible
         given_up = frozenset(self._pruned) - self._passed
         pruned = given_up - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) and not idle.along(path):
@@ -456,11 +454,11 @@ class Planner:
                 return self._running_step(considered)
             self._pruned[aim.edge] = reason
             pruned |= {aim.edge, *equivalent_edges(self.automaton, aim, idle, pruned, self._symbol)}
-        # edges of several motions, or of one that failed before, come after all edges of one motion
+        # edges that need several motions, or a motion that failed before, come after all other edges
         for number, (alone, way, before) in undecided.items():
             decision = foresight.decide(alone, way, before, together=True)
             if decision.pruned and self._attempts.motions > 0:
-                # a motion may fail by chance: without any other, one that failed is made again
+                # a motion may fail by chance, so a failed motion is repeated if there is no other
                 again = self._foresight(self._attempts.forgiven())
                 repeated = self._consider(alone, way, again.movables)
                 repeated = again.decide(repeated, way, before, together=True)
@@ -490,7 +488,7 @@ class Planner:
     def _consider(
         self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
     ) -> Consideration:
-        """Return an edge with its candidates, the best one chosen; pruned if one motion does not take it."""
+        """Return an edge with its candidates and the best one chosen; pruned if no single motion takes it."""
         later = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
             movables.candidate(name, consideration, later, refine=True)
@@ -517,7 +515,7 @@ class Planner:
         return replace(self._decision("execute", considered, reason), target=target)
 
     def _why(self, aim: Consideration, target: Target) -> str:
-        """Return why an object is moved, and why this one where another one could be."""
+        """Return the reason why an object is moved, and why it is preferred to other objects."""
         name = target.name
         wrong = (
             [literal for literal in cube if self._symbol[literal[0]] is not literal[1]]
@@ -544,7 +542,11 @@ class Planner:
         return f"{why}; {rival.name} could do it with {self._comparison(rival, target, is_later)}"
 
     def _comparison(self, rival: Target, target: Target, is_later: bool) -> str:
-        """Return in what the target of a rival, later in the order or not, differs from the chosen one."""
+        """Return the difference between the target of a rival and the chosen target.
+
+        Args:
+            is_later: whether the rival comes later in the order of objects.
+        """
         skill = self.settings.skill
         rows = list(zip(_COMPARED[skill], costs_of(rival, skill), costs_of(target, skill), strict=True))
         (same, *_), *costs = rows[0]
@@ -558,7 +560,7 @@ class Planner:
         return f"{equal} and {same}, {f'and comes later {order}' if is_later else _LEADS_NOWHERE}"
 
     def _wanted_text(self, number: int, value: bool) -> str:
-        """Return a proposition that has to hold or not, with the specs that it is of; a long one by these."""
+        """Return the text of a literal with the names of its specs; only the names for a long text."""
         text, specs = self._words.propositions[number].literal(value), " and ".join(self._specs[number])
         if not specs or self._words.propositions[number].name:
             return text
@@ -578,7 +580,7 @@ class Planner:
         return self._sample
 
     def _unknown(self) -> str:
-        """Return the labels of the propositions that the newest sample leaves unknown, and why it does."""
+        """Return the labels of the unknown propositions in the newest sample, with the reasons."""
         numbers = [number for number, value in enumerate(self._symbol) if value is None]
         labels = ", ".join(self._words.propositions[number].label for number in numbers)
         formulas = [self._formulas[number] for number in numbers]
@@ -589,19 +591,19 @@ class Planner:
 _LENGTH: Final = "the same length of way", "a longer way", "a shorter way"
 _ROBUSTNESS: Final = "the same robustness", "less robustness", "more robustness"
 _COMPARED: Final = {"push": (_LENGTH, _ROBUSTNESS), "place": (_ROBUSTNESS, _LENGTH)}
-"""Words for an equal, a worse and a better target, in the order of `costs_of`."""
+"""Words for an equal, a worse and a better target, for each cost in the order of `costs_of`."""
 _LEADS_NOWHERE: Final = "but no motions lead on from there"
 
 
 def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
-    """Return that a rival's cost is worse or better than another one."""
+    """Return the comparison of a rival's cost with the least cost, in words."""
     (_, worse, better), cost, least = row
     numbers = f"({abs(cost):.3g}, here {abs(least):.3g})"
     return f"{worse} {numbers}" if cost > least else f"{better} {numbers}, {_LEADS_NOWHERE}"
 
 
 MOST_YIELDED: Final = 1800
-"""The most samples for which motions wait for others to pass, until one succeeds.
+"""Maximum number of samples and motions aside that motions spend on moving objects without a success.
 
-In a minute at 30 Hz, a person who walks two metres to and fro at 0.1 m/s leaves the way free.
+In a minute at 30 Hz, a person who walks two metres to and fro at 0.1 m/s leaves the path free.
 """

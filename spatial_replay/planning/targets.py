@@ -1,6 +1,6 @@
-"""Targets: the best cell of an object's gradient map, or the nearest good cell that it can be pushed to.
+"""Targets: the best cell of an object's gradient map, or for a push the nearest good cell that it can reach.
 
-A target is then refined: from the middle of its cell to a better place and turn nearby, on finer grids.
+A target is then refined on finer grids, from the centre of its cell to a better place and turn nearby.
 """
 
 from __future__ import annotations
@@ -36,31 +36,32 @@ from spatial_replay.spec.formula import Atom, Term, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas
 
 _COARSEST: Final = 0.5
-"""The first distance between places, in cells."""
+"""First spacing of the refinement, cells."""
 _HALVED: Final = 4
-"""How often that distance is halved."""
+"""Number of times that the spacing is halved."""
 _MOST_GRIDS: Final = 12
-"""The most grids that are measured for one target."""
+"""Maximum number of measured grids for one target."""
 _FARTHEST: Final = 2.0
-"""How far a target moves from the middle of its cell at most, in cells, along x and along y."""
+"""Maximum distance of a refined target from its old place, along x and along y, cells."""
 _SAME: Final = 0.25
-"""How near to a pose another one counts as the same, in cells."""
+"""Distance up to which two poses count as the same, cells."""
 _SAME_TURN: Final = math.radians(3.0)
+"""Angle up to which two poses count as the same, radians."""
 _BETTER: Final = 1e-9
-"""How much robustness a move has to gain."""
+"""Least gain of robustness in a step of the refinement."""
 
 _ASIDE: Final = math.radians(35.0)
-"""How far aside another push begins from a direction in which one failed at once."""
+"""Least angle between the directions of a failed push and of a further push, radians."""
 _PLACES_IN_CELL: Final = 4
-"""How many places are looked at for each cell that a leg of a way crosses."""
+"""Number of tested points in each cell along a leg of a path."""
 _SWEPT: Final = math.radians(10.0)
-"""The widest angle between orientations that are looked at while an object turns on the spot."""
+"""Maximum angle between tested orientations during a turn on the spot, radians."""
 
 Measured = Callable[[Grid, tuple[float, ...]], tuple[GradientMap, Floats]]
-"""Gives the map of an object over a grid in some orientations (yaws), and its room there."""
+"""Function from a grid and orientations (yaws) to an object's map and its room."""
 
 _EQUAL: Final = 1e-9
-"""Difference of robustness of cells that are equally robust."""
+"""Difference of robustness up to which cells count as equally robust."""
 
 
 def find_target(
@@ -71,21 +72,21 @@ def find_target(
     failed: Collection[tuple[float, float]] = (),
     failures: Sequence[Target] = (),
 ) -> Target | str:
-    """Return the target for an object, or why there is none.
+    """Return the target for an object, or the reason why there is none.
 
     Args:
-        gradient: the map of the progress set.
-        tracked: the object before the motion.
-        room: (A, rows, columns), the distance to what room is kept from.
-        failed: places (x, y) where earlier attempts failed.
-        failures: targets for which motions failed while everything stood as it does.
+        gradient: map of the progress set.
+        tracked: object before the motion.
+        room: (A, rows, columns), distance to the objects from which room is kept.
+        failed: places (x, y) where earlier motions failed.
+        failures: targets of failed motions in the current scene.
     """
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
     good = holds & ~avoided_cells(gradient, settings, failed)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
-        # near a cell that was tried, a refined target may still be another one
+        # cells a finger's width from failed targets or, if there are none, cells with another pose
         for apart in (_spread(settings), _SAME * _cell(settings)):
             untried = good & ~tried_poses(gradient, failures, apart)
             if untried.any():
@@ -94,7 +95,7 @@ def find_target(
         least_room = min(settings.room, float(room[good].max())) if failures else settings.room
         roomy = good & (room >= least_room)
         values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
-        # of equally robust cells, the nearest
+        # the nearest of equally robust cells
         away = distance_to([centre_of(tracked.footprint)], gradient.grid)
         values = np.where(values >= values.max() - _EQUAL, -away, -np.inf)
         return _best_target(gradient, values, tracked)
@@ -108,7 +109,7 @@ def target_in(
     pose: tuple[float, float, float],
     failures: Sequence[Target] = (),
 ) -> Target | str:
-    """Return the target for an object at one pose (x, y, turn) of a map, or why it cannot get there."""
+    """Return the target for an object at a pose (x, y, turn) of a map, or the reason why it is impossible."""
     cell = gradient.cell_of(*pose)
     if gradient.blocked[cell] != FREE:
         return REASONS[gradient.blocked[cell]]
@@ -126,7 +127,7 @@ def nearest_target(
     settings: Settings,
     failures: Sequence[Target] = (),
 ) -> Target | str:
-    """Return the target in the nearest of some cells (A, rows, columns), or why there is none."""
+    """Return the target in the nearest of `good` cells (A, rows, columns), or why there is none."""
     if not good.any():
         return "there is no place for it"
     if settings.skill == "push":
@@ -160,7 +161,7 @@ def _nearest_cell(
     free = (gradient.blocked[0] == FREE) & ~towards
     paths = {0: shortest_path(free, (row, column), good[0])}
     if paths[0] is None:
-        # it is turned at the end of its path, and only if that is needed
+        # other orientations are tried only if the object cannot keep its orientation
         for layer in range(1, len(gradient.turns)):
             goals = _turnable(gradient, layer, good[layer] & free, settings)
             paths[layer] = shortest_path(free, (row, column), goals)
@@ -169,13 +170,13 @@ def _nearest_cell(
         return "no free path leads to a good place" + _but_for(failures)
     _, turned, path = min(routes, key=lambda route: route[0])
     cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
-    # an object off the middle of its cell need not visit that middle first
+    # an object off the centre of its cell need not go to this centre first
     first = 0
     if cells[0] == cell and len(cells) > 1:
         first = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
     turns = [gradient.grid.centre(*corner) for corner in cells[first:]]
     way = (start, *turns)
-    # after a push that failed, a straight leg would begin too nearly in the same direction
+    # after a failed push, a straight first leg might begin in the failed direction again
     if not failures:
         way = _without_corners(way, gradient, free, settings)
     return _target(gradient, tracked, (turned, *cells[-1]), way)
@@ -184,9 +185,9 @@ def _nearest_cell(
 def _without_corners(
     way: Sequence[tuple[float, float]], gradient: GradientMap, free: Booleans, settings: Settings
 ) -> tuple[tuple[float, float], ...]:
-    """Return a way without the corners that a straight leg over free and clear cells saves.
+    """Return a path in which straight legs over free and clear cells replace corners.
 
-    A robot that pushes has to take hold again at each corner.
+    A pushing robot has to take hold again at each corner.
     """
     grid = gradient.grid
     least = settings.workspace.clearance + grid.cell_size / math.sqrt(2.0)
@@ -208,7 +209,7 @@ def _without_corners(
 
 
 def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
-    """Return in which of some cells (rows, columns) an object can be turned to the orientation of a layer."""
+    """Return the goals (rows, columns) in which an object can be turned to the orientation of a layer."""
     able = np.zeros(goals.shape, np.bool_)
     if goals.any():
         low, left = np.argwhere(goals).min(axis=0).tolist()
@@ -221,9 +222,9 @@ def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Sett
 
 
 def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settings) -> Booleans:
-    """Return (rows, columns): whether a map's object can turn on the spot in each cell of a grid.
+    """Return whether a map's object can turn on the spot in each cell of a grid, (rows, columns).
 
-    Nothing stands in its way there, and no constraint holds, in orientations every few degrees in between.
+    At several orientations during the turn, no obstacle may touch it and no constraint may hold.
     """
     count = math.ceil(abs(turn) / _SWEPT)
     about = gradient.made_of.now.about
@@ -242,10 +243,10 @@ def _but_for(failures: Sequence[Target]) -> str:
 
 
 def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], settings: Settings) -> bool:
-    """Return whether a map's object is clear of everything between two points, not only in cells' middles."""
+    """Return whether a map's object stays clear on a straight leg, also between the centres of cells."""
     grid, workspace = gradient.grid, settings.workspace
     points = list(points_along(leg, grid.cell_size / _PLACES_IN_CELL))
-    # no point of a cell is nearer to anything than its middle by more than half its diagonal
+    # at any point of a cell the clearance is at most half a diagonal less than at the centre
     least = workspace.clearance + grid.cell_size / math.sqrt(2.0)
     if all(gradient.clearance[0][grid.cell(*point)] > least for point in points):
         return True
@@ -260,12 +261,12 @@ def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], sett
 
 
 def _spot(x: float, y: float, size: float) -> Grid:
-    """Return a grid of one cell with a point in its middle."""
+    """Return a grid of one cell around a point."""
     return Grid(x - size / 2, y - size / 2, size, 1, 1)
 
 
 def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
-    """Return (rows, columns): where a path would begin in about a direction in which a push failed."""
+    """Return the cells (rows, columns) near an object that are in about the direction of a failed push."""
     towards = np.zeros(grid.shape, np.bool_)
     centre, radius = centre_of(tracked.footprint), radius_of(tracked)
     offsets = (grid.centres() - np.array(centre)).reshape(*grid.shape, 2)
@@ -278,7 +279,7 @@ def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Ta
 
 
 def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject) -> bool:
-    """Return whether a push begins in about the direction of one that failed."""
+    """Return whether a push begins in about the direction of a failed push."""
     radius = radius_of(tracked)
     begins = _beginning(target, radius)
     turned = (math.remainder(begins - _beginning(failure, radius), math.tau) for failure in failures)
@@ -286,7 +287,7 @@ def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject
 
 
 def _beginning(target: Target, distance: float) -> float:
-    """Return the angle in which a way begins: that to its first point at a distance, or to its end."""
+    """Return the first direction of a path: the angle to its first point at a distance, or to its end."""
     begin, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
     x, y = next((point for point in points if math.dist(point, begin) >= distance), target.waypoints[-1])
     return math.atan2(y - begin[1], x - begin[0])
@@ -297,9 +298,8 @@ def _path_into_reach(
 ) -> Path | None:
     """Return the path to the nearest free cell.
 
-    Cells out of reach may be crossed only if the path starts in one. From a cell where a constraint would
-    hold, such cells may be crossed too, but no occupied ones. From an occupied cell the path first jumps to
-    the nearest free cell.
+    A path may cross cells out of reach only if it starts in one. It may cross constrained cells only if it
+    starts in one, but no occupied cells. From an occupied cell it first jumps to the nearest passable cell.
     """
     free = gradient.blocked[0] == FREE
     is_reached = settings.workspace.within_reach(gradient.grid)[cell]
@@ -312,7 +312,7 @@ def _path_into_reach(
 
 
 def _nearest(cells: np.ndarray, cell: tuple[int, int]) -> tuple[int, int]:
-    """Return the one of some cells that is nearest to another cell."""
+    """Return the nearest of `cells` to a cell."""
     places = np.argwhere(cells)
     row, column = places[int(np.argmin(((places - np.array(cell)) ** 2).sum(axis=1)))].tolist()
     return row, column
@@ -349,7 +349,7 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
 
 
 def _why_too_large(gradient: GradientMap) -> str:
-    """Return in what an object of a map would have to be and does not fit; "" if it may fit."""
+    """Return a sentence on a region or object that is too small for a map's object; "" if there is none."""
     about = gradient.made_of.then.about
     formulas = [
         about.propositions[number] for cube in gradient.made_of.progress for number, value in cube if value
@@ -369,11 +369,11 @@ def _why_too_large(gradient: GradientMap) -> str:
 
 
 _Rounded: TypeAlias = tuple[Floats, float]
-"""Corners (N, 2) of an outline, and its radius."""
+"""Corners (N, 2) and rounding radius of an outline."""
 
 
 def _outlines_of(term: Term, about: MapSubject) -> list[_Rounded]:
-    """Return what an object or a region covers; nothing for other terms."""
+    """Return the outlines of an object or region; none for other terms."""
     name = getattr(term, "name", "")
     if isinstance(term, TrackedName) and name in about.sample.objects:
         return [(part.vertices, part.radius) for part in about.sample.objects[name].footprint.parts]
@@ -402,15 +402,16 @@ def refine_target(
     measure: Measured,
     failures: Sequence[Target] = (),
 ) -> Target:
-    """Return the target with the most robustness near a target, or the same one.
+    """Return the most robust target near a target, or the target itself.
 
-    A compass search: the best of 5 x 5 places around the newest one, in up to three turns, and closer ones
-    once none is better. Places are free, as that of the target is, and have the preferred room if that has.
+    This is a compass search: each step takes the best of 5 x 5 places around the newest place, in up to three
+    turns. If no place is better, the spacing is halved. All places are free. If the target has the preferred
+    room, they have it too.
 
     Args:
-        tracked: the object before the motion.
-        measure: measures maps around the target.
-        failures: targets for which motions failed; others are taken if there are any.
+        tracked: object before the motion.
+        measure: function that measures maps around the target.
+        failures: targets of failed motions, which are avoided if possible.
     """
     size = settings.workspace.grid.cell_size
     spacing, turning, halved = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
@@ -451,7 +452,7 @@ def refine_target(
 
 
 def tried_poses(gradient: GradientMap, failures: Sequence[Target], radius: float) -> Booleans:
-    """Return (A, rows, columns): which poses of a map are some targets, but for a distance."""
+    """Return whether each pose of a map is within a radius of a failed target, (A, rows, columns)."""
     same = np.zeros(gradient.blocked.shape, np.bool_)
     centres = gradient.grid.centres().reshape(*gradient.grid.shape, 2)
     for failure in failures:
@@ -461,7 +462,7 @@ def tried_poses(gradient: GradientMap, failures: Sequence[Target], radius: float
 
 
 def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) -> bool:
-    """Return whether a target is one of some others, but for a fraction of a cell."""
+    """Return whether a target equals a failed target within a fraction of a cell."""
     return _is_near(target, failures, _SAME * _cell(settings))
 
 
@@ -474,7 +475,7 @@ def _is_near(target: Target, failures: Sequence[Target], radius: float) -> bool:
 
 
 def _spread(settings: Settings) -> float:
-    """Return how far other places are from one that failed, if there are any: about a finger's width."""
+    """Return the preferred distance from a failed place: about a finger's width."""
     return max(_cell(settings), settings.room / 4.0)
 
 
@@ -483,7 +484,7 @@ def _cell(settings: Settings) -> float:
 
 
 def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, settings: Settings) -> Booleans:
-    """Return (A, rows, columns): whether poses are as near to a target as they may be."""
+    """Return whether each pose is within the permitted distance of a target, (A, rows, columns)."""
     offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
     near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
     turned = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (1.0 + 1e-9)
@@ -491,9 +492,9 @@ def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, setting
 
 
 def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> float:
-    """Return how far an object may be turned from an orientation: half the way to the next one; or 0.
+    """Return the maximum turn of an object in a refinement: half the angle to the next orientation, or 0.
 
-    A pushed object that keeps its orientation is not turned at all.
+    A pushed object that keeps its orientation is not turned.
     """
     yaws = sorted(settings.workspace.yaws)
     if len(yaws) < 2 or tracked.yaw is None or (settings.skill == "push" and target.turn == 0.0):
@@ -502,9 +503,9 @@ def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> 
 
 
 def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
-    """Return the point nearest to another one for which `normals @ point >= least`, if there are any.
+    """Return the nearest point to `point` with `normals @ point >= least`, if such a point exists.
 
-    The dual problem by accelerated projected gradients.
+    The dual problem is solved by accelerated projected gradients.
     """
     gram, missing = normals @ normals.T, least - normals @ point
     rate = 1.0 / max(float(np.linalg.norm(gram, 2)), 1e-12)
@@ -516,14 +517,14 @@ def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
 
 
 class RoomCost(NamedTuple):
-    """Cost of the room around a target: the robustness possible with less, and the room there."""
+    """Cost of the room around a target: the robustness of a target with less room, and its room."""
 
     robustness: float
     room: float
 
 
 def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomCost | None:
-    """Return what the room around a target costs; None if no more robustness was possible with less."""
+    """Return the cost of the room around a target; None if less room allows no more robustness."""
     gradient = candidate.map
     if settings.skill != "place" or settings.room <= 0.0:
         return None
