@@ -226,7 +226,7 @@ class Tabletop:
             engine.step()
 
     def sample(self) -> Sample:
-        """Return the current sample of all bodies, with detection noise; repeated calls give equal samples."""
+        """Return the current sample of all bodies with detection noise; repeated calls give equal samples."""
         self._open_engine()
         number = self._ticks // _TICKS_PER_SAMPLE
         errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
