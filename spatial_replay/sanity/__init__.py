@@ -1,4 +1,4 @@
-"""Sanity of specifications: which runs satisfy them at all, by automata and laws of geometry."""
+"""Sanity checks of specifications by automata and laws of geometry: can a run satisfy or violate them?"""
 
 from __future__ import annotations
 

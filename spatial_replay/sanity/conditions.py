@@ -1,8 +1,8 @@
 """Propositions as conditions: Boolean functions of linear inequalities between measured quantities.
 
-A relation is built of measurements by sums, minima and maxima, so "at least 0" is a Boolean function of
-inequalities between sums. Two relations about one quantity share it, whatever their names:
-`a closeto[0.1] b` and `a dist b >= 0.2` are inequalities about one distance.
+A relation combines measurements by sums, minima and maxima. So its condition, "at least 0", is a Boolean
+function of linear inequalities. Relations on the same quantity share it: `a closeto[0.1] b` and
+`a dist b >= 0.2` are two inequalities about one distance.
 """
 
 from __future__ import annotations
@@ -69,21 +69,21 @@ from spatial_replay.trace.trace import Sample, Trace
 # ------------------------------------------------------------------------------------------------------- sums
 
 MAX_INEQUALITIES: Final = 64
-"""How many inequalities one relation is written as at most; one of more is not looked into."""
+"""Most inequalities of one relation; a relation with more is an opaque proposition."""
 
 Quantity: TypeAlias = Measurement | Signal
 Weights: TypeAlias = tuple[tuple[Quantity, Fraction], ...]
 
 
 class Linear(NamedTuple):
-    """A weighted sum of quantities, plus a constant."""
+    """Weighted sum of quantities plus a constant."""
 
     weights: Weights
     constant: Fraction = Fraction(0)
 
 
 class LeastOrGreatest(NamedTuple):
-    """The least or the greatest of some numbers."""
+    """Minimum or maximum of several numbers."""
 
     kind: Literal["min", "max"]
     options: tuple[Linear | LeastOrGreatest, ...]
@@ -93,7 +93,7 @@ Tree: TypeAlias = Linear | LeastOrGreatest
 
 
 def tree_of(expression: Expression, regions: Mapping[str, Outline]) -> Tree | None:
-    """Return an expression as sums below minima and maxima; None for one with too many sums."""
+    """Return an expression as minima and maxima of sums; None if it has too many sums or no such form."""
     try:
         return _build(expression, regions)
     except OverflowError:
@@ -109,7 +109,7 @@ def _build(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
         case Sum():
             return _add(_build(expression.first, regions), _build(expression.second, regions))
         case Negative(Equality()):
-            # `!=` excludes a number, and no inequality that holds at its limit can say so
+            # `!=` excludes one number, which inequalities that include their limits cannot express
             raise OverflowError("an excluded number")
         case Negative():
             return _times(_build(expression.operand, regions), Fraction(-1))
@@ -129,10 +129,10 @@ def _build(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
 
 
 def exact(value: float) -> Fraction:
-    """Return the decimal fraction that a number is written as.
+    """Return the exact fraction of a number's decimal text.
 
     Raises:
-        OverflowError: it is not finite.
+        OverflowError: the number is not finite.
     """
     if not isfinite(value):
         raise OverflowError("not finite")
@@ -170,7 +170,7 @@ def _size(tree: Tree) -> int:
 
 
 def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
-    """Return a measurement of unions as the least or greatest of measurements of their members."""
+    """Return a measurement of unions as the minimum or maximum of the measurements of their members."""
     kind: Literal["min", "max"]
     parts: list[Measurement]
     if all(isinstance(without_radius(plain(term)), RegionName) for term in measurement.terms):
@@ -181,7 +181,7 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
             pairs = product(*map(members, measurement.terms))
             parts = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
         case Protrusion():
-            # an outer union stays whole: its members may hold different parts of the inner term
+            # an outer union is not split: the inner term may lie partly in one member and partly in another
             kind, outer = "max", plain(measurement.outer)
             parts = [Protrusion(inner, outer) for inner in members(measurement.inner)]
         case Projection():
@@ -197,13 +197,13 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
 
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
-    """Return what is measured of regions alone: a number, as they are where they are, or else unknown."""
+    """Return the constant of a measurement between regions, which never move; a quantity if it is unknown."""
     (value,) = _numbers_of([measurement], regions)
     return Linear(((measurement, Fraction(1)),)) if value is None else Linear((), value)
 
 
 def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outline]) -> list[Fraction | None]:
-    """Return what is measured of regions alone; None where that is unknown."""
+    """Return the numbers of measurements between regions; None for an unknown number."""
     nothing = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
     values = leaf_values(nothing, [Atom("", "", measurement) for measurement in measurements], {})[
         :, :, 0
@@ -212,7 +212,7 @@ def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outli
 
 
 def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Measurement, Fraction]:
-    """Return the distances of regions that are apart, and protrusions of regions from those around them."""
+    """Return the distances of regions that are apart, and the protrusions of regions from enclosing ones."""
     terms = (term for atom in atoms for term in terms_of(atom.expression))
     names = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
     pairs = list(permutations(names, 2))
@@ -227,19 +227,19 @@ def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Meas
 
 
 def _diameter(outline: Outline) -> Fraction:
-    """Return the greatest distance of two points of a region in the plane."""
+    """Return the diameter of a region in the plane."""
     widest = max((dist(*pair) for pair in combinations(outline.vertices, 2)), default=0.0)
     return exact(widest + 2.0 * outline.radius)
 
 
 def is_about_heights(atoms: Iterable[Atom]) -> bool:
-    """Return whether a relation is along z."""
+    """Return whether an atom compares coordinates along z."""
     parts = (part for atom in atoms for part in iter_expressions(atom.expression))
     return any(isinstance(part, Projection) and part.axis == "z" for part in parts)
 
 
 def _shift(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
-    """Return a measurement of enlarged terms by that of the terms, where that is exact."""
+    """Return a measurement of enlarged terms as that of the bare terms plus a constant, if this is exact."""
     unit = Fraction(1)
     match measurement:
         case Projection() if measurement.axis != "z":
@@ -260,7 +260,10 @@ def _shift(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
 
 
 def members(term: Term) -> tuple[Term, ...]:
-    """Return the terms whose union a term is: the members of a named group, otherwise itself."""
+    """Return the members of a named group, with the delay, enlargement or centre of the term.
+
+    Any other term is returned as its only member.
+    """
     term = plain(term)
     if isinstance(term, Enlarged):
         return tuple(Enlarged(member, term.radius) for member in members(term.term))
@@ -280,7 +283,7 @@ def members(term: Term) -> tuple[Term, ...]:
 
 
 def plain(term: Term) -> Term:
-    """Return a term with its enlargements as one, and a region as it always is."""
+    """Return a term with nested enlargements merged, and a region without its delay."""
     if isinstance(term, Enlarged):
         inner = plain(term.term)
         radius = term.radius + (inner.radius if isinstance(inner, Enlarged) else 0.0)
@@ -291,28 +294,28 @@ def plain(term: Term) -> Term:
 
 
 def without_radius(term: Term) -> Term:
-    """Return a term before it is enlarged."""
+    """Return a term without its enlargement."""
     return term.term if isinstance(term, Enlarged) else term
 
 
 def radius_of(term: Term) -> Fraction:
-    """Return by how much a term is enlarged."""
+    """Return the radius of a term's enlargement; 0 without one."""
     return exact(term.radius) if isinstance(term, Enlarged) else Fraction(0)
 
 
 def is_flat(term: Term, regions: Mapping[str, Outline]) -> bool:
-    """Return whether a term certainly has no height: distances to it are those in the plane."""
+    """Return whether a term is a region without a height; distances to it are distances in the plane."""
     base = without_radius(term)
     return isinstance(base, RegionName) and base.name in regions and regions[base.name].height is None
 
 
 def is_solid(term: Term) -> bool:
-    """Return whether a term covers something in every sample in which it is known."""
+    """Return whether a term has a footprint in every sample in which it is known; a group may be empty."""
     return not isinstance(base_of(term), Group)
 
 
 def terms_in(quantities: Iterable[Quantity]) -> list[Term]:
-    """Return the terms that quantities measure, each once, without enlargements."""
+    """Return the distinct measured terms of quantities, without enlargements."""
     terms = (term for quantity in quantities if isinstance(quantity, Measurement) for term in quantity.terms)
     return list(dict.fromkeys(without_radius(term) for term in terms))
 
@@ -320,20 +323,20 @@ def terms_in(quantities: Iterable[Quantity]) -> list[Term]:
 # ------------------------------------------------------------------------------------------------- conditions
 
 MAX_DECISIONS: Final = 200_000
-"""How many nodes the diagrams of conditions may have."""
+"""Most nodes in the diagrams of conditions."""
 
 
 class Fact(NamedTuple):
     """Condition of a diagram: an inequality between quantities, or an opaque proposition.
 
     Attributes:
-        weights: of a sum of quantities, the first 1; none for what is not looked into.
-        threshold: what the sum is compared with.
-        side: ">" is false where the sum is less, and leaves open where it is equal, as relations between
-            footprints are marginal there. ">=" and "<=" are meant to the letter, for sums that some relation
-            compares with "==".
-        texts: sentences of the language where it is true, and where it is false.
-        alone: of a quantifier over a class, its value where no object is of that class; otherwise None.
+        weights: factors of a sum of quantities, the first one 1; empty for an opaque proposition.
+        threshold: limit of the sum.
+        side: comparison of the sum with the threshold. ">" is true above the threshold and false below.
+            It leaves equality open, because a relation between footprints is marginal there. ">=" and "<="
+            are exact; they are used for sums that some relation compares with "==".
+        texts: formulas for the true fact and for the false fact.
+        alone: value of a quantifier over a class if no object has that class; None for other facts.
     """
 
     weights: Weights
@@ -343,7 +346,7 @@ class Fact(NamedTuple):
     alone: bool | None = None
 
     def inequality(self, value: bool, label: int) -> Inequality:
-        """Return what holds where the fact is true, or false."""
+        """Return the inequality that holds where the fact has a value; conflicts identify it by its label."""
         rises = (self.side != "<=") == value
         is_strict = self.side == ">" or not value
         sign = -1 if rises else 1
@@ -356,13 +359,13 @@ def _whole(weight: Fraction) -> Fraction | int:
 
 
 class FactDiagrams:
-    """The facts that some formulas are about, and the diagrams of propositions over them.
+    """Facts in some formulas, and diagrams of propositions over these facts.
 
     Attributes:
-        diagrams: of all conditions; variables are the numbers of facts.
-        facts: by number.
-        diameters: of the regions, unless a formula or a region is about heights.
-        between: distances of regions that are apart, and protrusions of regions from those around them.
+        diagrams: diagrams of all conditions; their variables are numbers of facts.
+        facts: facts by number.
+        diameters: diameters of regions by name; empty if a formula or a region has heights.
+        between: distances of regions that are apart, and protrusions of regions from enclosing ones.
     """
 
     def __init__(self, formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> None:
@@ -375,7 +378,7 @@ class FactDiagrams:
         self._written: dict[int, dict[str, None]] = {}
         self._shapes = Shapes()
         self._opaque_nodes: dict[int, int] = {}
-        # quantities that are compared with "==": modes and counts as a rule
+        # sums that are compared with "==", usually modes and counts
         self._compared: set[Weights] = set()
         atoms = [part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom)]
         for atom in atoms:
@@ -385,15 +388,15 @@ class FactDiagrams:
         )
         self.diameters = {} if is_upright else {name: _diameter(outline) for name, outline in regions.items()}
         self.between = _between(atoms, regions)
-        # atoms get the first numbers: a run that they alone decide can be placed
+        # `necessary` drops high numbers first: atoms get low ones, because opaque facts cannot be placed
         for atom in atoms:
             self.of(atom)
 
     def of(self, formula: Formula) -> int:
-        """Return the diagram of a formula about one sample."""
+        """Return the diagram of a formula without temporal operators."""
         entry = self._known.get(id(formula))
         if entry is None:
-            # the formula is kept, so that its id stays its own
+            # the formula is stored, because the id of a deleted object can be reused
             entry = self._known[id(formula)] = formula, self._diagram(expand(formula))
         return entry[1]
 
@@ -404,7 +407,7 @@ class FactDiagrams:
                 return YES if formula.value else NO
             case Atom():
                 if is_about_having_rates(formula):
-                    # the rules are about logs in which rates have values
+                    # an examination assumes that rates have values
                     return YES
                 tree = self._tree_of(formula.expression)
                 return self._opaque(formula) if tree is None else self._condition(tree, formula)
@@ -427,7 +430,7 @@ class FactDiagrams:
         return self._trees[expression]
 
     def _condition(self, tree: Tree, atom: Atom) -> int:
-        """Return where a number is at least 0."""
+        """Return the diagram of the condition that a number is at least 0."""
         if isinstance(tree, LeastOrGreatest):
             parts = [self._condition(option, atom) for option in tree.options]
             join = self.diagrams.both if tree.kind == "min" else self.diagrams.either
@@ -448,7 +451,7 @@ class FactDiagrams:
         return node if is_least else self.diagrams.complement(node)
 
     def equal_texts(self, number: int) -> Iterator[tuple[str, str]]:
-        """Yield pairs of comparisons of a fact, as "x > 1" and "x >= 1", whose robustness is the same."""
+        """Yield pairs of comparisons with the same robustness in a fact, such as "x > 1" and "x >= 1"."""
         texts = dict.fromkeys((*self._written.get(number, ()), *self.facts[number].texts))
         for strict in texts:
             for sign in (" > ", " < "):
@@ -460,7 +463,7 @@ class FactDiagrams:
         shape = self._shapes.of(formula)
         if shape not in self._opaque_nodes:
             node = self._opaque_nodes[shape] = self._new_opaque(formula)
-            # "exists" of something is not "forall" of its negation
+            # `exists x: p` is the negation of `forall x: not p`, so both have one fact
             self._opaque_nodes[self._shapes.negate(shape)] = self.diagrams.complement(node)
         return self._opaque_nodes[shape]
 
@@ -479,7 +482,7 @@ class FactDiagrams:
         number = self._numbers[key]
         self._written.setdefault(number, {})[written] = None
         existing = self.facts[number]
-        # of several relations that say the same, the fact has the text without "not"
+        # several relations can have the same fact; its texts are those without "not"
         first, second = (
             new if is_negated(old) and not is_negated(new) else old
             for old, new in zip(existing.texts, fact.texts, strict=True)
@@ -489,19 +492,19 @@ class FactDiagrams:
 
 
 def is_negated(text: str) -> bool:
-    """Return whether a fact is reported by a relation that does not hold."""
+    """Return whether the text of a fact is a negated relation."""
     return text.startswith(("not (", "not a part of "))
 
 
 def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
-    """Return a sum that is at least 0 as a sum, its threshold, and whether that is the least value."""
+    """Return the condition `linear >= 0` as factors, a threshold, and whether that is a lower limit."""
     factor = linear.weights[0][1]
     weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)
     return weights, -linear.constant / factor, factor > 0
 
 
 def _equal_sums(tree: Tree) -> Iterable[Weights]:
-    """Yield the sums that have to be equal to a threshold."""
+    """Yield the sums whose lower and upper limit are the same threshold."""
     if isinstance(tree, Linear):
         return
     sums = [
@@ -518,7 +521,7 @@ def _equal_sums(tree: Tree) -> Iterable[Weights]:
 def _texts(
     atom: Atom, is_whole: bool, is_least: bool, weights: Weights, threshold: Fraction
 ) -> tuple[str, str]:
-    """Return the sentences of a fact of an atom: where it holds, and where it fails."""
+    """Return the texts of a condition of an atom: where it holds, and where it fails."""
     if is_whole:
         return atom.text, f"not ({atom.text})"
     compared = _compared_texts(weights, threshold, (">=", "<=") if is_least else ("<=", ">="))
@@ -527,14 +530,14 @@ def _texts(
     text = _relation_text(weights) if not threshold else None
     if text is None:
         return f"a part of {atom.text}", f"not a part of {atom.text}"
-    # the relation says that a sum is at least 0, or at most
+    # the relation limits a sum by 0 from below or from above
     relation, holds_above = text
     texts = relation, f"not ({relation})"
     return texts if holds_above == is_least else texts[::-1]
 
 
 def _exact_texts(weights: Weights, threshold: Fraction, side: Literal[">=", "<="]) -> tuple[str, str] | None:
-    """Return an exact comparison and its negation in words; None for a sum of several numbers."""
+    """Return the texts of an exact comparison and of its negation; None for a sum of several quantities."""
     return _compared_texts(weights, threshold, (side, "<" if side == ">=" else ">"))
 
 
@@ -552,7 +555,7 @@ def _compared_texts(weights: Weights, threshold: Fraction, signs: tuple[str, str
 
 
 def _relation_text(weights: Weights) -> tuple[str, bool] | None:
-    """Return the relation between two terms that compares a sum with 0, and whether it holds above 0."""
+    """Return the relation that compares a sum with 0, and whether it holds above 0; None if there is none."""
     match weights:
         case ((Protrusion() as quantity, _),):
             return f"{format_term(quantity.inner)} enclosedin {format_term(quantity.outer)}", False

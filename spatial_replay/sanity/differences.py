@@ -1,4 +1,4 @@
-"""The shortest runs that one of two specifications accepts and the other one rejects."""
+"""Shortest runs that one of two specifications accepts and the other rejects."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from spatial_replay.text import named_arguments, number_text, plural
 Relation: TypeAlias = Literal["same", "stricter", "weaker", "different", "unknown"]
 
 _RATES_HZ: Final = (1.0, 10.0)
-"""Samples per second at which bounds in seconds are compared."""
+"""Sample rates for bounds in seconds, Hz."""
 
 _MEANINGS: Final[Mapping[Relation, str]] = MappingProxyType(
     {
@@ -50,15 +50,15 @@ _MEANINGS: Final[Mapping[Relation, str]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Distinction(Printed):
-    """How the runs that two specifications accept differ; a specification accepts a run if all results do.
+    """Difference of two specifications; a specification accepts a run that satisfies all its results.
 
     Attributes:
-        first, second: the names of the specifications.
-        relation: of the first to the second: "same", "stricter", "weaker", "different", or "unknown".
-        only_first: the shortest run that the first accepts and the second rejects; None if none was found.
-        only_second: the shortest run that the second accepts and the first rejects.
-        rates_hz: the samples per second at which runs were compared; empty if no bound is in seconds.
-        reason: why no run distinguishes them, or why that is not decided; "" otherwise.
+        first, second: names of the specifications.
+        relation: relation of the first to the second: "same", "stricter", "weaker", "different", "unknown".
+        only_first: shortest run that only the first accepts; None if none was found.
+        only_second: shortest run that only the second accepts; None if none was found.
+        rates_hz: sample rates of the comparison, Hz; empty if no bound is in seconds.
+        reason: reason why no run distinguishes them, or why this is not decided; "" otherwise.
     """
 
     first: str
@@ -71,21 +71,21 @@ class Distinction(Printed):
 
     @property
     def sentence(self) -> str:
-        """How they differ."""
+        """The difference as a sentence."""
         meaning = _MEANINGS[self.relation].format(first=self.first, second=self.second)
         rates = " and ".join(f"{number_text(rate)} Hz" for rate in self.rates_hz)
         at_rates = f", at {rates}" if rates else ""
         return f"{meaning}{at_rates}{f' ({self.reason})' if self.reason else ''}"
 
     def lines(self) -> Iterator[str]:
-        """Yield how they differ, and the runs that show it."""
+        """Yield the sentence of the difference, and the runs that show it."""
         yield self.sentence
         yield from _run_lines(self.first, self.second, self.only_first)
         yield from _run_lines(self.second, self.first, self.only_second)
 
     @property
     def document(self) -> dict[str, Any]:
-        """The distinction as values for JSON."""
+        """The difference as values for JSON."""
         return {
             "first": self.first,
             "second": self.second,
@@ -113,15 +113,16 @@ def _run_lines(accepting: str, rejecting: str, example: Example | None) -> Itera
 
 @named_arguments
 def distinguish(first: Specification, second: Specification, *, rate_hz: float | None = None) -> Distinction:
-    """Find the shortest runs that one specification accepts and the other one rejects.
+    """Find the shortest runs that one specification accepts and the other rejects.
 
-    Automata decide, together with laws of geometry, as in `doctor`.
+    The search uses automata and laws of geometry, as `doctor` does.
 
     Args:
-        rate_hz: samples per second, by which bounds in seconds are counted; 1 and then 10 without it.
+        rate_hz: sample rate for bounds in seconds, Hz; without it, 1 Hz and then 10 Hz are tried.
 
     Raises:
-        UsageError: not specifications, other places of one region, a rate that is not above 0.
+        UsageError: not specifications, a specification with a template or without results, two shapes of one
+            region, or a rate outside of 1e-6 to 1e9.
     """
     specifications = first, second
     for specification in specifications:
@@ -152,10 +153,10 @@ def _names(specifications: Sequence[Specification]) -> tuple[str, str]:
 
 
 def _together(first: Specification, second: Specification) -> Specification:
-    """Return a specification with all of both: one spec for each.
+    """Return one specification with two specs: the conjunctions of the results of both specifications.
 
     Raises:
-        UsageError: they have no result, or a template, or another place of one region.
+        UsageError: a specification with a template or without results, or two shapes of one region.
     """
     regions: dict[str, Outline] = {**first.regions, **second.regions}
     for name, outline in first.regions.items():
@@ -179,7 +180,7 @@ def _together(first: Specification, second: Specification) -> Specification:
 
 
 class _Comparison:
-    """Both directions of one comparison, at one rate."""
+    """Comparison of two specs in both directions at one sample rate."""
 
     def __init__(self, together: Specification, rate_hz: float | None) -> None:
         self._specification, self._rate_hz = together, rate_hz
@@ -203,7 +204,7 @@ class _Comparison:
         if obstacles:
             reason = obstacles[0]
             if any(runs):
-                # whether there is one the other way round is not known
+                # the other direction is undecided
                 accepting, rejecting = (second, first) if runs[0] else (first, second)
                 reason = f"not decided is whether {accepting} accepts runs that {rejecting} rejects: {reason}"
         elif relation == "same":
@@ -212,7 +213,7 @@ class _Comparison:
         return Distinction(first, second, relation, runs[0], runs[1], rates, reason)
 
     def _difference(self, accepting: int, rejecting: int) -> Example | Answer | str:
-        """Return a run that only one accepts, the answer that there is none, or why that is unknown."""
+        """Return a run that only one spec accepts, the answer that there is none, or the obstacle."""
         accepted, rejected = self._readings[accepting], self._readings[rejecting]
         obstacle = accepted.reason or rejected.reason
         if accepted.satisfying is None or rejected.violating is None:

@@ -1,4 +1,4 @@
-"""Faults of a specification that need no run: it cannot be satisfied, or checks nothing."""
+"""Faults of a specification that are found without a run: it cannot be satisfied, or checks nothing."""
 
 from __future__ import annotations
 
@@ -44,31 +44,31 @@ from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, oth
 from spatial_replay.text import json_fields, named_arguments, number_text, plural, shortened_formula
 
 MAX_PAIRS: Final = 300
-"""How many pairs of specs are compared at most."""
+"""Most compared pairs of specs."""
 
 MAX_ANTECEDENTS: Final = 40
-"""How many antecedents of one spec are looked at."""
+"""Most examined antecedents of one spec."""
 
 _SHOWN: Final = 3
-"""How many exclusions a sentence names."""
+"""Most exclusions in one sentence."""
 
 Kind: TypeAlias = Literal["unsatisfiable", "always true", "idle antecedent", "implied", "contradiction"]
 
 
 _ENDS: Final[Mapping[str, str]] = MappingProxyType({"unsatisfiable": "satisfied", "always true": "violated"})
-"""The verdict that no run has, by the kind of the finding."""
+"""Impossible verdict by kind of finding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is wrong with a specification.
+    """One fault of a specification.
 
     Attributes:
-        kind: what it is.
-        specs: the names of the specs that it is about; of an implied one, that and the one that implies it.
-        reason: why: "by its logic alone", or what geometry excludes.
-        exclusions: relations that exclude each other in one sample, on which the finding rests.
-        diagnostic: the finding as a warning with its place in the text.
+        kind: kind of the fault.
+        specs: names of the affected specs; for "implied", the implied spec and then the implying one.
+        reason: cause of the fault: "by logic alone", or relations that geometry excludes.
+        exclusions: relations that exclude each other in one sample and so cause the fault.
+        diagnostic: warning with the place of the fault.
     """
 
     kind: Kind
@@ -80,16 +80,16 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class SpecExamination:
-    """Findings about one result of a specification.
+    """Examination of one result of a specification.
 
     Attributes:
-        name: of the spec.
-        reason: why it has no automaton, so that only a looser reading of it was examined; "" if it has one.
-        undecided: questions that were given up, as sentences.
-        unrelated: what was taken to hold or fail whatever else holds: quantifiers over open groups, relations
-            to earlier samples.
-        satisfied, violated: the shortest runs that satisfy it, and violate it; None where there is none, or
-            none was found.
+        name: name of the spec.
+        reason: reason why the spec has no automaton, so that only a looser reading was examined; "" if it
+            has one.
+        undecided: undecided questions as sentences.
+        unrelated: formulas without laws of geometry, which may hold or fail independently of all others:
+            quantifiers over open groups, relations to earlier samples.
+        satisfied, violated: shortest run with that verdict; None if there is none or none was found.
     """
 
     name: str
@@ -102,12 +102,12 @@ class SpecExamination:
 
 @dataclass(frozen=True)
 class Examination(Printed):
-    """Faults of a specification, and examples of its specs.
+    """Faults of a specification, and example runs of its specs.
 
     Attributes:
-        findings: in the order of the text.
-        specs: one for each result.
-        notes: what was left out, and regions that objects cannot cross, as sentences.
+        findings: faults in text order.
+        specs: one examination for each result.
+        notes: sentences about skipped checks, and about regions that objects cannot cross.
     """
 
     findings: tuple[Finding, ...]
@@ -115,10 +115,10 @@ class Examination(Printed):
     notes: tuple[str, ...] = ()
 
     def lines(self, files: Mapping[tuple[str, str], Path] = MappingProxyType({})) -> Iterator[str]:
-        """Yield the findings, and the shortest runs of each spec.
+        """Yield the findings and the shortest runs of each spec as lines of text.
 
         Args:
-            files: the files of runs, by spec and verdict.
+            files: files of the runs by spec and verdict.
         """
         for finding in self.findings:
             yield from str(finding.diagnostic).split("\n")
@@ -164,7 +164,7 @@ class Examination(Printed):
 
 
 def _remarks(spec: SpecExamination) -> Iterator[str]:
-    """Yield how far a spec was examined."""
+    """Yield sentences about the limits of an examination."""
     if spec.reason:
         yield f"no automaton: {spec.reason}"
         yield "  examined with its bounds and past operators read loosely: what that excludes is excluded"
@@ -194,7 +194,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
 
 
 def example_document(example: Example | None) -> dict[str, Any] | None:
-    """Return a run as values for JSON."""
+    """Return an example run as values for JSON; None without a run."""
     if example is None:
         return None
     about = json_fields(example, "robustness", "note")
@@ -203,15 +203,15 @@ def example_document(example: Example | None) -> dict[str, Any] | None:
 
 @named_arguments
 def doctor(specification: Specification, *, examples: bool = True) -> Examination:
-    """Find what is wrong with a specification before any run is evaluated.
+    """Find faults of a specification without evaluating a run.
 
-    It finds specs that no run satisfies with a margin (a robustness above 0), or that none violates with one.
-    It also finds specs that follow from another one or contradict it, and implications whose antecedent never
-    holds. Automata decide, together with laws of geometry: a run is only considered if footprints could be
-    so.
+    A spec is reported if no run satisfies it with a margin (a robustness above 0), or no run violates it with
+    a margin. Specs that follow from another spec or contradict it are reported, too. So are implications with
+    an antecedent that never holds. The search uses automata and laws of geometry, which exclude runs that
+    footprints cannot have.
 
     Args:
-        examples: look for the shortest runs that satisfy and violate each spec, too.
+        examples: whether to search for the shortest runs that satisfy and violate each spec.
 
     Raises:
         UsageError: not a specification.
@@ -221,25 +221,25 @@ def doctor(specification: Specification, *, examples: bool = True) -> Examinatio
 
 
 def refuse_unsatisfiable(specification: Specification, name: str) -> None:
-    """Refuse a spec that no run satisfies with a margin.
+    """Raise an error if no run satisfies a spec with a margin.
 
     Raises:
-        SpecificationError: it is one.
+        SpecificationError: no run satisfies the spec with a margin.
     """
     _refuse(specification, [name], [True])
 
 
 def refuse_constant_results(specification: Specification) -> None:
-    """Refuse results that no run violates with a margin, or none satisfies: no run says anything about them.
+    """Raise an error for results that no run can satisfy, or violate, with a margin.
 
     Raises:
-        SpecificationError: there are some; all are reported together.
+        SpecificationError: there are such results; one error reports all of them.
     """
     _refuse(specification, [spec.name for spec in specification.results], [False, True])
 
 
 def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[bool]) -> None:
-    """Refuse those specs of some names that no run satisfies (True), or violates (False)."""
+    """Raise an error for named specs that no run satisfies (True in `ends`) or violates (False in `ends`)."""
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
     findings = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in ends]
@@ -249,7 +249,7 @@ def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[b
 
 
 def _subject(formula: Formula) -> frozenset[str]:
-    """Return the objects, regions and signals that a formula is about."""
+    """Return the names of the objects, regions and signals in a formula."""
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
     computed = [atom for atom in atoms if atom.relation in ("signal", "sum")]
     signals = {name for atom in computed for name in signals_in(atom.expression)}
@@ -258,7 +258,7 @@ def _subject(formula: Formula) -> frozenset[str]:
 
 
 def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[NamedSpec]:
-    """Yield the named conjuncts of a spec; the spec itself, if it has others."""
+    """Yield the named conjuncts of a spec; the spec itself if some conjunct has no name."""
     formula, names = spec.formula, list[str]()
     if isinstance(formula, Boolean) and formula.operator in ("and", "spec"):
         names = [operand.name or "" for operand in formula.operands]
@@ -270,7 +270,7 @@ def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[NamedSpec]:
 
 
 class _Examiner:
-    """One examination: what geometry excludes is found once for all questions."""
+    """Examination of one specification; all questions share the exclusions of geometry."""
 
     def __init__(self, specification: Specification) -> None:
         self._specification = specification
@@ -303,7 +303,7 @@ class _Examiner:
         return Examination(tuple(places), described, tuple(self._notes))
 
     def why_empty(self, part: NamedSpec, satisfied: bool) -> Finding | None:
-        """Return the finding that no run satisfies, or violates, a part; None if one may."""
+        """Return the finding that no run satisfies, or violates, a part; None if such a run may exist."""
         if not self._is_empty(part, satisfied):
             return None
         self._examine(part)
@@ -315,7 +315,7 @@ class _Examiner:
         return self._readings[part.name]
 
     def _answer(self, part: NamedSpec, satisfied: bool) -> Answer | None:
-        """Return the shortest run that satisfies, or violates, a part; None if that is not decided."""
+        """Return the answer on the shortest run that satisfies, or violates, a part; None if undecided."""
         key = part.name, satisfied
         if key not in self._answers:
             reading = self._reading(part)
@@ -338,7 +338,7 @@ class _Examiner:
         return None
 
     def _of_whole(self, part: NamedSpec, satisfied: bool) -> Answer | None:
-        """Return what the automaton of a whole part says; None if that is not decided either."""
+        """Return the answer from the automaton of the whole part; None if this is undecided, too."""
         try:
             side = Side(automaton_of(self._specification, part.name, part.formula), satisfied)
             if not side.may_agree(side.automaton.initial):
@@ -381,7 +381,7 @@ class _Examiner:
                 possible[node] = ever
         if satisfying is None or not possible:
             return
-        # one run in which all of them hold at once answers for each
+        # a run in which all antecedents hold in one sample answers the question for each of them
         once = self._sometime(part, Boolean("and", tuple(node.operands[0] for node in possible)))
         if len(possible) > 1 and once is not None and self._search.is_found(satisfying, once):
             return
@@ -398,7 +398,7 @@ class _Examiner:
         self._add("idle antecedent", (part.name,), node.span, answer, message, _IDLE)
 
     def _sometime(self, part: NamedSpec, formula: Formula) -> Runs | None:
-        """Return the runs in which a part of a spec holds in some sample; None without an automaton."""
+        """Return the runs in which a formula holds in some sample; None if it has no automaton."""
         eventually = loosen(Temporal("F", (formula,)))
         try:
             return ((Side(automaton_of(self._specification, part.name, eventually)),),)
@@ -406,7 +406,7 @@ class _Examiner:
             return None
 
     def _pairs(self, parts: Sequence[NamedSpec], results: Sequence[NamedSpec]) -> None:
-        """Compare specs that are about the same things, and are no trouble on their own."""
+        """Compare specs that share an object, region or signal; faulty specs are left out."""
         sound = [part for part in parts if not (self._is_empty(part, True) or self._is_empty(part, False))]
         subjects = {part.name: _subject(part.formula) for part in sound}
         pairs = [
@@ -493,7 +493,7 @@ _SAME: Final = "leave one of them out"
 
 
 def reason_of(answer: Answer) -> str:
-    """Return why there is no such run."""
+    """Return the reason of an answer without a run."""
     if answer.by_logic or not answer.exclusions:
         opposites = "".join(
             f"; `{text}` and `{opposite}` are opposites" for text, opposite in answer.opposites[:_SHOWN]
@@ -515,7 +515,7 @@ def _exclusion_text(texts: Sequence[str]) -> str:
 
 
 def _unrelated_texts(formula: Formula) -> Iterator[str]:
-    """Yield what geometry says nothing about: open quantifiers, and relations to earlier samples."""
+    """Yield the formulas without laws of geometry: open quantifiers, open groups, earlier samples."""
     texts: dict[str, None] = {}
     for part in iter_formulas(formula):
         if isinstance(part, Quantified):

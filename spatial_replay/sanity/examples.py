@@ -1,7 +1,7 @@
-"""Shortest runs by example: in words, and as samples that evaluate to the verdict.
+"""Examples of shortest runs: in words, and as samples with the expected verdict.
 
-Objects are boxes along the axes. Boxes make every relation a few linear inequalities between their sides, or
-a choice among some. A placement is a proposal that is evaluated before it is shown.
+Objects are axis-aligned boxes. So a relation is a set of linear inequalities between sides of boxes, or a
+choice between several sets. A placement is evaluated before it is shown.
 """
 
 from __future__ import annotations
@@ -64,20 +64,20 @@ def around(outline: Outline) -> tuple[tuple[float, float], ...]:
 
 
 def inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
-    """Return the largest box, among some, that a footprint encloses."""
+    """Return the largest of the boxes in the parts of a footprint (see `_box_in`)."""
     boxes = [_box_in(part) for part in footprint.parts]
     return max(boxes, key=lambda box: math.prod(high - low for low, high in box))
 
 
 def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
-    """Return a box around a part's centroid, of the proportions of the box around the part."""
+    """Return the largest box in a part that has the part's centroid and the shape of its bounding box."""
     x, y = centre_of(Footprint((part,)))
     if len(part.vertices) < 3:
         half = part.radius / math.sqrt(2.0)
         return (x - half, x + half), (y - half, y + half)
     width, height = np.ptp(part.vertices, axis=0).tolist()
     after = np.roll(part.vertices, -1, axis=0)
-    # corners are counter-clockwise: normals point outwards
+    # the corners are in counter-clockwise order, so these normals point outwards
     normals = np.column_stack([after[:, 1] - part.vertices[:, 1], part.vertices[:, 0] - after[:, 0]])
     room = (normals * (part.vertices - (x, y))).sum(axis=1)
     share = float((room / (np.abs(normals) @ (width / 2.0, height / 2.0))).min())
@@ -90,30 +90,30 @@ def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
 # -------------------------------------------------------------------------------------------------- placement
 
 MAX_SOLUTIONS: Final = 300
-"""How many systems of inequalities one placement tries."""
+"""Most systems of inequalities that one placement solves."""
 
 MAX_TURNED: Final = 5
-"""How many objects are turned towards each other at most."""
+"""Most objects with an orientation; each has four candidate yaws, and all combinations are tried."""
 
 _TOLERANCE: Final = 1e-9
-"""By how much a bound may be missed."""
+"""Tolerance of bounds."""
 
 _DIGITS: Final = 9
-"""Significant digits of coordinates, so that a file says the same."""
+"""Significant digits of coordinates, in the samples and in their file."""
 
 _SHARES: Final = {2: 0.7, 3: 0.57}
-"""Gaps along two or three axes that are each less than such a share are less than 1 together."""
+"""Limit of the gap along each of two or three axes that keeps the distance below 1."""
 
 Ways: TypeAlias = list[list[Inequality]]
-"""Inequalities of which those of one list have to hold."""
+"""Alternatives: all inequalities of at least one list must hold."""
 
 
 class CannotPlaceError(Exception):
-    """Why no placement is possible, as part of a sentence."""
+    """No placement is possible; the message is the reason as part of a sentence."""
 
 
 class _Amount(NamedTuple):
-    """A weighted sum of unknowns plus a constant."""
+    """Weighted sum of unknowns plus a constant."""
 
     weights: dict[Any, float]
     constant: float = 0.0
@@ -135,14 +135,14 @@ class _Amount(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """Objects to place.
+    """Objects and signals to place, and the regions around them.
 
     Attributes:
         objects: names of tracked objects.
-        signals: names.
-        regions: by name.
+        signals: names of signals.
+        regions: shapes by name.
         upright: whether objects have heights.
-        turned: names of the objects that have an orientation.
+        turned: names of the objects with an orientation.
     """
 
     objects: Sequence[str]
@@ -154,11 +154,11 @@ class Setting:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Along which objects are placed."""
+        """Axes of the boxes."""
         return ("x", "y", "z") if self.upright else ("x", "y")
 
     def region_box(self, name: str, *, outer: bool) -> tuple[tuple[float, float], ...]:
-        """Return limits along x, y and, if it has a height, z: of a box around a region, or inside it."""
+        """Return a box around a region (`outer`) or inside it: limits along x, y and, with a height, z."""
         key = (name, outer)
         if key not in self._boxes:
             outline = self.regions[name]
@@ -168,21 +168,22 @@ class Setting:
 
 
 Core: TypeAlias = frozenset[tuple[int, int]]
-"""Facts, by sample and place, that exclude each other."""
+"""Facts that exclude each other, as pairs: index of the sample, index among its facts."""
 
 
 def placements(
     setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
 ) -> Iterator[tuple[tuple[Sample, ...] | None, Core | None]]:
-    """Yield placements in which facts have some values, the roomiest first, or what excludes each other.
+    """Yield placements in which facts have given values, those with the widest margins first.
 
-    Neither is known where that takes too long.
+    Each item has the samples of a placement, or the facts that exclude each other. Both are None if an
+    attempt reaches its limit.
 
     Args:
-        facts: of each sample, with their values.
+        facts: facts of each sample with their values.
 
     Raises:
-        CannotPlaceError: a fact is about something that is not placed.
+        CannotPlaceError: a fact mentions something that cannot be placed.
     """
     unit = _unit(setting, facts)
     turns = [_turns(setting, sample_facts) for sample_facts in facts]
@@ -209,7 +210,7 @@ def placements(
 
 
 def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
-    """Return a length that fits what the facts are about."""
+    """Return a typical length of boxes, from the regions or else from the thresholds of distances."""
     lengths = [
         high - low for name in setting.regions for low, high in setting.region_box(name, outer=False)[:2]
     ]
@@ -225,7 +226,7 @@ def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> flo
 
 
 class _Attempt:
-    """One placement in the making: unknowns are the least sides of boxes in each sample, and their sizes."""
+    """Attempt of one placement; unknowns are sizes of boxes, and lower sides and signals in each sample."""
 
     def __init__(self, setting: Setting, unit: float, margin: float, spread: float) -> None:
         self._setting = setting
@@ -235,20 +236,20 @@ class _Attempt:
         self._left = MAX_SOLUTIONS
 
     def sizes(self) -> Iterator[Inequality]:
-        """Yield that no box is too small or too large to be looked at."""
+        """Yield limits of the sizes of boxes, so that no box is too small or too large to see."""
         for name, axis in product(self._setting.objects, self._setting.axes):
             size = _Amount({("size", name, axis): 1.0})
             yield size.at_least(self._unit / self._spread)
             yield size.at_most(self._unit * self._spread)
 
     def ways(self, fact: Fact, value: bool, index: int) -> Ways:
-        """Return what makes a fact true, or false, in a sample.
+        """Return the alternatives that give a fact its value in a sample; none if it needs no inequality.
 
         Raises:
-            CannotPlaceError: it is about something that is not placed.
+            CannotPlaceError: the fact mentions something that cannot be placed.
         """
         if not fact.weights:
-            # objects are placed without a class
+            # placed objects have no class, so a quantifier over a class has no members
             if fact.alone is value:
                 return []
             raise CannotPlaceError(f"objects are not placed for `{fact.texts[0]}`")
@@ -257,7 +258,7 @@ class _Attempt:
         bound = float(fact.threshold) + (margin if rises else -margin)
         quantities = [quantity for quantity, _ in fact.weights]
         if isinstance(quantities[0], Misalignment):
-            # turned before anything is placed
+            # `_turns` decided the orientations before
             return []
         if all(isinstance(quantity, (Projection, CentroidProjection, Signal)) for quantity in quantities):
             total = _Amount({})
@@ -267,7 +268,7 @@ class _Attempt:
         if len(quantities) == 1:
             return self._relation(quantities[0], rises, bound, index)
         if len(quantities) == 2 and fact.weights[1][1] == -1:
-            # to bound a difference, both distances are bounded by a common middle value
+            # a difference of distances keeps a bound if a middle value separates the two distances
             return [
                 [*first_way, *second_way]
                 for middle in (0.0, self._unit, 3.0 * self._unit)
@@ -278,16 +279,16 @@ class _Attempt:
 
     @property
     def is_finished(self) -> bool:
-        """Whether all ways were tried that matter."""
+        """Whether the search ended before its limit."""
         return self._left > 0
 
     def solve(
         self, required: list[Inequality], choices: Sequence[Ways], samples: int
     ) -> Mapping[Any, float] | frozenset[int]:
-        """Return values of the unknowns, or the labels of what excludes each other.
+        """Return values of the unknowns, or the labels of facts that exclude each other.
 
-        The first choice is taken that the values so far do not fulfil. Where what excludes each other
-        is not about a choice, another way does not help.
+        The search branches on the first choice that the current values do not fulfil. A conflict without
+        that choice ends the branch, because it excludes all alternatives of the choice.
         """
         self._left -= 1
         start = self._start(samples)
@@ -314,7 +315,7 @@ class _Attempt:
     def sample(
         self, values: Mapping[Any, float], index: int, turns: Mapping[str, float], period_ns: int
     ) -> Sample:
-        """Return a sample of a solution."""
+        """Return a sample with the boxes and signals of a solution."""
         objects: dict[str, TrackedObject | Footprint] = {}
         for name in self._setting.objects:
             limits = []
@@ -331,7 +332,7 @@ class _Attempt:
         return Sample(index * period_ns, objects, signals)
 
     def _start(self, samples: int) -> dict[Any, float]:
-        """Return where objects stay unless a fact moves them: in a row below all regions."""
+        """Return the initial values of the unknowns: objects in a row below all regions, signals at 0."""
         boxes = [self._setting.region_box(name, outer=True) for name in self._setting.regions]
         left = min((box[0][0] for box in boxes), default=0.0)
         bottom = min((box[1][0] for box in boxes), default=0.0) - 2.0 * self._unit
@@ -347,7 +348,7 @@ class _Attempt:
         return start
 
     def _relation(self, quantity: Quantity, rises: bool, bound: float, index: int) -> Ways:
-        """Return what makes a distance or a protrusion at least, or at most, a bound."""
+        """Return the alternatives that bound a distance or a protrusion from below (`rises`) or above."""
         if isinstance(quantity, SignedDistance):
             first, second = plain(quantity.first), plain(quantity.second)
             bound += float(radius_of(first) + radius_of(second))
@@ -356,7 +357,7 @@ class _Attempt:
             bound += float(radius_of(second) - radius_of(first))
         else:
             raise CannotPlaceError("it compares quantities of several kinds")
-        # a region is taken for a box that makes it harder: around it to be away, inside it to be near
+        # a box replaces a region so that the relation gets harder: around it to be far, inside it to be near
         outers = (rises, rises) if isinstance(quantity, SignedDistance) else (not rises, rises)
         a = self._sides(first, index, outer=outers[0])
         b = self._sides(second, index, outer=outers[1])
@@ -372,7 +373,7 @@ class _Attempt:
         return [[gap.at_most(share * bound) for gap in gaps]]
 
     def _sides(self, term: Term, index: int, *, outer: bool) -> list[tuple[_Amount, _Amount]]:
-        """Return the least and the greatest coordinates of a term along its axes."""
+        """Return the least and the greatest coordinate of a term along each axis."""
         term = without_radius(term)
         if isinstance(term, RegionName):
             limits = self._setting.region_box(term.name, outer=outer)
@@ -409,7 +410,7 @@ class _Attempt:
 
 
 def _object(term: Term, index: int) -> tuple[str, int]:
-    """Return the object that a term is, and the sample in which it is meant."""
+    """Return the object of a term, and the index of its sample."""
     if isinstance(term, Earlier):
         if term.samples is None or not isinstance(term.term, TrackedName) or term.samples > index:
             raise CannotPlaceError("it looks back over a time, or before the first sample")
@@ -420,10 +421,10 @@ def _object(term: Term, index: int) -> tuple[str, int]:
 
 
 def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]:
-    """Return orientations, by quarters, for which facts about orientations have their values.
+    """Return yaws, in multiples of 90 degrees, that give facts about orientations their values.
 
     Raises:
-        CannotPlaceError: there are none, or too many objects.
+        CannotPlaceError: there are no such yaws, or too many objects.
     """
     asked = [
         (fact, value)
@@ -462,7 +463,7 @@ def _all_hold(way: Sequence[Inequality], values: Mapping[Any, float]) -> bool:
 
 
 def _missing(way: Sequence[Inequality], values: Mapping[Any, float]) -> float:
-    """Return by how much values miss the bounds of inequalities."""
+    """Return the greatest violation of some inequalities; 0 if all hold."""
     sums = (
         sum(weight * values[key] for key, weight in inequality.coefficients) - inequality.bound
         for inequality in way
@@ -477,10 +478,10 @@ def _round(value: float) -> float:
 # --------------------------------------------------------------------------------------------------- examples
 
 MAX_SAMPLES: Final = 40
-"""Longer runs are shown in words only."""
+"""Most samples of a placed run; longer runs are shown only in words."""
 
 MAX_WORDS: Final = 20
-"""How many runs of one length are tried until one can be placed."""
+"""Most runs of one length whose placement is tried."""
 
 _SECOND_NS: Final = 10**9
 _TENTH_NS: Final = 10**8
@@ -488,14 +489,14 @@ _TENTH_NS: Final = 10**8
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """The shortest run that satisfies a spec, or violates it.
+    """Shortest run that satisfies or violates a spec.
 
     Attributes:
-        verdict: what it is evaluated to.
-        sentences: what has to hold in each sample; everything else may hold or not.
-        samples: objects placed so; None if no placement was found.
-        robustness: of these samples; None without any.
-        note: why there are only words, or "".
+        verdict: verdict of the run.
+        sentences: requirements on each sample; other facts do not matter.
+        samples: samples of a placement; None if no placement was found.
+        robustness: robustness of the samples; None without samples.
+        note: reason why there is no placement, or "".
     """
 
     verdict: Literal["satisfied", "violated"]
@@ -506,12 +507,12 @@ class Example:
 
     @property
     def jsonl(self) -> str:
-        """The samples as a track file (JSONL); "" without any."""
+        """The samples as a track file (JSONL); "" without samples."""
         return "".join(f"{json.dumps(row, ensure_ascii=False)}\n" for row in self.rows)
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """The lines of that file."""
+        """The lines of the track file as values for JSON."""
         return [_row(sample) for sample in self.samples or ()]
 
 
@@ -526,12 +527,14 @@ def shortest_example(
     rate_hz: float | None = None,
     another: Callable[[Sequence[Word]], Word | None] = lambda avoided: None,
 ) -> Example | None:
-    """Return a run with what has to hold in its samples, placed if it can be.
+    """Return the example of a word, with samples if a placement is found.
 
     Args:
-        is_exact: otherwise the word is only a guess: without a placement that confirms it, there is no run.
-        rate_hz: samples per second of the run.
-        another: returns a word that is as short, and has nothing of what could not be placed.
+        is_exact: whether the word certainly has the verdict; if not, the result is None without a placement
+            that confirms it.
+        rate_hz: sample rate of the run, Hz.
+        another: function that returns another word of the same length, without the given words that cannot
+            be placed.
     """
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
     periods_ns = (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS)
@@ -542,7 +545,7 @@ def shortest_example(
     while len(avoided) < MAX_WORDS:
         facts = [[(search.fact(number), value) for number, value in sorted(cube.items())] for cube in word]
         sentences = tuple(
-            # two facts of one quantity may read the same
+            # two facts of one quantity can have the same text
             " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in sample_facts))
             or "any sample"
             for sample_facts in facts
@@ -579,10 +582,11 @@ def _place(
     """Return samples that evaluate to the verdict, and their robustness.
 
     Returns:
-        None for those if none are found; then why, and facts that cannot be placed together, if known.
+        Samples and robustness, or None if there are none; the reason for None; the facts that cannot be
+        placed together, if known.
 
     Raises:
-        CannotPlaceError: there is something that is not placed.
+        CannotPlaceError: the run contains something that cannot be placed.
     """
     if spec.parameter is not None:
         raise CannotPlaceError("a template is about the objects of a log")
@@ -607,7 +611,7 @@ def _place(
 
 
 def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tuple[str, float]:
-    """Return the verdict and the robustness of a spec; of its parts, where it nests too much for a whole."""
+    """Return verdict and robustness of a spec; a spec that is too deeply nested is evaluated by conjuncts."""
 
     def evaluation_of(*formulas: Formula) -> Evaluation:
         specs = [
@@ -624,7 +628,7 @@ def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tu
 
 
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:
-    """Return what there is to place: what the other specs are about, too, so that they can be evaluated."""
+    """Return the setting of a spec, with the objects and signals of all specs, so that all are evaluated."""
     own_atoms = _atoms(spec)
     every = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
     upright = is_about_heights(every)

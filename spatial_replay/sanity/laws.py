@@ -1,6 +1,7 @@
 """Laws of geometry: linear inequalities between measurements that hold for all footprints.
 
-Each holds for unions of convex parts, with heights or without; what the plane alone would allow is left out.
+Each law holds for unions of convex parts, with and without heights. Laws of the plane alone are left out,
+except for those with the label `LEVEL`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from spatial_replay.spec.formula import (
 )
 
 LEVEL: Final = -1
-"""The label of laws about objects without a gap in height; labels of facts are at least 0."""
+"""Label of laws about objects without a gap in height; labels of facts are at least 0."""
 
 
 def laws(
@@ -46,12 +47,12 @@ def laws(
     between: Mapping[Measurement, Fraction],
     diameters: Mapping[str, Fraction],
 ) -> list[Inequality]:
-    """Return the laws between quantities, and between these and others that are about the same terms.
+    """Return the laws of some quantities and of further measurements of their terms.
 
     Args:
-        inside: the protrusions that are at most 0.
-        between: distances of regions that are apart, and protrusions of regions from those around them.
-        diameters: of regions, for objects without a gap in height; none where heights count.
+        inside: protrusions that are at most 0.
+        between: distances of regions that are apart, and protrusions of regions from enclosing ones.
+        diameters: diameters of regions by name, for objects without a gap in height; empty if heights matter.
     """
     used = list(dict.fromkeys(quantities))
     present = set(terms_in(used))
@@ -65,7 +66,7 @@ def laws(
     distances = [quantity for quantity in used if isinstance(quantity, SignedDistance)]
     protrusions = [quantity for quantity in used if isinstance(quantity, Protrusion)]
     inequalities += _enlargement(distances, protrusions)
-    # in the order of the text, so that equal questions are answered by equal steps
+    # in text order (a set has no order), so that equal questions take equal steps
     bare = dict.fromkeys(
         _distance(without_radius(distance.first), without_radius(distance.second)) for distance in distances
     )
@@ -77,7 +78,7 @@ def laws(
     inequalities += _across(bare, outside, diameters)
     inequalities += _centres(outside, regions)
     if extents.matter:
-        # protrusions of regions are measured and rounded: exact extents add nothing to them
+        # protrusions between regions are already measured and rounded, so exact extents add nothing
         inequalities += extents.laws(
             bare, [protrusion for protrusion in outside if protrusion not in between]
         )
@@ -85,7 +86,7 @@ def laws(
 
 
 def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequality:
-    """Return the law that a weighted sum is at most a bound."""
+    """Return the law that a weighted sum of quantities is at most a bound."""
     total: dict[Quantity, int] = {}
     for quantity, weight in weights:
         total[quantity] = total.get(quantity, 0) + weight
@@ -111,7 +112,7 @@ def _single(used: Iterable[Quantity]) -> Iterator[Inequality]:
 
 
 def _region_laws(between: Mapping[Measurement, Fraction]) -> Iterator[Inequality]:
-    """Yield how far regions are apart at least, and how far they stick out of one another at most."""
+    """Yield the least distances between regions, and their greatest protrusions from enclosing regions."""
     for measurement, value in between.items():
         sign = -1 if isinstance(measurement, SignedDistance) else 1
         yield _law((measurement, sign), bound=sign * value)
@@ -120,7 +121,7 @@ def _region_laws(between: Mapping[Measurement, Fraction]) -> Iterator[Inequality
 def _across(
     distances: Iterable[SignedDistance], outside: Mapping[Protrusion, None], diameters: Mapping[str, Fraction]
 ) -> Iterator[Inequality]:
-    """Yield that two objects are at most the diameter of a region apart, plus how far they stick out."""
+    """Yield: two objects are at most the diameter of a region apart, plus their protrusions from it."""
     for pair, (name, diameter) in product(distances, diameters.items()):
         region = RegionName(name)
         rooms = [Protrusion(pair.first, region), Protrusion(pair.second, region)]
@@ -130,7 +131,7 @@ def _across(
 
 
 def _centres(outside: Mapping[Protrusion, None], regions: Mapping[str, Outline]) -> Iterator[Inequality]:
-    """Yield that a centre sticks out of a convex region at most as far as the whole."""
+    """Yield: the protrusion of a centre from a convex region is at most that of the whole footprint."""
     for protrusion in outside:
         inner, outer = protrusion.inner, protrusion.outer
         if not isinstance(inner, Centre) or not isinstance(outer, RegionName):
@@ -141,7 +142,7 @@ def _centres(outside: Mapping[Protrusion, None], regions: Mapping[str, Outline])
 
 
 def _enlargement(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
-    """Yield by how much enlarging changes a measurement at most: less where heights decide it."""
+    """Yield the greatest change of a measurement by enlargement; the change is less if heights decide it."""
     for first, second in _variants(
         distances, lambda distance: _distance(*map(without_radius, (distance.first, distance.second)))
     ):
@@ -160,7 +161,7 @@ _Measured = TypeVar("_Measured", SignedDistance, Protrusion)
 def _variants(
     measured: list[_Measured], bare_of: Callable[[_Measured], _Measured]
 ) -> Iterator[tuple[_Measured, _Measured]]:
-    """Yield pairs of measurements of the same terms, enlarged by different radii."""
+    """Yield pairs of measurements of the same terms with different enlargements."""
     alike: dict[_Measured, dict[_Measured, None]] = {}
     for measurement in measured:
         alike.setdefault(bare_of(measurement), {})[measurement] = None
@@ -183,7 +184,7 @@ def _growth(protrusion: Protrusion) -> Fraction:
 def _transitive(
     protrusions: dict[Protrusion, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
-    """Yield that a sticks out of c at most as far as a out of b and b out of c together."""
+    """Yield: the protrusion of a from c is at most that of a from b plus that of b from c."""
     outers: dict[Term, dict[Term, Protrusion]] = {}
     for protrusion in protrusions:
         if is_solid(protrusion.inner) and is_solid(protrusion.outer):
@@ -194,11 +195,11 @@ def _transitive(
         a, b = first.inner, first.outer
         for c, second in outers.get(b, {}).items():
             if a == c:
-                # a lies within b by no more than b sticks out of a
+                # if a is inside b with a margin, b protrudes from a by at least this margin
                 yield _law((first, -1), (second, -1))
-            # heights count between a and c, but not on the way over a region without any
+            # heights matter between a and c, but not in steps over a region b without a height
             is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
-            # steps over what no measurement begins or ends with say the same one by one
+            # a chain that leads to no measured protrusion of a adds nothing to its single steps
             is_nested = isinstance(b, RegionName) and isinstance(c, RegionName)
             leads = is_nested or c in outers[a] or not beyond.get(c, frozenset()).isdisjoint(outers[a])
             if a == c or is_gap or not (leads or is_flat(a, regions)):
@@ -213,7 +214,7 @@ def _transitive(
 
 
 def _reachable(term: Term, outers: Mapping[Term, Mapping[Term, Protrusion]]) -> frozenset[Term]:
-    """Return what a chain of protrusions leads to from a term."""
+    """Return the terms that chains of protrusions reach from a term."""
     waiting, reached = [term], set[Term]()
     while waiting:
         more = outers.get(waiting.pop(), {}).keys() - reached
@@ -225,7 +226,7 @@ def _reachable(term: Term, outers: Mapping[Term, Mapping[Term, Protrusion]]) -> 
 def _nesting(
     distances: dict[SignedDistance, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
-    """Yield that what is inside overlaps, and is as far from others as its outside or farther."""
+    """Yield: a nested term overlaps its outer term, and is at least as far from any third term."""
     inside: dict[Term, list[Protrusion]] = {}
     for protrusion in within:
         if is_solid(protrusion.inner) and is_solid(protrusion.outer):
@@ -247,7 +248,7 @@ def _nesting(
 
 
 class _Extents:
-    """The least and greatest coordinates of terms along the axes."""
+    """Least and greatest coordinates of terms along the axes."""
 
     def __init__(self, used: Iterable[Quantity], terms: list[Term], regions: Mapping[str, Outline]) -> None:
         along = [quantity for quantity in used if isinstance(quantity, (Projection, CentroidProjection))]
@@ -262,7 +263,7 @@ class _Extents:
     def laws(
         self, distances: Iterable[SignedDistance], protrusions: Iterable[Protrusion]
     ) -> Iterator[Inequality]:
-        """Yield the laws of extents, and those between them and other measurements."""
+        """Yield the laws between extents, and between extents and other measurements."""
         for term in self._terms:
             for axis in self._axes(term):
                 least, most = Projection(term, axis, "min"), Projection(term, axis, "max")
@@ -307,7 +308,7 @@ class _Extents:
 
 
 def extent(outline: Outline, axis: Axis) -> tuple[Fraction, Fraction] | None:
-    """Return the least and the greatest coordinate of a region along an axis; None without heights."""
+    """Return the least and the greatest coordinate of a region along an axis; None for z without a height."""
     if axis == "z":
         return None if outline.height is None else (exact(outline.height[0]), exact(outline.height[1]))
     coordinates = [exact(vertex["xy".index(axis)]) for vertex in outline.vertices]

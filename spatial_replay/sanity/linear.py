@@ -1,7 +1,8 @@
-"""Whether linear inequalities can hold together, exactly: a solution, or which of them exclude each other.
+"""Exact satisfiability of linear inequalities: a solution, or inequalities that exclude each other.
 
-The method is the simplex of solvers for satisfiability (Dutertre and de Moura, 2006). A strict inequality
-keeps an infinitesimal distance: numbers are pairs (a, b) that stand for a + b times a positive infinitesimal.
+The method is the simplex of SMT solvers (Dutertre and de Moura, "A Fast Linear-Arithmetic Solver for
+DPLL(T)", 2006, https://doi.org/10.1007/11817963_11). Strict inequalities need infinitesimals: a pair (a, b)
+is the number a + b * epsilon, where epsilon is a positive infinitesimal.
 """
 
 from __future__ import annotations
@@ -13,26 +14,26 @@ from operator import not_
 from typing import Final, NamedTuple, TypeAlias
 
 Real: TypeAlias = Fraction | float
-"""Fractions and whole numbers give exact answers, floats fast ones."""
+"""Number: fractions and integers give exact answers, floats fast answers."""
 
 Coefficients: TypeAlias = tuple[tuple[Hashable, Real], ...]
-"""Pairs of a quantity and its factor; no quantity twice."""
+"""Pairs of a quantity and its factor; each quantity occurs once."""
 
 _Pair: TypeAlias = tuple[Real, Real]
 
 MAX_PIVOTS: Final = 4000
-"""Steps after which an answer is no longer waited for."""
+"""Most pivots of one search."""
 
 _TOLERANCE: Final = 1e-9
-"""By how much floats may miss a bound."""
+"""Tolerance of bounds for floats."""
 
 
 class Inequality(NamedTuple):
-    """A weighted sum of quantities that is at most a bound.
+    """Weighted sum of quantities that is at most a bound.
 
     Attributes:
-        is_strict: it must be less than the bound.
-        label: what a conflict names it by; None for a law, which no conflict names.
+        is_strict: whether the sum must be less than the bound.
+        label: identifier in conflicts; None if conflicts do not list it.
     """
 
     coefficients: Coefficients
@@ -42,10 +43,10 @@ class Inequality(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """An answer; neither part is given if the search was not finished.
+    """Answer of `solve`; both attributes are None if the search reached its limit.
 
     Attributes:
-        values: of all quantities, that keep every inequality; of strict ones only the limit.
+        values: values of all quantities that keep every inequality; a strict inequality can be at its bound.
         conflict: labels of inequalities that exclude each other.
     """
 
@@ -60,13 +61,13 @@ def solve(
     exact: bool = True,
     start: Mapping[Hashable, Real] | None = None,
 ) -> Solution:
-    """Return values that keep all inequalities, or labels of some that exclude each other.
+    """Return values that keep all inequalities, or the labels of inequalities that exclude each other.
 
     Args:
-        laws: more inequalities, each of which is looked into only once values would break it: of many laws,
-            few matter to one question.
-        exact: compute with fractions; else with floats, up to a tolerance.
-        start: values that quantities keep unless an inequality moves them; 0 without it.
+        laws: further inequalities; a law is added once the current values violate it, because few of many
+            laws matter to one question.
+        exact: whether to compute with fractions; floats have a tolerance.
+        start: initial values of quantities, which only inequalities change; 0 by default.
     """
     tableau = _Tableau(0.0 if exact else _TOLERANCE, start or {})
     added, waiting = list(inequalities), list(laws)
@@ -86,7 +87,7 @@ def solve(
 
 
 def _ratio(value: Real, factor: Real) -> Real:
-    """Return an exact quotient of exact numbers; whole ones stay whole, which is several times as fast."""
+    """Return the quotient, exact for exact numbers; integers stay integers for ±1, which is faster."""
     if factor in (1, -1):
         return value * factor
     if isinstance(value, float) or isinstance(factor, float):
@@ -95,7 +96,7 @@ def _ratio(value: Real, factor: Real) -> Real:
 
 
 class _Tableau:
-    """Variables with bounds, some of which are sums of others; `conflict` once two bounds cross."""
+    """Variables with bounds; some variables are sums of others. `conflict` is set once two bounds cross."""
 
     def __init__(self, tolerance: float, start: Mapping[Hashable, Real]) -> None:
         self.conflict: set[int] | None = None
@@ -103,26 +104,26 @@ class _Tableau:
         self._tolerance = tolerance
         self._numbers: dict[Hashable, int] = {}
         self._quantities: dict[Hashable, int] = {}
-        # of each variable that is a sum: the factors of the others
+        # for each variable that is a sum, the factors of its summands
         self._rows: dict[int, dict[int, Real]] = {}
         self._value: list[_Pair] = []
         self._lower: list[tuple[_Pair, int] | None] = []
         self._upper: list[tuple[_Pair, int] | None] = []
 
     def extend(self, inequalities: Sequence[Inequality], first: int) -> set[int] | None:
-        """Add bounds, numbered from `first`, and move variables into all; return as `search` does."""
+        """Add bounds with numbers from `first` on and search again; return the result of `search`."""
         for index, inequality in enumerate(inequalities, first):
             if not self.add(inequality, index):
                 return self.conflict
         return self.search()
 
     def keeps(self, inequality: Inequality) -> bool:
-        """Return whether the present values keep an inequality that is not strict."""
+        """Return whether the current values keep an inequality that is not strict."""
         whole, small = self._sum({self._quantity(key): factor for key, factor in inequality.coefficients})
         return not self._below((inequality.bound, 0), (whole, small))
 
     def add(self, inequality: Inequality, index: int) -> bool:
-        """Add a bound; return whether it does not contradict the opposite bound."""
+        """Add a bound; return False if it contradicts the opposite bound."""
         coefficients, bound, is_strict, _ = inequality
         if not coefficients:
             if bound < -self._tolerance or (is_strict and bound <= 0):
@@ -146,7 +147,12 @@ class _Tableau:
         return self.conflict is None
 
     def search(self) -> set[int] | None:
-        """Move variables into their bounds; return what conflicts, or nothing if it takes too long."""
+        """Move all variables into their bounds.
+
+        Returns:
+            None if all are in their bounds, the numbers of conflicting inequalities otherwise; an empty set
+            after `MAX_PIVOTS` steps.
+        """
         for variable in range(len(self._value)):
             if variable not in self._rows:
                 self._enter(variable)
@@ -179,17 +185,17 @@ class _Tableau:
         return {key: self._value[number][0] for key, number in self._quantities.items()}
 
     def _variable(self, normal: Coefficients) -> int:
-        """Return the variable of a sum whose first factor is 1."""
+        """Return the variable of a normalized sum: its first factor is 1."""
         if len(normal) == 1:
             return self._quantity(normal[0][0])
         number = self._numbers.get(normal)
         if number is None:
-            # quantities are numbered before the sums of them
+            # quantities get their numbers before the sums of them
             terms = [(self._quantity(key), factor) for key, factor in normal]
             number = self._numbers[normal] = self._new()
             row: dict[int, Real] = {}
             for quantity, factor in terms:
-                # a quantity that a pivot made a sum is replaced by that sum
+                # a quantity that a pivot turned into a sum is replaced by this sum
                 whole: dict[int, Real] = self._rows.get(quantity, {quantity: 1})
                 for variable, weight in whole.items():
                     row[variable] = row.get(variable, 0) + factor * weight
@@ -212,7 +218,7 @@ class _Tableau:
         return len(self._value) - 1
 
     def _enter(self, variable: int) -> None:
-        """Move a variable that is no sum into its bounds."""
+        """Move a variable that is not a sum into its bounds."""
         lower, upper = self._lower[variable], self._upper[variable]
         if lower is not None and self._value[variable] < lower[0]:
             self._value[variable] = lower[0]
@@ -232,7 +238,8 @@ class _Tableau:
         return first[0] < second[0] - self._tolerance if self._tolerance else first < second
 
     def _violation(self) -> tuple[int, bool] | None:
-        """Return the first sum outside of its bounds, and whether it has to rise (Bland's rule)."""
+        """Return the first sum outside of its bounds, and whether it must rise; None if there is none."""
+        # the lowest number first (Bland's rule), so that the pivots cannot cycle
         for variable in sorted(self._rows):
             value, lower, upper = self._value[variable], self._lower[variable], self._upper[variable]
             if lower is not None and self._below(value, lower[0]):
@@ -242,14 +249,14 @@ class _Tableau:
         return None
 
     def _can_move(self, variable: int, factor: Real, rises: bool) -> bool:
-        """Return whether a variable can change so that a sum with it rises, or falls."""
+        """Return whether a variable can move so that a sum with it rises (`rises`) or falls."""
         up = (factor > 0) == rises
         bound = self._upper[variable] if up else self._lower[variable]
         value = self._value[variable]
         return bound is None or (self._below(value, bound[0]) if up else self._below(bound[0], value))
 
     def _pivot(self, leaving: int, entering: int, goal: _Pair) -> None:
-        """Set a sum to a bound by changing one of its variables, which becomes a sum in its place."""
+        """Set a sum to a bound by changing one of its variables; the sum and the variable exchange roles."""
         row = self._rows.pop(leaving)
         factor = row.pop(entering)
         step = tuple(_ratio(to - at, factor) for to, at in zip(goal, self._value[leaving], strict=True))

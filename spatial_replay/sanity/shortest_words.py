@@ -1,8 +1,8 @@
-"""The shortest run that automata accept or reject together, among the runs that geometry allows.
+"""Shortest runs that automata jointly accept or reject, among the runs that geometry allows.
 
-Many automata have more states together than can be visited. Short runs need no product: the demands of each
-automaton on a run of a few samples are a small diagram over the facts of all samples. A spec without an
-automaton has looser readings that still decide a part of the questions.
+The product of many automata has too many states for a search. Short runs need no product: the runs of a few
+samples with the outcome of an automaton are a small diagram over the facts of all samples. A spec without an
+automaton has looser readings, which still decide some questions.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ from spatial_replay.spec.walks import iter_formulas
 # -------------------------------------------------------------------------------------- runs of a few samples
 
 Cube: TypeAlias = dict[int, bool]
-"""Facts by number that have to be true, or false, in one sample."""
+"""Required values of facts in one sample, by number of the fact."""
 
 MAX_NODES: Final = 100_000
-"""How many nodes the diagrams about runs of one length have at most."""
+"""Most nodes in the diagrams of runs of one length."""
 
 MAX_CONFLICTS_OF_A_LENGTH: Final = 400
-"""How many combinations of facts geometry excludes at most before a length is given up."""
+"""Most combinations of facts that geometry excludes before a length is given up."""
 
 
 class TooManyConflictsError(Exception):
-    """More than `MAX_CONFLICTS_OF_A_LENGTH` combinations of facts were excluded."""
+    """Geometry excludes more than `MAX_CONFLICTS_OF_A_LENGTH` combinations of facts."""
 
 
 class Side(NamedTuple):
-    """An automaton, and whether it has to accept the run or to reject it."""
+    """Automaton with its required outcome: it accepts the run (`accepts`) or rejects it."""
 
     automaton: Automaton
     accepts: bool = True
 
     def agrees(self, state: int) -> bool:
-        """Return whether a run may end in a state."""
+        """Return whether a run that ends in a state has the required outcome."""
         return (state in self.automaton.accepting) == self.accepts
 
     def may_agree(self, state: int) -> bool:
-        """Return whether a run may still end as it has to."""
+        """Return whether a run can still get the required outcome from a state."""
         return state in (self.automaton.can_accept if self.accepts else self.automaton.can_reject)
 
     def least_remaining(self, state: int) -> int:
-        """Return how many samples it takes at least to end as it has to."""
+        """Return a lower bound of the samples from a state to the required outcome."""
         return self.automaton.distances[state] if self.accepts else int(not self.agrees(state))
 
 
@@ -78,19 +78,21 @@ def word_of_length(
     conflicts: Callable[[Cube], Iterable[Cube]],
     avoided: Sequence[Sequence[Cube]] = (),
 ) -> tuple[Cube, ...] | None:
-    """Return what has to hold in each sample of a run of some length that all sides agree with.
+    """Return the requirements on each sample of a run of given length with the outcomes of all sides.
+
+    The result is None if there is no such run.
 
     Args:
-        facts: the diagrams that conditions are in.
-        diagrams: new ones, of `MAX_NODES` at most, for those about runs.
-        condition_of: returns the condition of each proposition of an automaton.
-        conflicts: returns facts of one sample that exclude each other.
-        avoided: what no such run may have: facts of each sample, or of one in any.
+        facts: diagrams of the conditions.
+        diagrams: empty diagrams for the runs, with room for `MAX_NODES` nodes.
+        condition_of: function that returns the conditions of an automaton's propositions.
+        conflicts: function that returns combinations of facts in one sample that geometry excludes.
+        avoided: words that the run must not contain; a word of one cube is excluded in every sample.
 
     Raises:
-        NoAutomatonError: it takes too many nodes.
-        RecursionError: it takes too many facts.
-        TooManyConflictsError: geometry excludes too much.
+        NoAutomatonError: the diagrams need too many nodes.
+        RecursionError: the runs have too many facts.
+        TooManyConflictsError: geometry excludes too many combinations of facts.
     """
     runs = _Runs(length, facts, diagrams)
     whole = YES
@@ -118,10 +120,10 @@ def agreements(
     diagrams: Diagrams,
     condition_of: Callable[[Automaton], Sequence[int]],
 ) -> list[tuple[bool, bool]]:
-    """Return of each side whether it agrees with any of the runs in which some facts hold, and with all.
+    """Return two flags for each side: whether some run with a word has its outcome, and whether all have it.
 
     Raises:
-        NoAutomatonError: it takes too many nodes.
+        NoAutomatonError: the diagrams need too many nodes.
     """
     runs = _Runs(len(word), facts, diagrams)
     cube = {
@@ -135,7 +137,7 @@ def agreements(
 
 
 class _Runs:
-    """Diagrams about all samples of a run: the samples of one fact are next to each other."""
+    """Diagrams over the facts in all samples of a run; the variables of one fact are next to each other."""
 
     def __init__(self, length: int, facts: Diagrams, diagrams: Diagrams) -> None:
         self.diagrams, self._length, self._facts = diagrams, length, facts
@@ -146,7 +148,7 @@ class _Runs:
         return fact * self._length + index
 
     def clause(self, word: Sequence[Cube], first: int = 0) -> int:
-        """Return where facts of some samples do not all have their values."""
+        """Return the diagram of the runs that differ from a word, which begins at sample `first`."""
         cubes = enumerate(word, first)
         return clause(
             self.diagrams,
@@ -154,13 +156,13 @@ class _Runs:
         )
 
     def without(self, node: int, word: Sequence[Cube]) -> int:
-        """Return the runs in which facts do not all have their values: those of one sample, in none."""
+        """Return the runs of a diagram that contain a word nowhere."""
         for first in range(self._length - len(word) + 1):
             node = self.diagrams.both(node, self.clause(word, first))
         return node
 
     def split(self, cube: Cube) -> tuple[Cube, ...]:
-        """Return the facts of each sample."""
+        """Return the cubes of the samples from a cube over all samples."""
         word: tuple[Cube, ...] = tuple({} for _ in range(self._length))
         for variable, value in cube.items():
             fact, index = divmod(variable, self._length)
@@ -168,7 +170,7 @@ class _Runs:
         return word
 
     def agreeing_runs(self, side: Side, conditions: Sequence[int]) -> int:
-        """Return the runs that a side agrees with."""
+        """Return the diagram of the runs with the outcome of a side."""
         automaton = side.automaton
         nodes: dict[tuple[int, int], int] = {}
 
@@ -194,7 +196,7 @@ class _Runs:
         return after(automaton.initial, 0)
 
     def _in_sample(self, node: int, index: int) -> int:
-        """Return a condition on facts as one on a sample."""
+        """Return the diagram of a condition in one sample of the run."""
         key = node, index
         if key not in self._at:
             fact, low, high = self._facts[node]
@@ -209,7 +211,7 @@ class _Runs:
 
 
 def first_cube(diagrams: Diagrams, node: int) -> Cube:
-    """Return decisions that lead to true."""
+    """Return decisions on a path to true; a fact is true only if false leads nowhere."""
     cube: Cube = {}
     while node != YES:
         variable, low, high = diagrams[node]
@@ -219,7 +221,7 @@ def first_cube(diagrams: Diagrams, node: int) -> Cube:
 
 
 def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
-    """Return facts of a cube that make a condition true, without those that do not matter."""
+    """Return facts of a cube that make a condition true; without any of them it could be false."""
     for fact in sorted(cube, reverse=True):
         less = {number: value for number, value in cube.items() if number != fact}
         if _is_certain(diagrams, condition, less):
@@ -228,7 +230,7 @@ def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
 
 
 def _is_certain(diagrams: Diagrams, node: int, cube: Cube) -> bool:
-    """Return whether a function is true wherever some facts have their values."""
+    """Return whether the facts of a cube make a condition true, whatever the values of other facts."""
     waiting, visited = [node], {node}
     while waiting:
         current = waiting.pop()
@@ -246,7 +248,7 @@ def _is_certain(diagrams: Diagrams, node: int, cube: Cube) -> bool:
 
 
 def clause(diagrams: Diagrams, cube: Cube) -> int:
-    """Return where facts do not all have their values."""
+    """Return the condition that some fact of a cube has another value."""
     node = NO
     for fact in sorted(cube, reverse=True):
         node = diagrams.decide(fact, *((YES, node) if cube[fact] else (node, YES)))
@@ -256,51 +258,51 @@ def clause(diagrams: Diagrams, cube: Cube) -> int:
 # ----------------------------------------------------------------------------------------- runs of any length
 
 Word: TypeAlias = tuple[Cube, ...]
-"""Requirements on each sample of a run; the outcome is the same for all open propositions."""
+"""Requirements on each sample of a run; other facts do not change the outcome."""
 
 MAX_STEPS: Final = 100_000
-"""How many steps one question takes, each a decision of a diagram that is visited."""
+"""Most steps of one question; a step is a visited decision of a diagram."""
 
 MAX_ALL_STEPS: Final = 400_000
-"""How many steps all questions about one specification take together."""
+"""Most steps of all questions about one specification."""
 
 _STEPS_OF_GEOMETRY: Final = 50
-"""How many steps asking geometry counts as."""
+"""Steps that one check of geometry counts as."""
 
 MAX_CONFLICTS: Final = 2000
-"""How many combinations of facts geometry excludes at most before an answer is given up."""
+"""Most combinations of facts that geometry excludes before a question is given up."""
 
 
 MAX_LENGTHS: Final = 4
-"""How many lengths are tried for all automata at once, from the least that they allow."""
+"""Most lengths that are tried without a product, from the least possible length on."""
 
 MAX_SHORT: Final = 12
-"""The longest run that is looked for so."""
+"""Longest run that is searched for without a product, samples."""
 
 _ON_ONE_LEVEL: Final = "no gap in height"
-"""The condition of an exclusion that does not hold for objects above each other."""
+"""Text of the condition under which an exclusion holds, if objects above each other are no exclusion."""
 
 MAX_PAIRS: Final = 200
-"""How many pairs of automata are looked at for two that exclude each other."""
+"""Most pairs of automata that are tested for excluding each other."""
 
 Runs: TypeAlias = tuple[tuple[Side, ...], ...]
-"""Options: those runs that all sides of at least one of them agree with."""
+"""Alternatives: the runs that have the outcomes of all sides of at least one alternative."""
 
 
 class UndecidedError(Exception):
-    """A question that takes too many steps."""
+    """A question takes too many steps."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to one question.
+    """Answer to one question: the shortest run, or the reason why there is none.
 
     Attributes:
-        word: of the shortest run; None if there is none.
-        by_logic: whether there is none whatever the facts are about.
-        exclusions: facts that exclude each other, without which there would be one.
-        opposites: if it is by logic, relations that are each other's opposites, so that logic knows.
-        equals: if it is by logic, comparisons whose robustness is the same, as "x > 1" and "x >= 1".
+        word: requirements of the shortest run; None if there is no run.
+        by_logic: whether there is no run even without laws of geometry.
+        exclusions: facts that exclude each other by geometry; without these exclusions there would be a run.
+        opposites: with `by_logic`, pairs of relations that are each other's negation.
+        equals: with `by_logic`, pairs of comparisons with the same robustness, such as "x > 1" and "x >= 1".
     """
 
     word: Word | None
@@ -311,7 +313,7 @@ class Answer:
 
 
 class WordSearch:
-    """Answers questions about automata over the same conditions; what geometry excludes is kept."""
+    """Search for runs of automata over the same conditions; exclusions by geometry are stored."""
 
     def __init__(self, conditions: FactDiagrams) -> None:
         self._conditions = conditions
@@ -328,10 +330,10 @@ class WordSearch:
         self._steps = self._all_steps = 0
 
     def shortest(self, *runs: Runs) -> Answer:
-        """Return the shortest run that belongs to all of some runs.
+        """Return the answer on the shortest run in the intersection of some sets of runs.
 
         Raises:
-            UndecidedError: it takes too many steps.
+            UndecidedError: the search takes too many steps.
         """
         self._steps = 0
         options = _together(runs)
@@ -346,14 +348,14 @@ class WordSearch:
         return min(words, key=lambda answer: len(answer.word or ()), default=joint(answers))
 
     def is_found(self, *runs: Runs) -> bool:
-        """Return whether a run that belongs to all is found at once; if not, there may be one."""
+        """Return whether a short run in the intersection is found; False does not exclude longer runs."""
         return self._short(_together(runs)) is not None
 
     def another(self, length: int, avoided: Sequence[Word], *runs: Runs) -> Word | None:
-        """Return a run of some length that belongs to all of some runs; None if none is found.
+        """Return a run of given length in the intersection of some sets of runs; None if none is found.
 
         Args:
-            avoided: what it may not have, as in `word_of_length`.
+            avoided: words that the run must not contain, as in `word_of_length`.
         """
         for sides in _together(runs):
             try:
@@ -374,7 +376,7 @@ class WordSearch:
             self._all_steps += len(diagrams)
 
     def _short(self, options: Sequence[Sequence[Side]]) -> Word | None:
-        """Return the shortest run of a few samples; None if none is found."""
+        """Return the shortest run among runs of a few samples; None if none is found."""
         least = [
             max([1, *(side.least_remaining(side.automaton.initial) for side in sides)])
             for sides in options
@@ -388,10 +390,10 @@ class WordSearch:
                 try:
                     word = self._of_length(sides, length)
                 except (NoAutomatonError, RecursionError, TooManyConflictsError):
-                    # longer runs take more
+                    # longer runs need even more nodes
                     left.remove(sides)
                     continue
-                # a run with requirements says more than that any run of this length will do
+                # a run with requirements is preferred to an empty word, which stands for any run
                 if word is not None and any(word):
                     return word
                 anything = anything or word
@@ -400,7 +402,10 @@ class WordSearch:
         return None
 
     def _refine(self, sides: Sequence[Side]) -> Answer:
-        """Return the answer for all sides by that for a few: a run of these shows which one is missing."""
+        """Return the answer for all sides from answers for few sides.
+
+        A side that disagrees with the run of the few sides joins them.
+        """
         pairs = combinations(sides, 2) if len(sides) > 2 else ()
         for pair in islice(pairs, MAX_PAIRS):
             if self._short([pair]) is None and (answer := self._decide(pair)).word is None:
@@ -414,7 +419,7 @@ class WordSearch:
             subset.append(missing)
 
     def _disagreeing(self, sides: Sequence[Side], word: Word) -> Side | None:
-        """Return a side that may disagree with a run, of those that certainly do if there are any."""
+        """Return a side that may disagree with a run, preferably one that must; None if all agree."""
         diagrams = Diagrams(MAX_NODES)
         agreement_flags = agreements(sides, word, self._diagrams, diagrams, self._conditions_of)
         partly = [side for side, (_, is_whole) in zip(sides, agreement_flags, strict=True) if not is_whole]
@@ -431,7 +436,7 @@ class WordSearch:
             )
         numbers = sorted(self._read(sides))
         facts = [self.fact(number) for number in numbers]
-        # facts that "==" compares, and negated ones, have no opposites that need to be named
+        # opposites of exact comparisons and of negated relations need no explanation
         opposites = [
             fact.texts for fact in facts if fact.side == ">" and not any(map(is_negated, fact.texts))
         ]
@@ -442,21 +447,21 @@ class WordSearch:
         return [self._conditions.of(proposition.formula) for proposition in automaton.propositions]
 
     def _conflicts(self, cube: Cube) -> list[Cube]:
-        """Return the fewest facts of a cube that geometry excludes together, of each part that has some."""
+        """Return a minimal combination of facts that geometry excludes, for each part of a cube with one."""
         return list(filter(None, map(self._conflict, self._parts(cube))))
 
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
-        """Return the shortest run by A*: automata say how many samples it takes at least from here on."""
+        """Return the shortest run by A*; the automata give the lower bound of the remaining samples."""
         before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
         order = count()
-        # geometry is asked when a move leaves the queue: few of those that enter it do
+        # geometry is checked when a move leaves the queue, because most moves never leave it
         waiting: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
 
         def put_in(moves: int, leaves: Sequence[int], length: int, source: tuple[int, ...] | None) -> None:
             for leaf in leaves:
                 after = self._tuples[leaf]
                 if after not in before and all(map(Side.may_agree, sides, after)):
-                    # among equals, first those nearest to the end of the last side, then the longest
+                    # among equal bounds, moves near the end of the last side come first, then long runs
                     left = tuple(map(Side.least_remaining, sides, after))
                     key = length + max(left), left[::-1], -length
                     heappush(waiting, (key, next(order), moves, leaf, source))
@@ -484,7 +489,10 @@ class WordSearch:
             raise UndecidedError
 
     def _join(self, sides: Sequence[Side], states: Sequence[int]) -> tuple[int, list[int]]:
-        """Return where one sample leads to, as a diagram over facts, and its leaves: tuples of states."""
+        """Return the moves of all sides in one sample as a diagram over facts, and its leaves.
+
+        A leaf is a tuple with the next state of each side.
+        """
         nodes = [self._compose(side.automaton, state) for side, state in zip(sides, states, strict=True)]
         joined_nodes: dict[tuple[int, ...], int] = {}
 
@@ -508,7 +516,7 @@ class WordSearch:
         return whole, list(dict.fromkeys(decision.low for decision in decisions if decision.variable == LEAF))
 
     def _open_leaves(self, moves: int) -> set[int]:
-        """Return the leaves of a diagram to which facts lead that are not excluded together yet."""
+        """Return the leaves of a diagram that can be reached without a known exclusion."""
         key = moves, self._allowed
         if key not in self._open:
             leaves, waiting, visited = set(), [key], {key}
@@ -549,7 +557,7 @@ class WordSearch:
         return node(automaton.entries[state])
 
     def _leading(self, node: int, leaf: int) -> int:
-        """Return where a diagram leads to a leaf."""
+        """Return the condition under which a diagram leads to a leaf."""
         nodes: dict[int, int] = {}
 
         def to(inner: int) -> int:
@@ -566,7 +574,7 @@ class WordSearch:
         return result
 
     def _cube(self, condition: int) -> Cube | None:
-        """Return facts that make a condition true, and that geometry allows together; None without any."""
+        """Return a cube that makes a condition true and that geometry allows; None if there is none."""
         for _ in range(MAX_CONFLICTS):
             self._spend(_STEPS_OF_GEOMETRY)
             open_ = self._diagrams.both(condition, self._allowed)
@@ -582,7 +590,7 @@ class WordSearch:
         raise UndecidedError
 
     def _conflict(self, cube: Cube) -> Cube | None:
-        """Return the fewest of some facts that geometry excludes together; None if it allows them all."""
+        """Return a minimal combination of facts in a cube that geometry excludes; None if there is none."""
         numbers = self._impossible(cube)
         if numbers is None:
             return None
@@ -594,14 +602,14 @@ class WordSearch:
         return core
 
     def _impossible(self, cube: Cube) -> frozenset[int] | None:
-        """Return facts of a cube that geometry excludes together; None if it allows them all."""
+        """Return facts of a cube that exclude each other by geometry; None if it allows them all."""
         key = frozenset(cube.items())
         if key not in self._possible:
             self._possible[key] = self._ask_geometry(cube)
         return self._possible[key]
 
     def _parts(self, cube: Cube) -> list[Cube]:
-        """Return a cube in parts that are about different things: no law is about two of them."""
+        """Split a cube into parts without common terms or signals, so that no law connects two parts."""
         parts: list[tuple[frozenset[object], Cube]] = []
         for number, value in cube.items():
             about, part = self._about_of(number), {number: value}
@@ -615,7 +623,7 @@ class WordSearch:
         return [part for _, part in parts]
 
     def _about_of(self, number: int) -> frozenset[object]:
-        """Return the terms and signals that a fact is about."""
+        """Return the terms and signals of a fact."""
         if number not in self._terms:
             quantities = [quantity for quantity, _ in self._conditions.facts[number].weights]
             signals = [quantity for quantity in quantities if isinstance(quantity, Signal)]
@@ -642,14 +650,14 @@ class WordSearch:
         return solve(inequalities, geometry_laws).conflict
 
     def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
-        """Return the exclusions between facts that automata read; without any, those with other facts."""
+        """Return the exclusions between facts of the automata; else those with at least one such fact."""
         facts = self._read(sides)
         about = [(exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions]
         within = [exclusion for exclusion, read in about if facts >= read]
         return within or [exclusion for exclusion, read in about if facts & read]
 
     def _read(self, sides: Sequence[Side]) -> set[int]:
-        """Return the facts that automata read."""
+        """Return the facts in the conditions of the automata."""
         facts: set[int] = set()
         waiting = [
             self._conditions.of(proposition.formula)
@@ -677,12 +685,12 @@ class WordSearch:
 
 
 def _together(runs: Sequence[Runs]) -> list[tuple[Side, ...]]:
-    """Return the options of what belongs to all of some runs."""
+    """Return the alternatives of the intersection of some sets of runs."""
     return [tuple(chain.from_iterable(combination)) for combination in product(*runs)]
 
 
 def joint(answers: Sequence[Answer]) -> Answer:
-    """Return the answers that there is no run, of several questions, as one."""
+    """Merge the answers to several questions without a run into one."""
     exclusions = dict.fromkeys(exclusion for answer in answers for exclusion in answer.exclusions)
     opposites = dict.fromkeys(opposite for answer in answers for opposite in answer.opposites)
     equals = dict.fromkeys(equal for answer in answers for equal in answer.equals)
@@ -705,11 +713,11 @@ def _back(
 
 @dataclass(frozen=True)
 class SpecReading:
-    """The runs that satisfy a formula, and those that violate it, or more runs where it has no automaton.
+    """Runs that satisfy a formula and runs that violate it; without an automaton, supersets of these.
 
     Attributes:
-        satisfying, violating: None where not even a looser reading has an automaton.
-        reason: why a part of the formula has none; "" if all have.
+        satisfying, violating: sets of runs; None if not even a looser reading has an automaton.
+        reason: reason why a part of the formula has no automaton; "" if all parts have one.
     """
 
     satisfying: Runs | None
@@ -720,13 +728,13 @@ class SpecReading:
 def reading_of(
     specification: Specification, name: str, formula: Formula, rate_hz: float | None = None
 ) -> SpecReading:
-    """Return the automata that decide on a formula: one for each of the parts that have to hold together.
+    """Return the satisfying and violating runs of a formula, with one automaton for each conjunct.
 
-    Operators without an automaton are relaxed: a bounded `F` loses its bound, a past operator may hold or
-    not. Runs are only ever added, so that what the looser reading excludes is excluded.
+    Operators without an automaton are relaxed: a bounded `F` loses its bound, and a past operator may hold or
+    not. A looser reading only adds runs, so a run that it excludes is excluded by the formula, too.
 
     Args:
-        rate_hz: samples per second, which gives bounds in seconds an automaton.
+        rate_hz: sample rate for bounds in seconds, Hz; without it, such bounds have no automaton.
     """
     reasons: list[str] = []
     satisfying: list[Side] = []
@@ -752,7 +760,7 @@ def reading_of(
 
 
 def conjuncts(formula: Formula) -> tuple[Formula, ...]:
-    """Return formulas that hold together exactly where a formula does: `G (a and b)` is `(G a) and (G b)`."""
+    """Return formulas whose conjunction is equal to a formula: `G a` and `G b` for `G (a and b)`."""
     match formula:
         case Boolean(operator="and" | "spec"):
             return tuple(part for operand in formula.operands for part in conjuncts(operand))
@@ -775,10 +783,10 @@ def _is_always(formula: Temporal) -> bool:
 def automaton_of(
     specification: Specification, name: str, formula: Formula, rate_hz: float | None = None
 ) -> Automaton:
-    """Return the automaton of a formula in the words of a specification.
+    """Return the automaton of a formula with the definitions of a specification.
 
     Raises:
-        NoAutomatonError: as `automaton`.
+        NoAutomatonError: the formula has no automaton (see `automaton`).
     """
     alone = replace(specification, specs=(NamedSpec(name, formula),), source="")
     return automaton(alone, name, rate_hz=rate_hz, compiler="own")
@@ -789,7 +797,7 @@ def _loosely(specification: Specification, name: str, formula: Formula, *, posit
     for bounds in ("seconds", "all"):
         looser = loosen(signed, bounds)
         if looser is signed:
-            # it has no automaton as it is
+            # the unchanged formula has no automaton
             continue
         try:
             return Side(automaton_of(specification, name, looser))
@@ -799,11 +807,11 @@ def _loosely(specification: Specification, name: str, formula: Formula, *, posit
 
 
 def loosen(formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, loose: bool = True) -> Formula:
-    """Return a formula without past operators and bounds that holds wherever the formula does.
+    """Return a formula without past operators and bounds that a formula implies.
 
     Args:
-        bounds: drop those in seconds, or all.
-        loose: otherwise, return one that holds at most where the formula does.
+        bounds: bounds to drop, those in seconds or all.
+        loose: whether the formula implies the result; if not, the result implies the formula.
     """
     if not any(_is_obstacle(part, bounds) for part in iter_formulas(formula)):
         return formula
@@ -817,7 +825,7 @@ def loosen(formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, l
             operands = tuple(loosen(operand, bounds, loose=loose) for operand in formula.operands)
             if isinstance(formula, Boolean) or not _is_obstacle(formula, bounds):
                 return replace(formula, operands=operands)
-            # a window from 0 on has the present sample; any other may be empty
+            # a window from 0 on contains the current sample; any other window may be empty
             is_now = formula.bound is not None and formula.bound.lower == 0
             if (formula.operator == "G") == loose:
                 return operands[-1] if is_now else Truth(loose)
