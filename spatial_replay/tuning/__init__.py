@@ -1,1 +1,1 @@
-"""Tuning and learning: constants, or a whole specification, with which good runs and bad ones differ."""
+"""Tuning of constants and learning of specifications, so that good runs and bad runs differ."""

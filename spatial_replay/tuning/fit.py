@@ -35,7 +35,7 @@ _PHRASES: Phrases = MappingProxyType(
         "prec": ("lower than {b}", "not lower than {b}"),
     }
 )
-"""Names of a relation and of its opposite."""
+"""Phrases for a relation and for its negation."""
 _NAMED: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "dist": ("apart", "near"),
@@ -48,17 +48,17 @@ _NAMED: Mapping[str, tuple[str, str]] = MappingProxyType(
         "prec": ("lower", "not_lower"),
     }
 )
-"""Name of a spec about it."""
+"""Words for a relation and for its negation in names of specs."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimitedRelation:
-    """A relation that holds in a sample, or not.
+    """Relation with a limit, which holds or fails in each sample.
 
     Attributes:
-        direction: 0 where the quantity is at least a limit, 1 where its negative is.
-        limit: what it, or its negative, is at least; 0.0 for relations without a number.
-        other_limit: for a distance between two limits, the limit of its negative.
+        direction: 0 if the limit is for the quantity, 1 if it is for the negated quantity.
+        limit: lower limit; 0.0 for relations without a number.
+        other_limit: for a distance between two limits, lower limit of the negated distance; else None.
     """
 
     quantity: Quantity
@@ -67,7 +67,7 @@ class LimitedRelation:
     other_limit: float | None = None
 
     def text(self, taken: set[str]) -> str:
-        """Return it as written in a specification; `taken` are names that no variable may have."""
+        """Return the text of the relation in a specification; no variable has a name in `taken`."""
         parties = self.quantity.parties
         if not parties:
             name = written_name(self.quantity.signal, RELATION_NAMES)
@@ -99,16 +99,16 @@ class LimitedRelation:
 
     @property
     def _compared(self) -> str:
-        # 0 - limit rather than -limit: zero stays zero
+        # 0 - limit instead of -limit, which would be -0.0 for 0.0
         return (
             f"<= {format_number(0.0 - self.limit)}" if self.direction else f">= {format_number(self.limit)}"
         )
 
     def words(self, verb: Callable[[str], str]) -> str:
-        """Return it in words, as "red and blue are at least 0.05 apart".
+        """Return the relation in words, such as "red and blue are at least 0.05 apart".
 
         Args:
-            verb: returns what stands for "are" or "is".
+            verb: function that returns the words for "are" or "is".
         """
         quantity = self.quantity
         number = number_text(0.0 - self.limit if self.direction else self.limit)
@@ -131,7 +131,7 @@ class LimitedRelation:
 
     @property
     def name(self) -> str:
-        """Name of a spec about it, in letters, digits and underscores."""
+        """Name of a spec with the relation, in letters, digits and underscores."""
         which = _NAMED[self.quantity.relation][self.direction if self.other_limit is None else 1]
         names = [party.name for party in dict.fromkeys(self.quantity.parties)] or [self.quantity.signal]
         parts = [names[0], which, *names[1:]]
@@ -140,11 +140,11 @@ class LimitedRelation:
 
     @property
     def near(self) -> LimitedRelation:
-        """The same, of a distance between two limits only the greater one."""
+        """The relation; a distance between two limits keeps only its upper limit."""
         return self if self.other_limit is None else LimitedRelation(self.quantity, 1, self.other_limit)
 
     def opposite(self) -> LimitedRelation:
-        """Return that it does not hold."""
+        """Return the negated relation."""
         return replace(self, direction=1 - self.direction, limit=0.0 - self.limit)
 
 
@@ -154,11 +154,11 @@ def _party_text(party: Party) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One spec that is learned: a fact in time, or one fact before another.
+    """One learned spec: a relation with a temporal pattern, or an order of two relations.
 
     Attributes:
-        fact: what holds always, finally, eventually; what comes first, for "before" and "until".
-        later: what does not hold before that, for "before" and "until".
+        fact: relation that holds always, finally or eventually; for "before" and "until", the first one.
+        later: for "before" and "until", relation that does not hold before the first one; else None.
     """
 
     pattern: Pattern
@@ -166,7 +166,7 @@ class Line:
     later: LimitedRelation | None = None
 
     def formula(self, taken: set[str]) -> str:
-        """Return its formula as a text; `taken` are names that no variable may have."""
+        """Return the text of the formula; no variable has a name in `taken`."""
         text = self.fact.text(taken)
         if self.later is None:
             return f"{_OPERATORS[self.pattern]} ({text})"
@@ -201,7 +201,7 @@ class Line:
 
 
 def order_line(first: LimitedRelation, later: LimitedRelation) -> Line:
-    """Return that a fact holds before another one does, in the words that need the fewer negations."""
+    """Return the line for one relation before another, in the pattern with fewer negations."""
     is_positive = later.quantity.relation not in WITH_LIMIT and not later.direction
     return Line("before" if is_positive else "until", first, later)
 
@@ -211,31 +211,31 @@ def order_line(first: LimitedRelation, later: LimitedRelation) -> Line:
 PATTERNS: Final[tuple[Pattern, ...]] = ("always", "finally", "eventually")
 ALWAYS, FINALLY, EVENTUALLY = range(3)
 _MARGIN: Final = 3.0
-"""Mean distances between the good runs' values that a limit keeps from the nearest of them."""
+"""Margin of a limit from the nearest good run, in mean distances between the values of good runs."""
 _FINEST: Final = 0.01
-"""The least margin, as a part of the value itself."""
+"""Least margin, as a fraction of the value."""
 _SURE: Final = 4.0
-"""A bad run so many margins away is distinguished as surely as any."""
+"""Distance from the good runs, in margins, at which a bad run is fully distinguished."""
 _MOST_EVENTS: Final = 40
 _STILL: Final = 1e-3
 """Least movement, as a fraction of the greatest distance."""
 _STAYS: Final = 0.05
-"""Greatest displacement of a landmark, as a fraction of the longest way."""
+"""Greatest displacement of a landmark, as a fraction of the farthest displacement of an object."""
 _SCORED_RUNS: Final = 10
 _MOST_BITS: Final = 6.0
 
 
 @dataclass(frozen=True, eq=False)
 class FittedLimits:
-    """Every quantity's limits, fitted to some runs.
+    """Limits of all quantities, fitted to some runs.
 
     Attributes:
-        quantities: Q of them.
-        good, bad: the numbers of the runs.
-        limits: (3, 2, Q) by pattern and direction; NaN where no limit holds in all good runs.
-        lowest: (3, 2, Q), the lowest value of the good runs.
-        margins: (3, 2, Q), how far limits keep from it.
-        apart: (3, 2, Q, B), how surely each bad run is distinguished, 0 to 1.
+        quantities: Q quantities.
+        good, bad: measured runs, among them B bad ones.
+        limits: (3, 2, Q), limits by pattern and direction; NaN if no limit holds in all good runs.
+        lowest: (3, 2, Q), lowest values of the good runs.
+        margins: (3, 2, Q), margins between lowest values and limits before bad runs move the limits.
+        apart: (3, 2, Q, B), degree to which a limit distinguishes each bad run, 0 to 1.
     """
 
     quantities: tuple[Quantity, ...]
@@ -250,12 +250,12 @@ class FittedLimits:
     def to(
         cls, quantities: Sequence[Quantity], good: Sequence[Observed], bad: Sequence[Observed]
     ) -> FittedLimits:
-        """FittedLimits limits to the runs.
+        """Fit limits to the runs.
 
         A limit keeps a margin from the lowest value of the good runs. The margin is three times the mean
-        distance of their values, at most half the way to the nearest bad run. A bad run that no limit
-        distinguishes this way moves the limit that it is farthest behind, in margins, to the middle between
-        it and the good runs.
+        distance of their values, and at most half of the way to the nearest bad run. If no limit
+        distinguishes a bad run, one limit moves to the middle between that run and the good runs. It is the
+        limit with the greatest gap between them, in margins.
         """
         values = np.stack([_by_pattern(run, 0) for run in good], axis=-1)
         lowest = values.min(axis=-1)
@@ -266,7 +266,7 @@ class FittedLimits:
         valid = np.isfinite(lowest) & np.isfinite(margins) & (with_limit | (lowest >= 0.0))
         _leave_out(valid, quantities, lowest)
         limits = np.where(with_limit, lowest - margins, 0.0)
-        # a limit for objects that never overlapped does not let them overlap
+        # objects that never overlapped get a limit of at least 0, which excludes overlaps
         is_distance = np.array([quantity.relation == "dist" for quantity in quantities])
         limits[:, 0] = np.where(
             is_distance & (lowest[:, 0] >= 0.0), np.maximum(limits[:, 0], 0.0), limits[:, 0]
@@ -297,7 +297,7 @@ class FittedLimits:
         return cls(tuple(quantities), tuple(good), tuple(bad), limits, lowest, margins, apart)
 
     def fact(self, pattern: int, direction: int, quantity: int) -> LimitedRelation:
-        """Return a quantity with its limit, as a short decimal that still holds."""
+        """Return the relation of a quantity with its limit, rounded to a short decimal that still holds."""
         subject = self.quantities[quantity]
         if subject.relation not in WITH_LIMIT:
             return LimitedRelation(subject, direction, 0.0)
@@ -311,7 +311,7 @@ class FittedLimits:
 
     @cached_property
     def scale(self) -> float:
-        """The greatest distance of any pair in the good runs."""
+        """The greatest distance of two objects in the first good runs."""
         distances = [
             run.greatest[0, 1, index]
             for run in self.good[:_SCORED_RUNS]
@@ -322,7 +322,7 @@ class FittedLimits:
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
-        """For each quantity that is about a class, those about its members; none for the others."""
+        """For each quantity, indices of the same quantity of members of its class; empty without a class."""
         classes = members_of(self.good[0].trace)
         numbers = {
             (quantity.relation, parties): index
@@ -348,7 +348,7 @@ class FittedLimits:
 
     @cached_property
     def moves(self) -> Booleans:
-        """(Q,), whether each quantity varies in a good run."""
+        """(Q,), whether each quantity varies in some good run."""
         travel = np.max([run.travel for run in self.good], axis=0)
         is_length = np.array(
             [quantity.relation not in ("oriented", "signal") for quantity in self.quantities]
@@ -357,7 +357,7 @@ class FittedLimits:
 
     @cached_property
     def landmarks(self) -> frozenset[Party]:
-        """The objects, and whole classes, that stay where they are in all good runs."""
+        """Objects, and classes of objects, that stay in place in all good runs."""
         shifts = {
             name: max(run.shifts[name] for run in self.good)
             for name in set.intersection(*(set(run.shifts) for run in self.good))
@@ -373,7 +373,7 @@ class FittedLimits:
         return frozenset([*map(Party, still), *(Party(name, True) for name in whole)])
 
     def bits_between(self, quantity: int) -> float:
-        """Return how much it says that a distance is between both its limits at the end."""
+        """Return the information of "the distance is between its limits at the end", bits."""
         limits = self.limits[FINALLY, :, quantity, None]
         limits = np.where(np.isfinite(limits), limits, -np.inf)
         inside = [(run.sampled[:, quantity] >= limits).all(axis=0).mean() for run in self.good[:_SCORED_RUNS]]
@@ -381,8 +381,11 @@ class FittedLimits:
 
     @cached_property
     def bits(self) -> Floats:
-        """(3, 2, Q), the information of each line. For `F`: how seldom it holds. For `G`: how close it comes
-        to failing, relative to its variation."""
+        """(3, 2, Q), information of each line, bits.
+
+        It is higher for a line with `F` that holds in fewer samples. It is higher for a line with `G` that
+        comes closer to failing, relative to its variation.
+        """
         some = self.good[:_SCORED_RUNS]
         share = np.mean([(run.sampled[None] >= self.limits[..., None]).mean(axis=-1) for run in some], axis=0)
         bits = -np.log2(np.maximum(share, 2.0**-_MOST_BITS))
@@ -394,14 +397,14 @@ class FittedLimits:
         near = np.maximum(np.abs(self.lowest[ALWAYS]) + self.margins[ALWAYS], 1e-12)
         with np.errstate(invalid="ignore", divide="ignore"):
             tight = np.log2(np.where(is_distance, self.scale / 2.0, travel) / near)
-        # that a relation never holds, and what a signal's limits are, may be an accident
+        # a relation that never holds, and the limits of a signal, may be accidental
         tight[1, ~is_distance] = 0.0
         tight[:, has_no_length | ~self.moves] = 0.0
         bits[ALWAYS] = tight
         return np.where(np.isfinite(self.limits), np.clip(bits, 0.0, _MOST_BITS), 0.0)
 
     def events(self) -> list[LimitedRelation]:
-        """Return facts that hold at the end of all good runs, not at their beginning, the rarest first."""
+        """Return relations that hold at the end of all good runs but at no beginning, the rarest first."""
         begun = np.stack([run.first[:, 1] for run in self.good], axis=-1).max(axis=-1)
         limits = self.limits[FINALLY]
         is_event = np.isfinite(limits) & (begun < limits) & (self.bits[FINALLY] > 0.0)
@@ -411,7 +414,7 @@ class FittedLimits:
         return [self.fact(FINALLY, direction, index) for direction, index in where[order].tolist()]
 
     def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
-        """Return in which sample each fact first holds for sure, and in which it first may, (F, R) each."""
+        """Return the first sample in which each relation certainly holds, and may hold, (F, R) each."""
         first_times = [
             [
                 [run.first_time(fact.quantity, fact.direction, fact.limit, surely=surely) for run in runs]
@@ -423,10 +426,11 @@ class FittedLimits:
         return sure, possible
 
     def orders(self, facts: Sequence[LimitedRelation]) -> list[tuple[Line, int, Booleans]]:
-        """Return which facts come before which others in all good runs.
+        """Return the orders of relations that are the same in all good runs.
 
         Returns:
-            Each line, the fewest samples between both facts, and which bad runs have the other order.
+            For each order: its line, the least number of samples between the relations, and a flag for each
+            bad run with the reverse order.
         """
         facts = [fact.near for fact in facts]
         sure, possible = self.times(facts, self.good)
@@ -445,12 +449,12 @@ class FittedLimits:
 
 
 def _by_pattern(run: Observed, end: int) -> Floats:
-    """Return what decides each pattern, by direction, (3, 2, Q): the least, last and greatest number."""
+    """Return the deciding number of each pattern and direction, (3, 2, Q): least, last and greatest."""
     return np.stack((run.least[:, end], run.last[:, end], run.greatest[:, end]))
 
 
 def _leave_out(valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) -> None:
-    """Mark what another quantity says better, or what no one would write."""
+    """Mark limits as invalid that another quantity expresses better, or that no one would write."""
     inside: dict[frozenset[Party], Booleans] = {}
     for index, quantity in enumerate(quantities):
         if quantity.relation == "enclosedin":
@@ -459,21 +463,21 @@ def _leave_out(valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) 
         if quantity.relation == "oriented":
             valid[:, 1, index] = False
         elif quantity.relation == "dist":
-            # not written: how deep two objects overlap, or that they were far apart at some time
+            # left out are the depth of an overlap, and a large distance at some time
             valid[:, 0, index] &= lowest[:, 0, index] >= 0.0
             valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
             valid[EVENTUALLY, 0, index] = False
         elif quantity.relation == "ovlp":
-            # what is inside overlaps, too
+            # an object inside another one overlaps it, too
             valid[:, 0, index] &= ~inside.get(quantity.pair, np.zeros(3, bool))
             valid[:, 1, index] = False
         elif quantity.relation not in WITH_LIMIT:
-            # that it does not hold is worth saying if it never does
+            # a negated relation is written only if the relation never holds
             valid[1:, 1, index] = False
 
 
 def _short(limit: float, margin: float, lowest: float) -> float:
-    """Return a limit rounded down to a part of its margin, at most the lowest value."""
+    """Return a limit rounded down to two digits of its margin, at most the lowest value."""
     if margin <= 0.0:
         return limit
     exponent = floor(log10(margin)) - 1
@@ -483,9 +487,9 @@ def _short(limit: float, margin: float, lowest: float) -> float:
 
 
 def _one_digit(limit: float, lowest: float) -> float | None:
-    """Return the number of one digit from a limit up to the lowest value; None if there is none, or several.
+    """Return the only number with one digit between a limit and the lowest value; None if there is none.
 
-    People write 0.05 rather than 0.0487, and good runs that come near a limit say no more.
+    People write 0.05 instead of 0.0487, and good runs alone do not decide between the two.
     """
     step = Decimal(1).scaleb(floor(log10(max(abs(limit), abs(lowest)) or 1.0)))
     first = (Decimal(limit) / step).to_integral_value(ROUND_CEILING)

@@ -1,4 +1,4 @@
-"""Specifications learned from runs: their lines, the evidence for each, and a check on runs left out."""
+"""Specifications learned from runs: lines, evidence for each line, and a check by cross-validation."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ from spatial_replay.tuning.tuned import require_comparable
 
 _LEAST_BITS: Final = 0.25
 _LEAST_BITS_NEAR: Final = 1.5
-"""Bits that a line needs; one that says that something always stays near, or inside."""
+"""Least information of a line, bits: in general, and for lines such as "always near" or "always inside"."""
 _ALIKE: Final = 1.25
 _ALIKE_ALWAYS: Final = 2.0
-"""The greatest ratio of limits that are written as one of a class: at the end, and of what always holds."""
+"""Greatest ratio of members' limits for which one line of the class replaces theirs: at the end, with `G`."""
 _NEXT_LINE: Final = 0.6
-"""Weight of a second line about an object, and of each further one."""
+"""Factor of the weight of a line for each earlier line with the same object."""
 _LEAST_GAIN: Final = 0.25
 _LESS: Final = 0.5
-"""The bad runs that a further line has to distinguish; by how much less a run counts after that."""
+"""Least number of bad runs that a further line distinguishes; loss of weight of a distinguished run."""
 _NEVER: Final = 0.3
-"""How surely an event that never comes distinguishes a bad run; how the run ends says more."""
+"""Weight of a bad run in an order whose first event never happens; a line about the end says more."""
 _DISTANCES: Final = 2
-"""How many distances from landmarks say where one object is put: two leave two places in the plane."""
+"""Most distances from landmarks for one object; two distances leave two possible places in the plane."""
 _LEAST_BITS_PLACED: Final = 2.0
-"""Least weight of an object's distance from the nearest landmark."""
+"""Least information of a distance from the nearest landmark and of an object inside a landmark, bits."""
 _SHARE_OF_ALWAYS: Final = 1 / 3
-"""The most of all lines without bad runs that say what always holds, and that say orders."""
+"""Greatest share of lines with `G`, and of lines about orders, if there are no bad runs."""
 _PLAIN_BEFORE: Final = 0.8
 _PLAIN_UNTIL: Final = 0.6
 """Weight of a distinguished bad run in lines about orders; see `_plainness`."""
@@ -63,13 +63,13 @@ _DIRECTIONS: Final = frozenset({"leftof", "below", "prec"})
 
 
 def chosen_lines(fit: FittedLimits, most: int) -> tuple[Line, ...]:
-    """Return the lines to write, the most distinctive ones first: at most `most`."""
+    """Return at most `most` lines for the specification, the most distinctive first."""
     lines = _distinctive(fit, most) if fit.bad else _characteristic(fit, most)
     return tuple(_join_limits(lines))
 
 
 def _distinctive(fit: FittedLimits, most: int) -> list[Line]:
-    """Return lines by how many bad runs they distinguish that the lines before them have not."""
+    """Return lines, each with the most bad runs that the earlier lines do not distinguish."""
     where = np.argwhere((fit.apart > 0.0).any(axis=-1))
     events = fit.events()
     lengths = np.array([len(run.trace) for run in fit.bad])
@@ -94,7 +94,7 @@ def _distinctive(fit: FittedLimits, most: int) -> list[Line]:
         if best < len(where):
             pattern, direction, quantity = where[best].tolist()
             result.append(Line(PATTERNS[pattern], fit.fact(pattern, direction, quantity)))
-            # what is said of a class is said of its members
+            # a line about a class includes its members
             member_rows = [rows.get((pattern, direction, member)) for member in fit.members[quantity]]
             apart[[row for row in member_rows if row is not None]] = 0.0
         else:
@@ -105,7 +105,7 @@ def _distinctive(fit: FittedLimits, most: int) -> list[Line]:
 
 
 def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -> float:
-    """Return what it is worth to distinguish a bad run in a line that people write often, or seldom."""
+    """Return the weight of a distinguished bad run: higher for kinds of lines that people often write."""
     relation = fit.quantities[quantity].relation
     if pattern == ALWAYS and relation == "dist" and not direction:
         return 1.0
@@ -120,14 +120,14 @@ def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -
 
 
 def _join(groups: list[set[Party]], pair: tuple[Party, ...]) -> bool:
-    """Join the groups of two objects, and return whether they were apart."""
+    """Join the groups of two objects; return whether the objects were in different groups."""
     touching = [group for group in groups if not group.isdisjoint(pair)]
     groups[:] = [*(group for group in groups if group not in touching), set(pair).union(*touching)]
     return not any(group.issuperset(pair) for group in touching)
 
 
 def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
-    """Return lines of what good runs have in common: goals first, then what always holds, then orders."""
+    """Return lines that describe all good runs: goals first, then invariants, then orders."""
     share = max(1, int(most * _SHARE_OF_ALWAYS))
     always = _invariants(fit)[:share]
     goals = _goals(fit)[: max(1, most - len(always))]
@@ -136,7 +136,7 @@ def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
 
 
 def _goals(fit: FittedLimits) -> list[Line]:
-    """Return how good runs end: a distance for each object, and relations that began otherwise."""
+    """Return lines about the end of good runs: a distance for each object, and changed relations."""
     scored: list[tuple[float, int, Line]] = []
     joined, placed = list[set[Party]](), Counter[Party]()
     pairs = set()
@@ -153,7 +153,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
                 fact = replace(fit.fact(FINALLY, 0, index), other_limit=near.limit)
             bit = fit.bits_between(index)
             if centre in quantity.parties or any(placed[party] == 1 for party in quantity.parties):
-                # the nearest landmark says most, whatever the way there was
+                # the nearest landmark describes a place best, whatever the path of the object
                 bit = max(bit, _LEAST_BITS_PLACED)
             scored.append((bit, index, Line("finally", fact)))
             pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
@@ -173,7 +173,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
         if index in of_class or not (began or quantity.pair in pairs):
             continue
         if quantity.relation == "ovlp" and quantity.pair in pairs:
-            # what is inside overlaps, too
+            # an object inside another one overlaps it, too
             continue
         of_class.update(fit.members[index])
         if quantity.relation in _DIRECTIONS:
@@ -189,22 +189,22 @@ def _goals(fit: FittedLimits) -> list[Line]:
 
 
 def _begins_otherwise(fit: FittedLimits, index: int) -> bool:
-    """Return whether what holds at the end holds in no good run's first sample."""
+    """Return whether a relation at the end holds in the first sample of no good run."""
     return bool(max(run.first[0, 1, index] for run in fit.good) < fit.limits[FINALLY, 0, index])
 
 
 def _said_at_end(fit: FittedLimits, index: int) -> float:
-    """Return how much it says that a relation holds at the end."""
+    """Return the information of a relation at the end, bits."""
     quantity, bits = fit.quantities[index], float(fit.bits[FINALLY, 0, index])
     is_put = quantity.relation == "enclosedin" and quantity.parties[1] in fit.landmarks
     if is_put and _begins_otherwise(fit, index):
-        # what is put into a landmark is there on purpose, also where that is done early in each run
+        # an object is put into a landmark on purpose, even if this happens early in each run
         return max(bits, _LEAST_BITS_PLACED)
     return bits
 
 
 def _centre(fit: FittedLimits) -> Party | None:
-    """Return the landmark next to which most objects end, such as a plate; None if no two end by the same."""
+    """Return the landmark next to which most objects end, such as a plate; None if no landmark has two."""
     nearest: dict[Party, tuple[float, Party]] = {}
     for index, quantity in enumerate(fit.quantities):
         still = [party for party in quantity.parties if party in fit.landmarks and not party.is_class]
@@ -221,9 +221,9 @@ def _centre(fit: FittedLimits) -> Party | None:
 
 
 def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centre: Party | None) -> bool:
-    """Return whether a distance says where something is put by what stays, as no two others do yet.
+    """Return whether a distance from a landmark adds to the place of a moved object; count it if so.
 
-    That from the centre always does.
+    An object has at most `_DISTANCES` of them, and always the distance from the centre.
     """
     moved = [party for party in quantity.parties if party not in fit.landmarks]
     if len(moved) != 1 or (placed[moved[0]] >= _DISTANCES and centre not in quantity.parties):
@@ -233,12 +233,12 @@ def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centr
 
 
 def _by_worth(fit: FittedLimits, bits: float, index: int) -> tuple[bool, float, bool, int]:
-    """Return what orders relations: overlaps last, the rarest first, classes before their members."""
+    """Return the sort key of a relation: overlaps last, rare relations first, classes before members."""
     return fit.quantities[index].relation == "ovlp", -round(bits, 1), not fit.members[index], index
 
 
 def _spread(scored: list[tuple[float, Line]], landmarks: frozenset[Party]) -> list[Line]:
-    """Return lines by their bits, each counting for less the more lines there are about what it moves."""
+    """Return lines by their bits; each earlier line about the same moved object reduces the bits."""
     counts = Counter[Party]()
     result = []
     left = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored]
@@ -253,9 +253,9 @@ def _spread(scored: list[tuple[float, Line]], landmarks: frozenset[Party]) -> li
 
 
 def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool:
-    """Return whether all members of a class, where a quantity is about one, keep about the same limit.
+    """Return whether all members of a quantity's class have similar limits.
 
-    Then the class is written in place of its members.
+    If so, one line about the class replaces the lines about its members.
     """
     limit = abs(float(fit.limits[pattern, direction, index]))
     alike = _ALIKE_ALWAYS if pattern == ALWAYS else _ALIKE
@@ -269,7 +269,7 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
 
 
 def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
-    """Yield the distances at the end by how well they place something; with landmarks, the least first."""
+    """Yield weighted distances at the end; the weight is nearness with landmarks, else precision of place."""
     for index, quantity in enumerate(fit.quantities):
         far, near = fit.limits[FINALLY, :, index]
         if quantity.relation != "dist" or not near < 0.0 or not fit.moves[index]:
@@ -288,7 +288,7 @@ def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
 
 
 def _leads(before: dict[tuple[str, Party], set[Party]], relation: str, first: Party, second: Party) -> bool:
-    """Return whether a chain of directions that are written leads from one object to another."""
+    """Return whether a chain of already written directions leads from one object to another."""
     reached, left = {first}, [first]
     while left:
         for follower in before.get((relation, left.pop()), ()):
@@ -299,7 +299,7 @@ def _leads(before: dict[tuple[str, Party], set[Party]], relation: str, first: Pa
 
 
 def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[float, int, Line]]:
-    """Yield what holds at some time in good runs, but neither at their beginning nor at their end."""
+    """Yield lines about relations that hold during good runs, but not at the beginning or the end."""
     for index, quantity in enumerate(fit.quantities):
         if quantity.relation not in ("enclosedin", "dist") or quantity.pair in pairs or fit.members[index]:
             continue
@@ -315,7 +315,7 @@ def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[f
 
 
 def _invariants(fit: FittedLimits) -> list[Line]:
-    """Return what always holds, by how near it comes to not holding; classes in place of their members."""
+    """Return lines with `G`, those closest to failing first; a class replaces its members."""
     scored = []
     for direction, index in np.argwhere(fit.bits[ALWAYS] >= _LEAST_BITS).tolist():
         fact, bits = fit.fact(ALWAYS, direction, index), float(fit.bits[ALWAYS, direction, index])
@@ -330,11 +330,11 @@ def _invariants(fit: FittedLimits) -> list[Line]:
 
 
 def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line]:
-    """Yield the order in which goals are reached, each before the next."""
+    """Yield lines for the order in which goals are reached."""
     goals = [goal.near for goal in goals]
     times, _ = fit.times(goals, fit.good)
     gaps = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
-    # a goal that holds from the beginning is not reached
+    # a goal that holds in the first sample has no place in the order
     reached = [
         goals[index]
         for index in np.argsort(np.median(times, axis=1), kind="stable").tolist()
@@ -347,12 +347,12 @@ def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line
             yield gaps[key][0]
             last = None
         else:
-            # at the same time: what comes after both comes after the first
+            # both goals are reached at the same time, so the next goal is compared with the first of them
             last = last or first
 
 
 def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
-    """Yield lines with the two limits of one distance in one."""
+    """Yield lines; lines with the two limits of one distance become one line."""
     limits: dict[tuple[str, Quantity, int], LimitedRelation] = {
         (line.pattern, line.fact.quantity, line.fact.direction): line.fact
         for line in lines
@@ -373,23 +373,24 @@ def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
 MOST_LINES: Final = 100
 DEFAULT_LINES: Final = 20
 _MOST_MISSED: Final = 10
-"""The most missed bad runs in the text; JSON has all."""
+"""Most missed bad runs in the text; JSON lists all."""
 _FOLDS: Final = 10
 _FEWEST_SAMPLES: Final = 3
 _MOST_NAMED: Final = 3
 _LONGEST: Final = 1_000
-"""Characters of a comment."""
+"""Longest comment, characters."""
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedLine:
-    """One spec, and the evidence for it.
+    """One learned spec with its evidence.
 
     Attributes:
-        name, title, text: of the spec; the text is its formula.
-        pattern: of relations in time.
-        lowest: the lowest robustness of a good run, and the run that has it.
-        violated_by: the bad runs that violate it.
+        name, title, text: name, title and formula of the spec.
+        pattern: temporal pattern.
+        lowest: lowest robustness of a good run.
+        lowest_run: name of the good run with the lowest robustness.
+        violated_by: names of the bad runs that violate the spec.
     """
 
     name: str
@@ -403,7 +404,7 @@ class LearnedLine:
 
 @dataclass(frozen=True, slots=True)
 class CheckedRun:
-    """A run that was left out: what the lines learned from the others say about it."""
+    """Run with its verdict under lines that were learned without it."""
 
     name: str
     is_good: bool
@@ -411,22 +412,22 @@ class CheckedRun:
 
     @property
     def is_right(self) -> bool:
-        """Whether it is satisfied if it is good, and violated if it is bad."""
+        """Whether a good run is satisfied, or a bad run violated."""
         return self.verdict is (Verdict.SATISFIED if self.is_good else Verdict.VIOLATED)
 
 
 @dataclass(frozen=True, eq=False)
 class Learned(Printed):
-    """A specification learned from runs.
+    """Specification learned from runs.
 
     Attributes:
-        text: the specification file; comments say the evidence. "" if nothing was found.
-        specification: the same, parsed; None if nothing was found.
-        specs: its specs, in its order, the most distinctive first.
-        runs: every run's name, and whether it is good, in the order given.
-        missed: bad runs that no line distinguishes.
-        checked: runs that were left out in turn; none with fewer than three good runs.
-        left_out: what was not compared, in sentences.
+        text: specification file with the evidence in comments; "" if nothing was found.
+        specification: parsed text; None if nothing was found.
+        specs: specs in the order of the file, the most distinctive first.
+        runs: name of each run and whether it is good, in the given order.
+        missed: names of bad runs that no line distinguishes.
+        checked: runs that were left out in turn; empty with fewer than three good runs.
+        left_out: phrases for objects, pairs and signals that were not compared.
     """
 
     text: str
@@ -439,14 +440,14 @@ class Learned(Printed):
 
     @property
     def is_found(self) -> bool:
-        """Whether there are lines, and they distinguish every bad run."""
+        """Whether there are lines that together distinguish every bad run."""
         return bool(self.specs) and not self.missed
 
     def __repr__(self) -> str:
         return f"<Learned from {plural(len(self.runs), 'run')}: {plural(len(self.specs), 'spec')}>"
 
     def lines(self) -> Iterator[str]:
-        """Yield the specs with the evidence for each, as the command `learn` prints them."""
+        """Yield the lines of text that the command `learn` prints: specs with their evidence."""
         bad = sum(not is_good for _, is_good in self.runs)
         good = len(self.runs) - bad
         runs = plural(good, "good run") + (f" and {plural(bad, 'bad run')}" if bad else "")
@@ -474,7 +475,7 @@ class Learned(Printed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """This as values for JSON."""
+        """The result as values for JSON."""
         return {
             "found": self.is_found,
             "text": self.text,
@@ -493,16 +494,16 @@ def learn_runs(
     profile: str = DEFAULT_PROFILE,
     advance: Callable[[int], None] = lambda runs: None,
 ) -> Learned:
-    """Find relations that hold in all good runs, and not in bad ones.
+    """Learn a specification of relations that hold in all good runs, but not in bad runs.
 
     Args:
-        lines: write at most so many specs.
-        profile: of the relations.
-        advance: called with the number of runs that are measured.
+        lines: greatest number of specs.
+        profile: profile of the relations.
+        advance: function that is called with the number of runs measured since its last call.
 
     Raises:
-        UsageError: fewer than two good runs, a run that is too short, runs that are equal or in other units,
-            nothing that the runs have in common, unknown options.
+        UsageError: fewer than two good runs, a run that is too short, equal runs, runs in different units,
+            runs without common objects or signals, or an invalid option.
     """
     if not 1 <= lines <= MOST_LINES:
         raise UsageError(f"{lines} lines cannot be learned; give 1 to {MOST_LINES}")
@@ -550,7 +551,7 @@ def learn_runs(
 
 
 def _needs(trace: Trace) -> Needs:
-    """Return the needs of a specification of all that a trace has."""
+    """Return the needs of a specification that mentions everything in a trace."""
     return Needs(frozenset(trace.names), frozenset(trace.signals), frozenset({ANY_CLASS}))
 
 
@@ -582,7 +583,7 @@ def _check(runs: Sequence[LabelledRun]) -> None:
 
 
 def _missing(good: Sequence[LabelledRun]) -> Iterator[str]:
-    """Yield the objects that most good runs have, but not all."""
+    """Yield phrases for objects that at least half of the good runs have, but not all."""
     counts = Counter(name for run in good for name in run.trace.names)
     some = [name for name in sorted(counts) if len(good) / 2 <= counts[name] < len(good)]
     for name in some[:_MOST_NAMED]:
@@ -602,28 +603,28 @@ def _nothing_in_common(good: Sequence[LabelledRun]) -> str:
 
 
 class _Written(NamedTuple):
-    """Lines, and the specification that has one spec for each."""
+    """Lines with a specification that has one spec for each line."""
 
     lines: tuple[Line, ...]
     specification: Specification
 
     @property
     def pairs(self) -> Iterator[tuple[Line, NamedSpec]]:
-        """Each line with its spec."""
+        """Pairs of a line and its spec."""
         return zip(self.lines, self.specification.specs, strict=True)
 
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writes lines as a specification; `taken` are the objects' names, which no spec or variable has."""
+    """Writer of lines as a specification; no spec or variable has a name in `taken`, names of objects."""
 
     profile: str
     taken: set[str]
 
     def write_lines(self, lines: Sequence[Line], runs: Sequence[LabelledRun]) -> _Written | None:
-        """Return the lines that, as they are written, all good runs satisfy, and that some bad run violates.
+        """Return the lines whose written form all good runs satisfy and some bad run violates.
 
-        None if there are none.
+        Without bad runs, the good runs decide. The result is None if no line is left.
         """
         if not lines:
             return None
@@ -633,7 +634,7 @@ class _Writer:
         return _Written(tuple(kept_lines), self._parse(kept_lines)) if kept_lines else None
 
     def order(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
-        """Return the same lines: of those that the same bad runs violate, the shorter ones first."""
+        """Sort the lines: among lines that the same bad runs violate, shorter ones come first."""
         alike: dict[tuple[bool, ...], list[Line]] = {}
         keys = []
         for line, spec in written.pairs:
@@ -660,7 +661,7 @@ class _Writer:
     def text(
         self, written: _Written, head: Sequence[str], evidence: Sequence[LearnedLine], good: int, bad: int
     ) -> str:
-        """Return the file: each spec in its canonical form, below a comment with its evidence."""
+        """Return the text of the file: each spec in canonical form, under a comment with its evidence."""
         lines = [*map(_comment, head), f"use {self.profile}"]
         for spec, line in zip(written.specification.specs, evidence, strict=True):
             lowest = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
@@ -676,7 +677,7 @@ class _Writer:
 
 
 def _is_kept(spec: NamedSpec, runs: Sequence[LabelledRun]) -> bool:
-    """Return whether all good runs satisfy a spec, and some bad run, if there is one, violates it."""
+    """Return whether all good runs satisfy a spec and, if there are bad runs, some bad run violates it."""
     bad = [run for run in runs if not run.is_good]
     return all(robustness_of(spec.formula, run.trace)[0] >= 0.0 for run in runs if run.is_good) and (
         not bad or any(robustness_of(spec.formula, run.trace)[1] < 0.0 for run in bad)
@@ -708,7 +709,7 @@ def _check_folds(
     bad: Sequence[LabelledRun],
     learn: Callable[[Sequence[LabelledRun]], _Written | None],
 ) -> Iterator[CheckedRun]:
-    """Yield each run with its verdict by what is learned without it, and without others of its fold."""
+    """Yield each run with its verdict under the lines that are learned without its fold."""
     if len(good) < _FEWEST_SAMPLES:
         return
     folds = min(_FOLDS, max(len(good), len(bad)))
@@ -748,7 +749,7 @@ def _head(
 
 
 def checked_text(checked: Sequence[CheckedRun]) -> str:
-    """Return how the runs that were left out in turn came out, in a sentence."""
+    """Return a sentence with the verdicts of the runs that were left out in turn."""
     parts = []
     for kind, what in ((True, "satisfied"), (False, "violated")):
         some = [run for run in checked if run.is_good is kind]

@@ -1,4 +1,4 @@
-"""Tuned constants: what varies, in which direction, and the margins of labelled runs."""
+"""Tuned constants: grids of values, directions of change, and margins of labelled runs."""
 
 from __future__ import annotations
 
@@ -50,26 +50,26 @@ from spatial_replay.spec.walks import iter_expressions, iter_formulas
 from spatial_replay.trace.trace import FOREVER, Trace, window_of
 
 Numbers: TypeAlias = Mapping[str, float]
-"""Values of constants, durations in nanoseconds."""
+"""Values of constants by name; durations in nanoseconds."""
 _Fill: TypeAlias = Callable[[Numbers], Any]
 
 
 class Probe(NamedTuple):
-    """A formula as it was parsed with some values."""
+    """Formula that was parsed with some values of constants."""
 
     formula: Formula
     numbers: Numbers
 
 
 class _NeedsParsingError(Exception):
-    """A part of a formula depends on a constant in another way than by being it."""
+    """A changing part of a formula is neither a constant nor a negated constant."""
 
 
 def formula_with(probes: Sequence[Probe]) -> Callable[[Numbers], Formula] | None:
-    """Return a function that returns the formula with other values, or None where only parsing gives it.
+    """Return a function from values of constants to the formula; None if the text must be parsed for it.
 
-    A number that is a constant, or one negated, in all probes is taken to be it; texts of atoms stay as in
-    the first probe. Windows whose two ends may cross are left to the parser, which checks them.
+    A number that equals a constant, or a negated one, in all probes is replaced by the value. Texts of atoms
+    stay as in the first probe. Windows whose ends may cross need the parser, which checks their order.
     """
     try:
         return _fill([probe.formula for probe in probes], [probe.numbers for probe in probes])
@@ -116,19 +116,21 @@ def _number(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
 
 
 Value: TypeAlias = float | str
-"""A number or, as a text, a duration, as `parse_specification` takes it."""
+"""Number, or duration as a text, as in the arguments of `parse_specification`."""
 
 _PARTS: Final = 1_000_000
-"""At least as many values are tried for a number, so that steps of the grid are short decimals."""
+"""Least number of steps in a grid; a step is a power of ten, so that values are short decimals."""
 
 
 @dataclass(frozen=True)
 class VariedConstant:
-    """A constant, and the values from `low` to `high` that are tried: both of them, and multiples of `step`.
+    """Constant with a grid of values: `low`, `high` and the multiples of `step` between them.
+
+    A value is identified by its index in the grid.
 
     Attributes:
-        written: its value in the text.
-        low, high, step: numbers, or nanoseconds of a duration.
+        written: value in the text.
+        low, high, step: numbers; nanoseconds for a duration.
     """
 
     name: str
@@ -142,7 +144,8 @@ class VariedConstant:
         """Return a constant with a fine grid.
 
         Raises:
-            UsageError: an end that is none, or of another kind than the constant; an empty range.
+            UsageError: an invalid end, a number for a duration or the reverse, an empty range, or a range
+                outside of the range in the text.
         """
         ends = [_decimal(name, end, written) for end in (low, high)]
         width = ends[1] - ends[0]
@@ -150,7 +153,7 @@ class VariedConstant:
         if width <= 0:
             raise UsageError(f"{name}: the range {range_text} is empty; give a lower and a greater end")
         if written.range is not None:
-            # a range in the text is the widest that may be tried
+            # the range in the text limits the tried range
             inner = [Decimal(repr(end)) for end in written.range]
             if written.duration_ns is not None:
                 inner = [end * 10**9 for end in inner]
@@ -167,56 +170,56 @@ class VariedConstant:
 
     @property
     def is_whole(self) -> bool:
-        """Whether both ends are whole numbers, so that it may count samples."""
+        """Whether both ends are whole numbers, so that the constant may count samples."""
         return self.written.duration_ns is None and all(end % 1 == 0 for end in (self.low, self.high))
 
     @cached_property
     def steps(self) -> int:
-        """The number of the last value; that of the first is 0."""
+        """Index of the last value; the first value has index 0."""
         return max(1, int(-(-self.high // self.step)) - self._before)
 
     @cached_property
     def _before(self) -> int:
-        """The greatest multiple of the step that is at most `low`."""
+        """Number of whole steps from 0 to `low`, rounded down."""
         return int((self.low / self.step).to_integral_value(rounding="ROUND_FLOOR"))
 
     def decimal(self, number: int) -> Decimal:
-        """Return the value of that number, exactly."""
+        """Return the exact value at an index."""
         if number <= 0:
             return self.low
         return self.high if number >= self.steps else self.step * (self._before + number)
 
     def value(self, number: int) -> Value:
-        """Return the value of that number as `parse_specification` takes it."""
+        """Return the value at an index, as an argument of `parse_specification`."""
         decimal = self.decimal(number)
         return float(decimal) if self.written.duration_ns is None else text_of(Duration(int(decimal)))
 
     def number(self, number: int) -> float:
-        """Return the value of that number, a duration in nanoseconds."""
+        """Return the value at an index as a number; nanoseconds for a duration."""
         decimal = self.decimal(number)
         return float(decimal) if self.written.duration_ns is None else int(decimal)
 
     @property
     def written_number(self) -> float:
-        """The value in the text, a duration in nanoseconds."""
+        """The value in the text as a number; nanoseconds for a duration."""
         return self.written.value if self.written.duration_ns is None else self.written.duration_ns
 
     def text(self, number: int) -> str:
-        """Return the value of that number as written in a text: `70`, `2.5s`."""
+        """Return the text of the value at an index: `70`, `2.5s`."""
         return _text(self.decimal(number), self.written)
 
     def nearest(self, value: Decimal) -> int:
-        """Return the number of the value next to another one."""
+        """Return the index of the value nearest to a number."""
         inside = min(max(value, self.low), self.high)
         return min(max(int((inside / self.step).to_integral_value()) - self._before, 0), self.steps)
 
     @property
     def start(self) -> int:
-        """The number of the value next to the written one."""
+        """Index of the value nearest to the value in the text."""
         return self.nearest(_decimal(self.name, _written_value(self.written), self.written))
 
     def roundest(self, first: int, last: int) -> int:
-        """Return the number of a short value near the middle of a range of numbers."""
+        """Return the index of a short decimal near the middle between two indices."""
         middle = (self.decimal(first) + self.decimal(last)) / 2
         width = (self.decimal(last) - self.decimal(first)) / 2
         exponent = width.adjusted() + 1 if width else self.step.adjusted()
@@ -232,13 +235,14 @@ class VariedConstant:
 def varied_constants(
     specification: Specification, ranges: Mapping[str, tuple[Value, Value] | None]
 ) -> tuple[VariedConstant, ...]:
-    """Return the constants to tune: those with a range in `ranges`; without any, those with one in the text.
+    """Return the constants to tune: those in `ranges` or, if it is empty, all with a range in the text.
 
     Args:
-        ranges: the values to try, by name; None takes the range in the text.
+        ranges: range to try by name; None for the range in the text.
 
     Raises:
-        UsageError: no such constant, one without a range, an empty range, none at all.
+        UsageError: an unknown or computed constant, a constant without a range, an empty range, or no
+            constant to tune.
     """
     constants = specification.constants
     with_range = [
@@ -274,7 +278,7 @@ def varied_constants(
 
 
 def text_of_constant(constant: Constant) -> str:
-    """Write a constant as a text does."""
+    """Return the text of a constant's value."""
     return text_of(constant.value if constant.duration_ns is None else Duration(constant.duration_ns))
 
 
@@ -299,14 +303,14 @@ def _text(value: Decimal, written: Constant) -> str:
 
 
 Direction: TypeAlias = Literal[-1, 0, 1]
-"""1: looser, its robustness is at least that of the other in every log; -1: tighter; 0: the same."""
+"""1 is looser (the robustness is at least as high in every log), -1 is tighter, 0 is equal."""
 
 
 def direction(before: Specification, after: Specification) -> Direction | None:
-    """Return how the results of one specification compare with those of another, of the same shape.
+    """Return whether a specification is looser or tighter than another one of the same shape.
 
     Returns:
-        None where one is looser in some logs and tighter in others, or where that is not known.
+        Direction of `after`; None if it is looser in some logs and tighter in others, or if unknown.
     """
     if before.regions != after.regions or len(before.results) != len(after.results):
         return None
@@ -316,7 +320,7 @@ def direction(before: Specification, after: Specification) -> Direction | None:
 
 
 def _common(directions: Iterable[Direction | None]) -> Direction | None:
-    """Return the direction of something that rises with each of its parts."""
+    """Return the direction of a value that increases with each of its parts; None if parts disagree."""
     signs = set(directions) - {0}
     if not signs:
         return 0
@@ -365,7 +369,7 @@ def _alike(old: Boolean | Temporal, new: Boolean | Temporal) -> bool:
 
 
 def _of_bound(before: Bound | None, after: Bound | None) -> Direction | None:
-    """Return 1 if the window of an operator such as F grew: it has more samples to choose from."""
+    """Return 1 if the window of an operator such as F grew, so that it is looser; -1 if it shrank."""
     if before == after:
         return 0
     if before is None or after is None or before.unit != after.unit:
@@ -399,7 +403,7 @@ def _of_expression(before: Expression, after: Expression) -> Direction | None:
 
 
 def _of_term(before: Term, after: Term) -> Direction | None:
-    """Return 1 if a footprint is enlarged more."""
+    """Return 1 if a footprint is enlarged more, -1 if less."""
     if before == after:
         return 0
     if isinstance(before, Enlarged) and isinstance(after, Enlarged):
@@ -408,16 +412,16 @@ def _of_term(before: Term, after: Term) -> Direction | None:
 
 
 Point: TypeAlias = tuple[int, ...]
-"""The number of a value on the grid of each constant."""
+"""Index in the grid of each constant."""
 Parse: TypeAlias = Callable[[Mapping[str, Value]], Specification]
 
 _REMEMBERED: Final = 64
-"""Specifications kept compiled; a search goes back to recent ones."""
+"""Cached specifications; a search returns to recent ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledRun:
-    """A recorded run, and whether it did what it should."""
+    """Recorded run with its label, good or bad."""
 
     name: str
     is_good: bool
@@ -430,14 +434,14 @@ def load_runs(
     read: Callable[[LogFile], Trace],
     advance: Callable[[int], None] = lambda runs: None,
 ) -> list[LabelledRun]:
-    """Read runs; a file gives its name; if two files have the same, all are named with their folders.
+    """Read runs, named after their files; if two files have the same name, runs are named by paths.
 
     Args:
-        read: returns the samples of a log.
-        advance: called with the number of logs that are read.
+        read: function that returns the samples of a log.
+        advance: function that is called with the number of logs read since its last call.
 
     Raises:
-        UsageError: a log that is good and bad.
+        UsageError: a log is both good and bad.
     """
     files = [log for log in (*good, *bad) if not isinstance(log, Trace)]
     names_of_good, names_of_bad = _names(good), _names(bad)
@@ -460,7 +464,7 @@ def load_runs(
 
 
 def _names(logs: Sequence[LogFile | Trace]) -> dict[Path | str, str]:
-    """Return the names of files by their places."""
+    """Return the names of files by resolved path or address; traces are left out."""
     files = [log for log in logs if not isinstance(log, Trace)]
     return {file.resolve() if isinstance(file, Path) else _place(file): file.name for file in files}
 
@@ -470,18 +474,20 @@ def _place(file: LogFile) -> str:
 
 
 class Robustness(NamedTuple):
-    """The ends of the least robustness of all results of a specification, over one run."""
+    """Lower and upper end of the least robustness of a specification's results over one run."""
 
     lower: float
     upper: float
 
 
 class _Result(NamedTuple):
-    """A result of a specification with some values, compiled.
+    """Compiled result of a specification with some values of constants.
 
     Attributes:
-        regions: those of the specification.
-        same_measurements: whether it needs no other measurements than the first one.
+        order: leaves of the formula in the order of their numbers.
+        formula: compiled formula.
+        regions: regions of the specification.
+        same_measurements: whether all its measurements are those with the values in the text.
     """
 
     order: Sequence[Atom | Quantified]
@@ -491,22 +497,22 @@ class _Result(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """A run with what it needs to be evaluated again: instances of each result, and their samples."""
+    """Run prepared for repeated evaluation: instances of each result, with their samples."""
 
     scene: TraceScene
     instances: Mapping[str, Sequence[tuple[Instance, slice]]]
 
 
 class Margins:
-    """The margins of runs at points of the constants' grids; of each run, all that stays equal is kept.
+    """Margins of runs at points in the grids of constants; results and measurements are cached.
 
     Attributes:
-        runs: those evaluated, by their numbers.
-        varied: the constants, in the order of a point; sample counts have whole numbers.
-        directions: for each, whether a greater value is looser (1), tighter (-1), or neither for sure (None).
-        axes: for each result of the specification, by name, the constants that it depends on.
-        evaluations: how many times a result was evaluated on a run.
-        specification: returns that with the values of a point, or None if it is invalid with them.
+        runs: evaluated runs; methods identify a run by its index.
+        varied: constants in the order of a point; those that count samples have whole numbers.
+        directions: for each constant, 1 if a greater value is looser, -1 if it is tighter, None if unknown.
+        axes: indices of the constants that a result depends on, by name of the result.
+        evaluations: number of evaluations of a result on a run.
+        specification: function that returns the specification at a point; None if it is invalid there.
     """
 
     def __init__(
@@ -521,13 +527,14 @@ class Margins:
         """Prepare the runs.
 
         Args:
-            parse: returns the specification with values for some constants.
-            each: for each parameter of a template, the objects that it stands for.
-            advance: called with the number of runs that are prepared.
+            parse: function that returns the specification with values of some constants.
+            each: objects by template parameter.
+            advance: function that is called with the number of runs prepared since its last call.
 
         Raises:
-            SpecificationError: a specification that is invalid at an end of a range.
-            UsageError: a constant that no result depends on; a run that does not fit the specification.
+            SpecificationError: the specification is invalid at a value between the ends of a range.
+            UsageError: the specification is invalid at an end of a range, no result depends on a constant, or
+                a run does not fit the specification.
         """
         self.runs, self._parse, self._each = tuple(runs), parse, each
         self.varied = tuple(self._fitting(constant) for constant in varied)
@@ -554,11 +561,11 @@ class Margins:
         try:
             return self._parse(values)
         except SpecificationError:
-            # such as a window whose ends are reversed, between two constants
+            # such as a window with reversed ends, if both ends are constants
             return None
 
     def robustness(self, run: int, point: Point, results: Iterable[str] | None = None) -> Robustness | None:
-        """Return that of a run, of all results or some of them; None where the specification is invalid."""
+        """Return the robustness of all or some results over a run; None if the specification is invalid."""
         lower = upper = np.inf
         for name in self.axes if results is None else results:
             robustness = self._of_result(run, name, point)
@@ -578,12 +585,12 @@ class Margins:
         return self._robustness[key]
 
     def margin(self, run: int, point: Point, results: Iterable[str] | None = None) -> float:
-        """Return how far a run is from the verdict it should not have: its robustness, negated if it is bad.
+        """Return the margin of a run from the wrong verdict: its robustness, negated for a bad run.
 
-        Negative where it has that verdict; -inf where the specification is invalid.
+        The margin is negative if the verdict is wrong, and -inf if the specification is invalid.
 
         Args:
-            results: names; all of them if None.
+            results: names of results; None for all.
         """
         robustness = self.robustness(run, point, results)
         if robustness is None:
@@ -591,12 +598,12 @@ class Margins:
         return robustness.lower if self.runs[run].is_good else -robustness.upper
 
     def holds(self, run: int, point: Point, least: float = 0.0, results: Iterable[str] | None = None) -> bool:
-        """Return whether a margin is at least so large, and the verdict right: robustness 0 satisfies."""
+        """Return whether a run has the right verdict and a margin of at least `least`; 0 satisfies."""
         margin = self.margin(run, point, results)
         return margin >= least and (margin > 0.0 or self.runs[run].is_good or least < 0.0)
 
     def _fitting(self, constant: VariedConstant) -> VariedConstant:
-        """Return a constant with a grid of values that the specification takes."""
+        """Return a constant with a grid of valid values: whole numbers if it counts samples."""
         ends = {constant.value(0): "least", constant.value(constant.steps): "greatest"}
         for value, which in ends.items():
             try:
@@ -616,7 +623,7 @@ class Margins:
         return constant
 
     def _probe(self, constant: VariedConstant) -> dict[int, Specification]:
-        """Return the specification with some values of a constant, the others as written."""
+        """Return the specification at five values of one constant by index; the others stay as written."""
         numbers = sorted({constant.steps * part // 4 for part in range(5)})
         return {number: self._parse({constant.name: constant.value(number)}) for number in numbers}
 
@@ -628,7 +635,7 @@ class Margins:
         return directions.pop() if len(directions) == 1 else None
 
     def _axes(self, name: str, tried: Sequence[Mapping[int, Specification]]) -> tuple[int, ...]:
-        """Return the constants that change a result; any may that changes a region."""
+        """Return the constants that may change a result; a constant in a region may change all results."""
 
         def changes(specification: Specification) -> bool:
             return specification.regions != self._base.regions or _result_of(
@@ -642,7 +649,7 @@ class Margins:
     def _formula(
         self, name: str, tried: Sequence[Mapping[int, Specification]]
     ) -> Callable[[Numbers], Formula] | None:
-        """Return what gives the formula of a result with other values, if that can be had without parsing."""
+        """Return the function from values to the formula of a result; None if the text must be parsed."""
         written_numbers = {constant.name: constant.written_number for constant in self.varied}
         probes = [Probe(_result_of(self._base, name), written_numbers)]
         for constant, specifications in zip(self.varied, tried, strict=True):
@@ -702,7 +709,7 @@ class Margins:
     def _evaluate(self, prepared: _Prepared, name: str, result: _Result) -> Robustness:
         scene = prepared.scene
         if not result.same_measurements:
-            # a new trace, so that measurements for values that are only tried stay out of the run's cache
+            # a new trace, so that measurements for tried values do not fill the cache of the run
             scene = TraceScene(replace(scene.trace), result.regions, scene.skip)
         lower = upper = np.inf
         for instance, inside in prepared.instances.get(name, ()):

@@ -1,4 +1,4 @@
-"""Quantities that runs have in common, and their values in one run."""
+"""Quantities that several runs have in common, and their values in one run."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from spatial_replay.trace.trace import ABSENT, Trace
 MOST_OBJECTS: Final = 60
 MOST_PAIRS: Final = 400
 MOST_MEMBERS: Final = 30
-"""Bounds of what is compared: objects, pairs of them, members of a class."""
+"""Limits of the comparison: objects, pairs of objects, members of a class."""
 MOST_MEASURED: Final = 1 << 26
-"""At most so many pairs in so many samples, or two pairs in any case."""
+"""Most measurements, pairs times samples; two pairs are always measured."""
 MOST_SIGNALS: Final = 50
 _SAMPLED: Final = 33
-"""Samples of the first run in which pairs are compared, so that those that come near are measured first."""
+"""Samples of the first run that order the pairs: those that come nearest are measured first."""
 
 Relation: TypeAlias = Literal["dist", "oriented", "signal", "enclosedin", "ovlp", "leftof", "below", "prec"]
 _EITHER_WAY: tuple[Relation, ...] = ("dist", "ovlp", "oriented")
 _ONE_WAY: tuple[Relation, ...] = ("enclosedin", "leftof", "below", "prec")
 WITH_LIMIT: frozenset[Relation] = frozenset({"dist", "oriented", "signal"})
-"""Relations with a number to learn; the others hold or do not."""
+"""Relations with a learned limit; the others only hold or fail."""
 _PARAMETERS: Mapping[str, tuple[float | str, ...]] = MappingProxyType({"oriented": (0.0,), "prec": ("z",)})
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Party:
-    """One side of a relation: an object by its name, or every object of a class."""
+    """One side of a relation: an object by name, or every object of a class."""
 
     name: str
     is_class: bool = False
@@ -59,14 +59,14 @@ class Party:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A number of every sample: the robustness of a relation, or what a limit is learned for.
+    """Number in every sample: the robustness of a relation, or the number that a limit is learned for.
 
     Attributes:
-        parties: whom it is about, two of them; none for a signal.
-        signal: the name of a signal, or "".
-        formula: what is measured: for "dist" the signed distance, for "oriented" the negated misalignment,
-            for "signal" the signal. Over classes it is the least one of all members.
-        reach: over classes, the least one of all members' negated numbers; else `formula`.
+        parties: the two sides of the relation; empty for a signal.
+        signal: name of a signal, or "".
+        formula: formula of the number: the signed distance for "dist", the negated misalignment for
+            "oriented", the signal for "signal". Over classes it is the least number of all members.
+        reach: over classes, the least negated number of all members; else `formula`.
     """
 
     relation: Relation
@@ -77,23 +77,23 @@ class Quantity:
 
     @property
     def pair(self) -> frozenset[Party]:
-        """Whom it is about, in any order."""
+        """The sides of the relation in any order."""
         return frozenset(self.parties)
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether it is the same of its parties in the other order."""
+        """Whether the order of the parties does not matter."""
         return self.relation in _EITHER_WAY
 
 
 def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], list[str]]:
-    """Return what can be measured in all of some runs, and what was left out, in sentences.
+    """Return the quantities that all runs have, and phrases for the objects and signals that are left out.
 
-    Objects are compared by their names; those of a class also all at once, as in `forall a, b in class
-    "block"`, if every run has two of them, or has them under other names.
+    Objects are compared by name. A class is compared as a whole, too, as in `forall a, b in class "block"`,
+    if every run has two of its objects, or if the runs do not have the same objects of the class.
 
     Args:
-        profile: of the relations.
+        profile: profile of the relations.
     """
     common = set(traces[0].names).intersection(*(trace.names for trace in traces[1:]))
     names = sorted(common)
@@ -131,7 +131,7 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
 
 
 def members_of(trace: Trace) -> dict[str, set[str]]:
-    """Return the names of all objects of each class."""
+    """Return the names of objects by class."""
     names_by_class: dict[str, set[str]] = {}
     for column, name in enumerate(trace.names):
         rows = trace.rows[:, column]
@@ -144,7 +144,7 @@ def members_of(trace: Trace) -> dict[str, set[str]]:
 
 
 def _classes(members: Sequence[Mapping[str, set[str]]], common: set[str]) -> tuple[list[str], list[str]]:
-    """Return the classes to compare as a whole, and those that are too large for that."""
+    """Return the classes to compare as a whole, and the classes with too many objects."""
     shared = set(members[0]).intersection(*members[1:])
     fitting = sorted(
         name
@@ -177,7 +177,7 @@ def _nearest_first(trace: Trace, pairs: list[tuple[Party, Party]]) -> list[tuple
     few = trace.take(np.unique(np.linspace(0, len(trace) - 1, _SAMPLED).astype(np.int64)))
     atoms = [_atom("dist", TrackedName(a.name), TrackedName(b.name), "paper") for a, b in pairs]
     nearest = leaf_values(TraceScene(few, {}), atoms, {})[0].min(axis=1)
-    # a pair that is not always known comes after those that are
+    # pairs that are unknown in some sample come last
     key = np.where(np.isfinite(nearest), nearest, np.inf)
     return [pairs[index] for index in np.argsort(key, kind="stable").tolist()]
 
@@ -206,7 +206,7 @@ def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken: set[s
 
 
 def variables_of(parties: Sequence[Party], taken: set[str]) -> tuple[str, str]:
-    """Return a name for a member of each class that no object has."""
+    """Return two names of variables that no object has."""
     variables = []
     for name in ("a", "b"):
         while name in taken or name in {party.name for party in parties}:
@@ -239,23 +239,23 @@ def _atom(relation: str, a: TrackedName | Variable, b: TrackedName | Variable, p
 # ---------------------------------------------------------------------------------------------------- one run
 
 _AT_ONCE: Final = 1 << 22
-"""Numbers of a run that are held at once."""
+"""Most numbers of a run in memory at once."""
 _SAMPLED_OF_A_RUN: Final = 64
-"""Samples that say how often a relation holds."""
+"""Samples of a run that estimate how often a relation holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """A run's numbers, each as a lower and an upper end: they differ where something is unknown or uncertain.
+    """Numbers of a run with lower and upper ends, which differ for unknown or uncertain positions.
 
     Attributes:
-        trace: its samples.
-        least, greatest, first, last: (2, 2, Q) for Q quantities: by direction, the quantity itself and
-            its negative, and by end.
-        sampled: (2, Q, S), the lower ends in some samples, by direction.
-        travel: (Q,), by how much each quantity varies.
-        shifts: how far the corners of each object come from where they begin until the end; infinite if it is
-            not there.
+        trace: samples of the run.
+        least, greatest, first, last: (2, 2, Q) for Q quantities. The first axis is the direction: the
+            quantity or its negative. The second axis is the end.
+        sampled: (2, Q, S), lower ends in S samples, by direction.
+        travel: (Q,), difference between the greatest and the least value of each quantity.
+        shifts: displacement of each object from the first to the last sample; infinite if it is missing in
+            one of them or its shape changes.
     """
 
     trace: Trace
@@ -292,11 +292,11 @@ class Observed:
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
 
     def first_time(self, quantity: Quantity, direction: int, limit: float, *, surely: bool) -> int:
-        """Return the first sample in which a quantity, or its negative, is at least a limit; T if none.
+        """Return the first sample in which a quantity, or its negative, reaches a limit; T without one.
 
         Args:
             direction: 0 for the quantity, 1 for its negative.
-            surely: whether the lower end is compared with the limit, instead of the upper end.
+            surely: whether the lower end is compared with the limit instead of the upper end.
         """
         values = measure_both_ways(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
         holds = values >= limit if surely else values > limit
@@ -304,7 +304,7 @@ class Observed:
 
 
 def _shift(trace: Trace, column: int) -> float:
-    """Return how far an object's corners are, in the mean, from where they were in the first sample."""
+    """Return the mean displacement of an object's corners from the first to the last sample."""
     rows = trace.rows[[0, -1], column]
     if (rows < 0).any():
         return np.inf
@@ -321,7 +321,7 @@ def _shift(trace: Trace, column: int) -> float:
 
 
 def measure_both_ways(scene: TraceScene, quantities: Sequence[Quantity]) -> Floats:
-    """Return quantities and their negatives, with their ends, in each sample: (2, 2, Q, T)."""
+    """Return quantities and their negatives with lower and upper ends in each sample: (2, 2, Q, T)."""
     result = np.empty((2, 2, len(quantities), len(scene)))
     formulas = [quantity.formula for quantity in quantities]
     values = leaf_values(scene, formulas, {})
@@ -330,7 +330,7 @@ def measure_both_ways(scene: TraceScene, quantities: Sequence[Quantity]) -> Floa
     result[1] = -values[high], -values[low]
     others = [index for index, quantity in enumerate(quantities) if quantity.reach is not quantity.formula]
     if others:
-        # the negative of the least number of all members says nothing about the greatest one
+        # over a class, the negated least number is not the least negated number
         values = leaf_values(scene, [quantities[index].reach for index in others], {})
         low, high = low_and_high(len(values), wide=True)
         result[1][:, others] = values[low], values[high]
@@ -338,7 +338,7 @@ def measure_both_ways(scene: TraceScene, quantities: Sequence[Quantity]) -> Floa
 
 
 def robustness_of(formula: Formula, trace: Trace) -> tuple[float, float]:
-    """Return the ends of a formula's robustness over a whole run, as a replay of its log has them."""
+    """Return the lower and upper end of a formula's robustness over a whole run, as in a replay."""
     order = new_leaves(formula, ())
     leaves = leaf_values(TraceScene(trace, {}), order, {})
     low, high = OfflineFormula.of(formula, order).evaluate(leaves, trace.times_ns).ends(0)

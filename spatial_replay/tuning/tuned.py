@@ -1,6 +1,7 @@
-"""The search for constants (by numbers, exactly along directions, by evolution) and its result.
+"""Search for values of constants, and its result.
 
-The result holds values with their ranges, the margin of every run, runs that conflict, and surfaces.
+The search is exact for constants with a direction, and an evolution for others. The result has the values
+with their intervals, the margin of every run, conflicting runs, and surfaces.
 """
 
 from __future__ import annotations
@@ -38,18 +39,18 @@ from spatial_replay.tuning.margins import (
 )
 
 _GENERATIONS, _CANDIDATES = 15, 6
-"""Bounds of an evolution: its generations, and candidates of each for every number."""
+"""Limits of an evolution: generations, and candidates per number in one generation."""
 
 
 def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
-    """Return the last number up to which a condition holds: looked for at doubling steps, then by halves.
+    """Return the last number up to which a condition holds, by doubling steps and then bisection.
 
-    It costs few evaluations, all of them near to where it starts, if it does not hold far.
+    A condition that fails near the start costs few evaluations, all near the start.
 
     Args:
-        inside: holds, and is not evaluated.
-        end: the last number to look at, on either side.
-        holds: once it fails, it is taken to fail from there to the end.
+        inside: number at which the condition holds; it is not evaluated.
+        end: last number to evaluate, on either side.
+        holds: condition; after its first failure it is assumed to fail up to the end.
     """
     step = 1
     while inside != end:
@@ -61,7 +62,7 @@ def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
 
 
 def last_before(inside: int, outside: int, holds: Callable[[int], bool]) -> int:
-    """Return the last number that holds between one that does and another, on either side, that does not."""
+    """Return the last number that holds between a number that holds and a number that fails."""
     while abs(outside - inside) > 1:
         middle = (inside + outside) // 2
         if holds(middle):
@@ -72,7 +73,7 @@ def last_before(inside: int, outside: int, holds: Callable[[int], bool]) -> int:
 
 
 def least_for_all(runs: Iterable[int], most: int, holds: Callable[[int, int], bool]) -> int:
-    """Return the least number from which on `holds(run, number)` for every run; `most` if one never does."""
+    """Return the least number from which on `holds(run, number)` for every run; `most` if there is none."""
     number = 0
     for run in runs:
         if not holds(run, number):
@@ -83,7 +84,9 @@ def least_for_all(runs: Iterable[int], most: int, holds: Callable[[int, int], bo
 def evolve(
     cost: Callable[[Sequence[int]], float], sizes: Sequence[int], start: Sequence[int], seed: int
 ) -> None:
-    """Let SciPy look for numbers, from 0 to some sizes, of the least cost: the best that it asked for.
+    """Search for numbers from 0 to their sizes with the least cost, by SciPy's differential evolution.
+
+    The caller records the best call of `cost`, so nothing is returned.
 
     Raises:
         UsageError: SciPy is not installed.
@@ -103,21 +106,21 @@ def evolve(
 
 
 _MOST_EVALUATIONS: Final = 8_000
-"""Evaluations of runs for one decision, or for one widest margin; past them it counts as undecided."""
+"""Most evaluations of runs for one decision or one widest margin; beyond them it is undecided."""
 _MOST_BOXES: Final = 2_000
-"""Boxes that are looked at for one margin, which need no evaluation if they lie near to others."""
+"""Most boxes for one margin; boxes near others cost no evaluations, which are cached."""
 _LEVELS, _PRECISION = 40, 1e-3
-"""Margins tried for the widest, and how near to it, as a part of it, the search comes."""
+"""Most margins that are tried for the widest one, and relative precision of the widest margin."""
 _CONTRACTION: Final = 4
-"""Halvings by which a side of a box is cut in one turn."""
+"""Most bisections of one side of a box in one contraction."""
 
 
 class Feasibility(NamedTuple):
-    """Whether some runs all have a margin at some point.
+    """Answer to the question whether runs have a common point with a margin.
 
     Attributes:
-        looseness: of each constant there, or None if no such point was found.
-        is_proven: whether there is none, if none was found.
+        looseness: looseness of each constant at such a point; None if none was found.
+        is_proven: without a point, whether none exists; with a widest margin, whether none is wider.
     """
 
     looseness: tuple[int, ...] | None
@@ -125,20 +128,20 @@ class Feasibility(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """Constants that share results, and these results."""
+    """Constants that share results, with these results."""
 
     axes: tuple[int, ...]
     results: tuple[str, ...]
 
 
 class ExactSearch:
-    """The search for points, by their looseness, at which runs have a margin."""
+    """Exact search for points at which runs have a margin; constants are given by their looseness."""
 
     def __init__(self, margins: Margins, point_of: Callable[[Sequence[int]], Point]) -> None:
         """Prepare the search.
 
         Args:
-            point_of: returns the point with a looseness of each constant, from 0 to the number of its steps.
+            point_of: function from the looseness of each constant, 0 to its number of steps, to a point.
         """
         self._margins, self._point_of = margins, point_of
         self._steps = [constant.steps for constant in margins.varied]
@@ -151,7 +154,7 @@ class ExactSearch:
         )
 
     def widest(self, good: Sequence[int], bad: Sequence[int]) -> Feasibility:
-        """Return the point of the widest margin of some runs, if at any point all have the right verdict."""
+        """Return the point with the widest margin of some runs, if one point gives all the right verdict."""
         feasibility = self.decide(good, bad, 0.0)
         if feasibility.looseness is None:
             return feasibility
@@ -178,7 +181,7 @@ class ExactSearch:
         return Feasibility(best, is_proven)
 
     def decide(self, good: Sequence[int], bad: Sequence[int], level: float) -> Feasibility:
-        """Return a point at which some runs have at least a margin, or whether there is none."""
+        """Return a point at which all of some runs have at least a margin, if there is one."""
         numbers = list(self._steps)
         uncovered = list(bad)
         for part in self._single:
@@ -223,7 +226,7 @@ class ExactSearch:
     def _contract(
         self, runs: Sequence[int], corner: list[int], opposite: Sequence[int], level: float
     ) -> None:
-        """Move a corner of a box past numbers with which some runs fail even if all else is as opposite."""
+        """Move a corner of a box past numbers at which some run fails, even at the opposite corner."""
         for axis in self._joint.axes:
             end, limit = corner[axis], opposite[axis]
             if end == limit or self._may_fit(runs, _with(opposite, [axis], end), level):
@@ -251,7 +254,7 @@ class ExactSearch:
         return self._holds(run, _with(numbers, [axis], number), level, results)
 
     def _is_invalid(self, runs: Sequence[int], numbers: Sequence[int]) -> bool:
-        # such as a window whose ends are reversed; beyond, the verdict may be right again
+        # such as a window with reversed ends; behind invalid values the verdict may be right again
         return self._margins.robustness(runs[0], self._point_of(numbers)) is None
 
     def _least(self, runs: Sequence[int], numbers: Sequence[int]) -> float:
@@ -260,7 +263,7 @@ class ExactSearch:
 
 
 def _parts(margins: Margins) -> list[_Part]:
-    """Return the constants that share results, directly or through others."""
+    """Return groups of constants that share results, directly or through other constants."""
     parts: list[tuple[set[int], list[str]]] = []
     for name, axes in margins.axes.items():
         shared = [part for part in parts if part[0] & set(axes)]
@@ -276,25 +279,25 @@ def _with(numbers: Sequence[int], axes: Sequence[int], number: int) -> list[int]
 
 
 _PARTS: Final = 1 << 20
-"""Steps by which all constants together are tightened."""
+"""Steps in which all constants are tightened together."""
 _ROUNDS: Final = 6
-"""The most rounds of adding runs to those that decide."""
+"""Most rounds of adding runs to the deciding runs."""
 _MOST_LINES, _SECANTS = 64, 24
-"""The most lines of the grid that are all looked at, and the most steps on one of them."""
+"""Most lines of the grid in a complete search, and most steps on one line."""
 _FAR: Final = 1e12
-"""In place of an infinite margin."""
+"""Substitute for an infinite margin."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The end of a search.
+    """Result of a search.
 
     Attributes:
-        point: where it ended.
-        is_held: whether every run has the right verdict there.
-        conflict: runs that have not all the right verdict at any point, as far as was searched; () if held.
-        is_proven: whether they have it at no point at all; if held, whether no other point is better.
-        alone: those of the conflict that have the right verdict at no point, whatever the others need.
+        point: last point of the search.
+        is_held: whether every run has the right verdict at the point.
+        conflict: runs that never all have the right verdict in the search; empty if `is_held`.
+        is_proven: whether no point exists for the conflict; if `is_held`, whether no point is better.
+        alone: runs of the conflict that have the right verdict at no point, even without the others.
     """
 
     point: Point
@@ -305,7 +308,7 @@ class Found:
 
 
 class Search:
-    """A search for the best point, for given runs; the same seed gives the same point."""
+    """Search for the best point of given runs; the same seed gives the same point."""
 
     def __init__(self, margins: Margins, seed: int = 0) -> None:
         self._margins, self._seed = margins, seed
@@ -316,11 +319,10 @@ class Search:
         self._steps = tuple(constant.steps for constant in margins.varied)
 
     def best(self) -> Found:
-        """Return the tightest point if all runs are good, else the one with the widest margin.
+        """Return the tightest point if all runs are good, else the point with the widest margin.
 
         Raises:
-            UsageError: the tightest is asked for of a constant without a direction; the library for several
-                constants is not installed.
+            UsageError: all runs are good and a constant has no direction, or SciPy is needed and missing.
         """
         if not self._bad:
             return self._tightest()
@@ -331,10 +333,10 @@ class Search:
         return self._widest_of_several()
 
     def limit(self, run: int) -> int | None:
-        """Return the number at which a run holds by the narrowest, for one constant with a direction.
+        """Return the last index at which a run has the right verdict, for one constant with a direction.
 
         Returns:
-            None if it holds nowhere.
+            None if the run has it nowhere.
         """
         steps = self._steps[0]
         is_good = self._margins.runs[run].is_good
@@ -345,13 +347,13 @@ class Search:
         return at(self._least([run], steps, at))[0] if self._margins.holds(run, at(steps)) else None
 
     def interval(self, point: Point, axis: int, least: float = 0.0) -> tuple[int, int]:
-        """Return the numbers around a point's, on one axis, at which all margins are at least so large."""
+        """Return the interval around a point on one axis in which all margins are at least `least`."""
         return self._edge(point, axis, -1, least), self._edge(point, axis, 1, least)
 
     # ---------------------------------------------------------------------------------------- one constant
 
     def _tightest(self) -> Found:
-        """Tighten all constants together, then one after the other, while every run stays satisfied."""
+        """Tighten all constants together and then one by one, while every run stays satisfied."""
         for constant, direction in zip(self._margins.varied, self._margins.directions, strict=True):
             if direction is None:
                 raise UsageError(
@@ -395,14 +397,14 @@ class Search:
         return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
 
     def _alone(self, loosest: Point, tightest: Point) -> tuple[int, ...]:
-        """Return the runs that have the right verdict at no point, given the two at which that is easiest."""
+        """Return the runs that have the right verdict nowhere, by the loosest and the tightest point."""
         good = [run for run in self._good if not self._margins.holds(run, loosest)]
         return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
 
     def _crossing(self, first: int, last: int, at: Callable[[int], Point]) -> int:
-        """Return the least looseness at which the good have the wider margin; the last if there is none.
+        """Return the least looseness at which good runs have the wider margin; `last` if there is none.
 
-        Runs that have the least margin nowhere between the ends are left out as these move together.
+        As the ends approach each other, runs without the least margin between them are dropped.
         """
         margin = self._margins.margin
         good, bad = self._good, self._bad
@@ -420,13 +422,13 @@ class Search:
         return first
 
     def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
-        """Return the least number from which on every run holds; all hold at `most`."""
+        """Return the least number from which on every run has the right verdict; at `most` all have it."""
         return least_for_all(runs, most, lambda run, number: self._margins.holds(run, at(number)))
 
     # ------------------------------------------------------------------------------------ several constants
 
     def _widest_by_boxes(self) -> Found:
-        """Decide exactly over the runs that decide, and add those that turn out to, until none is missing."""
+        """Search exactly over deciding runs, and add the worst other runs until none is worse."""
         alone = self._alone(self._at(_PARTS), self._at(0))
         if alone:
             return Found(self._margins.start, is_held=False, conflict=alone, alone=alone)
@@ -443,7 +445,7 @@ class Search:
                 return Found(self._centre(point), is_held=True, is_proven=feasibility.is_proven)
             deciding += missing
         if feasibility.is_proven:
-            # leave out runs that the contradiction does not need, so that the conflict names few
+            # runs that the contradiction does not need are left out, so that the conflict names few runs
             for run in list(deciding):
                 rest = self._split([other_run for other_run in deciding if other_run != run])
                 fewer = exact.decide(*rest, 0.0)
@@ -452,7 +454,7 @@ class Search:
         return Found(self._margins.start, False, tuple(deciding), feasibility.is_proven)
 
     def _split(self, runs: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Return the good ones among runs, and the bad ones."""
+        """Return the good runs and the bad runs among some runs."""
         return [run for run in runs if run in self._good], [run for run in runs if run in self._bad]
 
     def _failing(self, point: Point) -> list[int]:
@@ -462,7 +464,7 @@ class Search:
         return tuple(self._number_at(axis, number) for axis, number in enumerate(looseness))
 
     def _widest_of_several(self) -> Found:
-        """Optimise over the runs that decide, and add those that turn out to, until none is missing."""
+        """Optimise over deciding runs, and add the worst other runs until none is worse."""
         start = self._margins.start
         deciding = self._worst(start, [])
         point = start
@@ -477,16 +479,16 @@ class Search:
         return Found(self._centre(point), is_held=True, is_proven=False)
 
     def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
-        """Return the good and the bad run of the least margin, if it is less than that of the known runs."""
+        """Return the good and the bad run with the least margin, if it is below that of the known runs."""
         margin = self._margins.margin
         least = min((margin(run, point) for run in known), default=np.inf)
         worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
         return [run for run in worst if run not in known and (not known or margin(run, point) < least)]
 
     def _optimise(self, runs: Sequence[int], start: Point) -> Point:
-        """Return the best point for some runs: of all on few grid lines, or else the best that is found.
+        """Return the best point for some runs, by a search of all grid lines or else by evolution.
 
-        The lines go along an axis with a direction, on which the best number is narrowed down.
+        A grid line follows an axis with a direction, on which secants find the best number.
         """
         directed = [axis for axis, direction in enumerate(self._margins.directions) if direction is not None]
         axis = max(directed, key=lambda axis: self._steps[axis], default=None)
@@ -511,10 +513,10 @@ class Search:
         return self._climb(runs, best[1])
 
     def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
-        """Return the best point that is found along an axis, with its margin.
+        """Return the best point on a line along an axis, with its margin.
 
-        Margins of good runs rise towards looser values, those of bad ones fall: the best is where they meet.
-        They are often linear in a threshold, so that a few secants find it.
+        Towards looser values, margins of good runs rise and margins of bad runs fall. They meet at the best
+        point. Margins are often linear in a threshold, so few secants find the point.
         """
         if axis is None:
             return self._sides(runs, point)[0], point
@@ -534,6 +536,7 @@ class Search:
         for turn in range(_SECANTS):
             if high - low <= 1:
                 break
+            # every third step is a bisection, because secants can leave one end in place for many steps
             share = 0.5 if turn % 3 == 2 else below / (below - above)
             middle = min(max(low + round(share * (high - low)), low + 1), high - 1)
             if (middle_excess := excess(middle)) >= 0.0:
@@ -543,7 +546,7 @@ class Search:
         return best
 
     def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
-        """Return the least margin of some runs, and those of the good and of the bad among them, bounded."""
+        """Return the least margins of some runs, of the good and of the bad ones; at most `_FAR` in size."""
         least = [_FAR, _FAR]
         for run in runs:
             side = int(not self._margins.runs[run].is_good)
@@ -551,7 +554,7 @@ class Search:
         return min(least), least[0], least[1]
 
     def _climb(self, runs: Sequence[int], point: Point) -> Point:
-        """Move a point along single axes while the least margin grows, by steps that halve."""
+        """Move a point along single axes while the least margin grows, with halving steps."""
 
         def value(trial: Point) -> float:
             return min(self._margins.margin(run, trial) for run in runs)
@@ -568,17 +571,17 @@ class Search:
         return point
 
     def _centre(self, point: Point) -> Point:
-        """Move each number to the middle of those that give no lesser margin."""
+        """Move each number to the middle of the interval that has no lesser margin."""
         least = self._least_margin(point)
         for axis, constant in enumerate(self._margins.varied):
             number = constant.roundest(*self.interval(point, axis, least))
             moved = self._with(point, axis, number)
-            # between the ends a constant without a direction may have a lesser margin
+            # a constant without a direction can have a lesser margin between the ends of the interval
             point = moved if self._all_hold(self._good + self._bad, moved, least) else point
         return point
 
     def _conflict(self, point: Point) -> tuple[int, ...]:
-        """Return the runs that conflict: one or two for which no point is found, else all that fail."""
+        """Return the conflicting runs: one or two runs without a common point, else all failing runs."""
         worst = self._worst(point, [])
         for few in (*[[run] for run in worst], worst):
             if not self._all_hold(few, self._optimise(few, point)):
@@ -588,11 +591,11 @@ class Search:
     # ---------------------------------------------------------------------------------------------- points
 
     def _number_at(self, axis: int, looseness: int) -> int:
-        """Return the number on an axis of a value that is so many steps looser than the tightest."""
+        """Return the index of the value that is `looseness` steps looser than the tightest value."""
         return self._steps[axis] - looseness if self._margins.directions[axis] == -1 else looseness
 
     def _at(self, part: int) -> Point:
-        """Return the point whose looseness is this part of all steps, on each axis."""
+        """Return the point with the same relative looseness, `part / _PARTS`, on each axis."""
         return self._point_at([part * steps // _PARTS for steps in self._steps])
 
     def _with(self, point: Point, axis: int, number: int) -> Point:
@@ -605,12 +608,12 @@ class Search:
         return min(self._margins.margin(run, point) for run in (*self._good, *self._bad))
 
     def _edge_of_each(self, point: Point, axis: int, end: int, least: float) -> int:
-        """Return the last number from a point's to an end up to which all runs hold, run by run.
+        """Return the last index towards an end at which all runs hold, for an axis with a direction.
 
-        For an axis with a direction: only good runs fail at tighter values, only bad ones at looser ones.
+        Only good runs fail at tighter values, and only bad runs at looser values.
         """
         is_looser = (end > point[axis]) == (self._margins.directions[axis] == 1)
-        # where the specification is invalid, one good run shows it as well as all
+        # one good run is enough to notice that the specification is invalid
         runs = [*self._bad, *self._good[:1]] if is_looser else self._good
 
         def holds(run: int, number: int) -> bool:
@@ -622,7 +625,7 @@ class Search:
         return end
 
     def _edge(self, point: Point, axis: int, towards: int, least: float) -> int:
-        """Return the last number in one direction up to which all margins are at least so large."""
+        """Return the last index in one direction up to which all margins are at least `least`."""
         runs, end = [*self._bad, *self._good], self._steps[axis] if towards > 0 else 0
         if self._margins.directions[axis] is not None:
             return self._edge_of_each(point, axis, end, least)
@@ -633,25 +636,25 @@ class Search:
 
 MOST_RUNS: Final = 10_000
 MOST_SAMPLES: Final = 1 << 25
-"""Bounds of what is held in memory: runs, and samples of all of them together."""
+"""Limits of memory: runs, and samples of all runs."""
 MOST_CONSTANTS: Final = 10
 _MOST_NAMED: Final = 5
-"""The most conflicting runs that a sentence names."""
+"""Most conflicting runs in one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class TunedConstant:
-    """A constant with the value found for it.
+    """Constant with its tuned value.
 
     Attributes:
-        value, written: the value found and the one in the text: a number, or a duration as a text.
-        low, high: ends of the interval around it that fits every run, with the other constants as found. One
-            step beyond either end, unless it ends the tried range, some run does not fit.
-        tried: the range that was tried.
-        step: the least difference of two values, or the seconds of it.
-        direction: 1 if greater values are looser, -1 if they are tighter, None if neither is certain.
-        is_decided: whether runs decide it; else no bad run keeps it from being looser, and it keeps the
-            written value, or the nearest that fits.
+        value, written: tuned value and value in the text: numbers, or durations as texts.
+        low, high: ends of the interval around the tuned value that fits every run, with the tuned values of
+            the other constants. One step beyond an end some run does not fit, unless the tried range ends.
+        tried: tried range.
+        step: least difference of two values; seconds for a duration.
+        direction: 1 if greater values are looser, -1 if they are tighter, None if unknown.
+        is_decided: whether runs decide the value. If not, no bad run limits looser values, and the constant
+            keeps the written value or the nearest value that fits.
     """
 
     name: str
@@ -667,11 +670,12 @@ class TunedConstant:
 
 @dataclass(frozen=True, slots=True)
 class RunMargin:
-    """A run with the values found.
+    """Run with its verdict and margin at the tuned values.
 
     Attributes:
-        robustness: the least of all results, at its lower end if the run is good and its upper end if bad.
-        margin: how far that is from the wrong verdict: negated for a bad run, negative if it is wrong.
+        robustness: least robustness of all results: the lower end for a good run, the upper for a bad run.
+        margin: margin from the wrong verdict: the robustness, negated for a bad run. It is negative if the
+            verdict is wrong.
     """
 
     name: str
@@ -683,13 +687,13 @@ class RunMargin:
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """Why no values were found.
+    """Reason why no values were found.
 
     Attributes:
         runs: names of the runs that cannot all have the right verdict.
-        message: what each of them needs, as far as that is known.
-        is_proven: whether no values exist, rather than that none were found.
-        alone: those of them that fit no values by themselves, whatever the others need.
+        message: needs of each run, as far as they are known.
+        is_proven: whether no values exist; if not, no values were found.
+        alone: names of the runs that fit no values even without the others.
     """
 
     runs: tuple[str, ...]
@@ -699,7 +703,7 @@ class Conflict:
 
     @property
     def sections(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Common and individual needs of the runs, runs without fitting values first."""
+        """Needs of the runs in two sections: runs that fit no values, and runs that contradict each other."""
         needs = self.message.split("; ")
         count = min(len(self.alone), _MOST_NAMED) + (len(self.alone) > _MOST_NAMED)
         alone = "this one fits none by itself" if len(self.alone) == 1 else "these fit none by themselves"
@@ -710,14 +714,14 @@ class Conflict:
 
 @dataclass(frozen=True, eq=False)
 class Surface(Displayed):
-    """The margin of every run over the values of one or two constants, the others as found.
+    """Margin of every run over the values of one or two constants; the others have their tuned values.
 
     Attributes:
-        names: of the constants, that along x first.
-        x, y: (X,) and (Y,), their values, durations in seconds; y is (1,) of NaN for one constant.
-        margins: (R, Y, X); -inf where the specification is invalid.
-        runs: (R,) names of the runs, and whether each is good.
-        found: the values found, or None.
+        names: names of the constants; the first one is along x.
+        x, y: (X,) and (Y,), values of the constants, seconds for durations; y is one NaN for one constant.
+        margins: (R, Y, X), margins; -inf where the specification is invalid.
+        runs: (R,), name of each run and whether it is good.
+        found: tuned values, or None.
         durations: for each constant, whether it is a duration.
     """
 
@@ -731,25 +735,25 @@ class Surface(Displayed):
 
     @property
     def least(self) -> Floats:
-        """(Y, X), the least margin of all runs."""
+        """(Y, X), least margin of all runs."""
         least: Floats = self.margins.min(axis=0)
         return least
 
 
 @dataclass(frozen=True, eq=False)
 class Tuning(Displayed):
-    """The values found for constants, or why there are none.
+    """Tuned values of constants, or the reason why there are none.
 
     Attributes:
         is_found: whether every run has the right verdict with these values.
-        constants: the constants that were varied; if nothing was found, as far as the search came.
-        margin: the least margin of all runs.
-        runs: every run, in the order given.
-        conflict: why nothing was found, or None.
-        is_widest: whether other values are known to have no wider margin, or to be no tighter. False if the
-            search ran out of evaluations, tried values of a constant without a direction, or kept a constant
-            that no bad run decides.
-        specification: the specification with the values, its comments and layout kept.
+        constants: varied constants; if nothing was found, at the last point of the search.
+        margin: least margin of all runs.
+        runs: all runs in the given order.
+        conflict: reason why nothing was found, or None.
+        is_widest: whether it is proven that no other values have a wider margin or are tighter. False if the
+            search ran out of evaluations, a constant has no direction, or a constant that no bad run decides
+            kept its value.
+        specification: specification with the values; comments and layout are unchanged.
     """
 
     is_found: bool
@@ -764,7 +768,7 @@ class Tuning(Displayed):
 
     @property
     def values(self) -> dict[str, Value]:
-        """The values by name, as `parse_specification` takes them."""
+        """The values by name, as an argument of `parse_specification`."""
         return {constant.name: constant.value for constant in self.constants}
 
     def __repr__(self) -> str:
@@ -774,10 +778,10 @@ class Tuning(Displayed):
         return f"<Tuning of {plural(len(self.runs), 'run')}: {values}; margin {self.margin:.6g}>"
 
     def surface(self, *names: str, points: int = 25) -> Surface:
-        """Compute the margins over one or two constants; without names over the first two.
+        """Compute the margins over one or two constants; by default over the first two.
 
         Args:
-            points: how many values of each constant.
+            points: number of values of each constant.
 
         Raises:
             UsageError: a constant that was not varied, more than two, fewer than 2 points or more than 200.
@@ -829,7 +833,7 @@ class Tuning(Displayed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """This as values for JSON."""
+        """The result as values for JSON."""
         unknown = {} if self.is_found else {"low": None, "high": None}
         return {
             "found": self.is_found,
@@ -850,23 +854,23 @@ def tune_runs(
     seed: int = 0,
     advance: Callable[[int], None] = lambda runs: None,
 ) -> Tuning:
-    """Find the constants with which all good runs are satisfied and all bad ones are violated.
+    """Find values of constants with which all good runs are satisfied and all bad runs are violated.
 
-    With bad runs those of the widest margin: the least of the good runs' robustness and the bad runs' negated
-    one is the greatest. With good runs only the tightest ones: all are tightened together, in proportion to
-    their ranges, and then one after the other. With bad runs, a constant that none of them keeps
-    from being looser stays as written as far as that fits.
+    With bad runs, the values have the widest margin. The margin is the least of the good runs' robustness and
+    the bad runs' negated robustness. A constant that no bad run keeps from being looser stays as written, or
+    gets the nearest value that fits. Without bad runs, the values are the tightest. All constants are
+    tightened together in proportion to their ranges, and then one by one.
 
     Args:
-        ranges: the values to try for each constant, by name; None takes the range in the text, and no ranges
-            all constants that have one there.
-        each: for each parameter of a template, the objects that it stands for.
-        seed: of the search over several constants; the same seed finds the same values.
-        advance: called with the number of runs that are prepared.
+        ranges: range to try by name of the constant; None for the range in the text. If it is empty, all
+            constants with a range in the text are tuned.
+        each: objects by template parameter.
+        seed: seed of the search over several constants; the same seed finds the same values.
+        advance: function that is called with the number of runs prepared since its last call.
 
     Raises:
         UsageError: no good run, too many runs, a constant that cannot be tuned, a run that does not fit the
-            specification, runs in other units.
+            specification, or runs in different units.
     """
     needs = Needs.of([specification], each or {})
     runs = [replace(run, trace=trim_trace(run.trace, needs)[0]) for run in runs]
@@ -888,9 +892,10 @@ def tune_runs(
 
 
 def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict[int, int]:
-    """Return the constants that no bad run decides, with the numbers of the values that they keep.
+    """Return the axes of constants that no bad run decides, with the indices of the values that they keep.
 
-    The widest margin would loosen them as far as can be. Good runs alone find the tightest values.
+    The widest margin would loosen such a constant to the end of its range. Without bad runs there are none,
+    because the tightest values are decided.
     """
     kept_numbers: dict[int, int] = {}
     if all(run.is_good for run in margins.runs):
@@ -918,13 +923,13 @@ def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
 
 
 def require_comparable(runs: Sequence[LabelledRun], remedy: str) -> None:
-    """Check that runs can be held in memory together, and are in the same units.
+    """Raise an error if runs have too many samples for the memory, or different units.
 
     Args:
-        remedy: what is to be done with some of them: "tune on".
+        remedy: verb for messages that ask for fewer runs, such as "tune on".
 
     Raises:
-        UsageError: too many runs or samples, or other units.
+        UsageError: too many runs or samples, or different units.
     """
     if len(runs) > MOST_RUNS:
         raise UsageError(f"{len(runs)} runs are more than {MOST_RUNS}; {remedy} some of them")
@@ -1010,7 +1015,7 @@ def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
 
 
 def _needs(margins: Margins, search: Search, run: int, *, is_exact: bool, is_alone: bool) -> str:
-    """Say which values a run needs, in a part of a sentence."""
+    """Return the values that a run needs, as part of a sentence."""
     labelled = margins.runs[run]
     what = "satisfied" if labelled.is_good else "violated"
     if not is_exact:
