@@ -120,6 +120,7 @@ def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
         least = int(column.min())
         width = int(column.max()) - least + 1
         places = column.astype(np.int64) - least
+        # ranks keep codes small, before their product would overflow
         if most * width > _MOST:
             (code, most), (places, width) = _ranks(code), _ranks(places)
         code, most = code * width + places, most * width

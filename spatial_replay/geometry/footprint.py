@@ -78,7 +78,7 @@ class ConvexPart:
         corners, is_convex = _tidy(vertices)
         if not is_convex:
             raise GeometryError(
-                f"the vertices {_vertices_text(corners)} are not those of a convex polygon in order; "
+                f"the vertices {_vertices_text(corners)} do not form a convex polygon in this order; "
                 "Footprint.polygon takes any polygon"
             )
         radius = _finite(radius, "a part's radius")
@@ -167,7 +167,7 @@ class Footprint(metaclass=_FootprintType):
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self.parts))
         if not self.parts:
-            raise GeometryError("a footprint without parts; leave an object that covers nothing out instead")
+            raise GeometryError("a footprint without parts; leave out an object that covers nothing")
 
     def __repr__(self) -> str:
         return f"Footprint({', '.join(map(repr, self.parts))})"
@@ -358,10 +358,10 @@ def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
 class FootprintBatch:
     """R footprints made of P convex parts with V vertices in total, as ragged rows.
 
-    The parts of footprint r are part_start[r] to before part_start[r + 1]. The vertices of part p are
-    vertex_start[p] to before vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without
-    repeated or collinear ones. One vertex is a point or disc, two are a segment or capsule. Raw outlines
-    have to pass `normalise_polygons` first.
+    Footprint r has the slice part_start[r] : part_start[r + 1] of parts. Part p has the slice
+    vertex_start[p] : vertex_start[p + 1] of vertices. Vertices of a part are in counter-clockwise order,
+    without repeated or collinear ones. One vertex is a point or disc, two are a segment or capsule. Raw
+    outlines have to pass `normalise_polygons` first.
 
     Attributes:
         part_start: (R + 1,) int64.
@@ -572,6 +572,7 @@ def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
         total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
         mean_x, mean_y = mean_x + x, mean_y + y
         at, parts = end, parts + 1
+    # points and segments have no area, so that each counts equally
     if total <= 0.0:
         total, sum_x, sum_y = float(parts), mean_x, mean_y
     centre[0], centre[1] = sum_x / total, sum_y / total
@@ -597,6 +598,7 @@ def _fill_centres(
             area, x, y = weight_and_centre(vertices, vertex_start[p], vertex_start[p + 1], radius[p])
             total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
             mean_x, mean_y = mean_x + x, mean_y + y
+        # points and segments have no area, so that each counts equally
         if total <= 0.0:
             total, sum_x, sum_y = part_start[row + 1] - part_start[row], mean_x, mean_y
         centres[row, 0], centres[row, 1] = sum_x / total, sum_y / total

@@ -130,7 +130,7 @@ def _is_farther(rows: Rows, p: int, q: int, reach: float) -> bool:
 
 @reference_free
 def _least_height(vertices: Floats, start: int, stop: int, x: float, y: float, nx: float, ny: float) -> float:
-    """Return the least signed height of a part's vertices above the line through (x, y) with a normal."""
+    """Return the least height of a part's vertices above the line through (x, y) with normal (nx, ny)."""
     least = np.inf
     for j in range(start, stop):
         least = min(least, nx * (vertices[j, 0] - x) + ny * (vertices[j, 1] - y))
@@ -323,7 +323,10 @@ def _union_distance(
 def _union_protrusion(
     rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
-    """Return the protrusion of a union of rows from another: a maximum over its parts of minima."""
+    """Return the protrusion of a union of rows from another.
+
+    It is the greatest protrusion of a part, and that of a part is the least over the parts of the other.
+    """
     greatest = -np.inf
     for i in range(first[0], first[1]):
         a = members[i]
@@ -409,6 +412,7 @@ def measure_rows(
                     grown = enlargement[a] + enlargement[b]
                     values[k, t] = _union_distance(rows, members, a_members, b_members, grown)
                 elif quantity[k] == PROTRUSION:
+                    # an enlarged container reduces the protrusion
                     grown = enlargement[a] - enlargement[b]
                     values[k, t] = _union_protrusion(rows, members, a_members, b_members, grown)
 
@@ -455,6 +459,7 @@ def fill_contacts(
                             vertex_start[q + 1], is_protrusion,
                         )  # fmt: skip
                         first_radius = radius[p] + first_enlargement
+                        # the point of a rounded part farthest outside lies beyond its vertex, not before it
                         first_radius = -first_radius if is_protrusion else first_radius
                         second_radius = radius[q] + second_enlargement
                         rounded = line[4] - first_radius - second_radius

@@ -32,7 +32,7 @@ from spatial_replay.geometry.kernels import (
 )
 
 _SHARE = 16_384
-"""Quantities per thread, at least; fewer do not pay for starting it."""
+"""Least number of quantities per thread; fewer do not pay for starting a thread."""
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
 
@@ -184,6 +184,7 @@ def candidate_pairs(
     greatest = np.maximum.reduceat(footprints.vertices + radius, first_vertex)
     high = closest_pairs(batch, rows[None], uncertainty, enlargement)[0, 2]
     size = max(np.abs(least).max(), np.abs(greatest).max())
+    # 1e-9 covers rounding, as in `closest_rows`
     reach = high + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * size
     # a sweep from left to right, because a matrix of all pairs of some thousands would take gigabytes
     order = np.argsort(least[:, 0], kind="stable")
@@ -256,6 +257,7 @@ def closest_rows(
                 reach = high + slack
                 gap_x = boxes[b, LEFT] - boxes[a, RIGHT]
                 if gap_x > reach:
+                    # boxes are sorted by their left sides, so that all further ones are farther away
                     break
                 gap_y = max(boxes[b, LOWER] - boxes[a, UPPER], boxes[a, LOWER] - boxes[b, UPPER])
                 if gap_y > reach:

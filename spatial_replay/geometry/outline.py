@@ -119,9 +119,9 @@ def _limit_corners(counts: Integers, fault: NDArray[np.int8]) -> None:
 
 
 _FEW_OUTLINES = 4_096
-"""Outlines at most that NumPy tests before the kernel; more of them are worth a compiled kernel."""
+"""Limit of outlines tested by NumPy first, because the kernel is interpreted for so few."""
 _MOST_TESTED_CORNERS = 16
-"""Corners at most of an outline that NumPy tests."""
+"""Limit of an outline's corners tested by NumPy."""
 
 
 @elementwise
@@ -223,6 +223,7 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
 @inlined
 def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
     """Drop superfluous vertices among the first `count`, in place; return the number left."""
+    # the line between two far vertices decides whether the outline is flat
     head = _farthest(vertices, count, 0)
     tail = _farthest(vertices, count, head)
     is_flat = True
@@ -304,8 +305,8 @@ def convex_pieces(vertices: Floats, holes: Sequence[Floats] = ()) -> list[Floats
     outline, vertices = vertices, np.concatenate([vertices, *holes])
     if len(vertices) > MOST_CORNERS:
         raise GeometryError(
-            f"a polygon that is not convex has {len(vertices):,} corners, and at most {MOST_CORNERS:,} are"
-            " split; simplify it, or take its hull (concave='hull')"
+            f"a polygon that is not convex has {len(vertices):,} corners, more than the {MOST_CORNERS:,} that"
+            " can be split; simplify it, or take its hull (concave='hull')"
         )
     from shapely import Polygon, constrained_delaunay_triangles, get_coordinates
 
@@ -349,6 +350,7 @@ def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring
         ring = from_j + from_i[1:-1]
         at_i = _turn(corners, from_j[-2], i, from_i[1])
         at_j = _turn(corners, from_i[-2], j, from_j[1])
+        # straight corners are allowed: normalising the piece drops them
         if at_i < 0 or at_j < 0:
             continue
         merged, removed = ring_of_edge[i, j], ring_of_edge[j, i]

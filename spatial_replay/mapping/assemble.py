@@ -42,21 +42,21 @@ from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
-"""Messages before the first trace; few, so that the first sample is early. Later steps double."""
+"""Messages before the first trace, few for an early first sample; the number doubles for each trace."""
 _LONGEST_STEP: Final = 8_192
-"""Messages between two traces at most."""
+"""Limit of messages between two traces."""
 
 _STEP_BYTES: Final = 2**23
-"""Size of messages between two traces at most, bytes."""
+"""Size limit of messages between two traces, bytes."""
 
 _MOST_STEPS = 100_000
-"""Samples between two messages at most; more show a jump of the clock instead of a pause."""
+"""Limit of samples between two messages; more of them show a jump of the clock."""
 
 _ANOTHER_CLOCK_NS: Final = 366 * 86_400 * 10**9
 """Jump back that shows two clocks, such as simulated time from 0 and time since 1970, nanoseconds."""
 
 _MOST_AT_ONCE = 1_000_000
-"""Samples at most between the messages of one step, all of which are in memory together."""
+"""Limit of samples between messages of one step, which are in memory together."""
 
 
 class _Assembling:
@@ -247,6 +247,7 @@ class _Assembling:
             if reader.planned.topic not in arrived_topics or (
                 self._knows_static and reader.planned.is_static and not reader.is_mapped
             ):
+                # static transforms were added in advance, by `know_static`
                 continue
             places = np.flatnonzero(number_of_message == self._number_of_topic[reader.planned.topic])
             places = self._of_publisher(reader.planned, places, arrived)
@@ -306,6 +307,7 @@ class _Assembling:
         moving = [batch for batch in stamped if batch.reader.advances_time]
         none = np.empty(0, np.int64)
         places = np.concatenate([none, *(batch.places for batch in moving)])
+        # in the order of arrival over all topics, in which a jump is defined
         order = np.argsort(places, kind="stable")
         times_ns = np.concatenate([none, *(batch.times_ns for batch in moving)])[order]
         if self._begin_ns is None and len(times_ns):
@@ -365,7 +367,7 @@ class _Assembling:
     def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
         """Return the final samples up to a time.
 
-        A message from before that time which arrives later is valid only after it.
+        A late message from before that time is valid only after it.
 
         Args:
             is_last: whether the log ends here, so that no message waits.
@@ -398,7 +400,7 @@ class _Assembling:
         return trace
 
     def _note_arrivals(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
-        """Note messages of a topic with their times on its clock, decoded where frames matter."""
+        """Note arrived messages of a topic, which are decoded if its reader `decodes_on_arrival`."""
 
     def _columns(self, messages: Sequence[Message]) -> MessageColumns:
         if not messages:
@@ -543,7 +545,7 @@ class _SampleTimes:
         return times
 
     def note(self, time_ns: int) -> bool:
-        """Note a sample at another time; return whether it comes after the last sample, if there is one."""
+        """Note an extra sample; return whether there is an earlier sample and none at or after its time."""
         comes_after = 0 <= self._last_ns < time_ns
         if comes_after:
             self._last_ns = time_ns
@@ -555,7 +557,8 @@ class _SampleTimes:
         if self._from_ns is None or upto_ns < self._from_ns:
             return np.empty(0, np.int64)
         begin_ns = max(self._from_ns, self._last_ns + 1)
-        # multiples of the step since the epoch, so that samples do not depend on the window
+        # multiples of the step since the epoch, so that samples do not depend on the window; integer
+        # division, because floats do not resolve nanoseconds since 1970
         first, stop = -(-begin_ns // step_ns), upto_ns // step_ns + 1
         marks = np.unique(np.concatenate([[begin_ns, upto_ns], times_ns[times_ns > begin_ns]]))
         gaps = np.diff(marks)
@@ -568,8 +571,8 @@ class _SampleTimes:
             )
         if stop - first > _MOST_AT_ONCE:
             raise UsageError(
-                f"{self._mapping_name}: sample.every: a sample each {step_ns} ns makes {stop - first} of them"
-                f" up to {upto_ns} ns, where at most {_MOST_AT_ONCE} fit between messages that are read"
+                f"{self._mapping_name}: sample.every: a sample every {step_ns} ns makes {stop - first}"
+                f" samples up to {upto_ns} ns, and at most {_MOST_AT_ONCE} fit between messages that are read"
                 " together; give a longer step"
             )
         return np.arange(first, max(first, stop), dtype=np.int64) * step_ns
@@ -646,7 +649,10 @@ class _Silences:
         return upto_ns
 
     def _silences(self, times_ns: Integers, known_ns: int, *, is_last: bool) -> Booleans:
-        """Return whether the silence after each message is too long; the last element is before the first."""
+        """Return for each message whether the silence after it is too long.
+
+        The last element concerns the silence before the first message.
+        """
         limits_ns = np.full(len(times_ns), self._most_ns)
         limits_ns[1:] = np.clip(LONG_PAUSE * np.diff(times_ns), self._least_ns, self._most_ns)
         # if no message has arrived up to `known_ns`, the next one is later
@@ -716,7 +722,7 @@ _MOMENT_S: Final = 0.001
 """Time in which messages of one time arrive, if all messages arrive in the order of time, seconds."""
 
 _MOST_HELD: Final = 4_096
-"""Observations at most that wait for transforms; further ones do not wait."""
+"""Limit of observations that wait for transforms; further observations do not wait."""
 
 
 _TRIAL = """
@@ -848,6 +854,7 @@ class LiveAssembler(_Assembling):
         if messages and not self.is_finished:
             self._add_step(self._columns(messages))
         waited_ns = self._silent[-1][1] if self._silent else max(self._settled_ns, self._patient_ns)
+        # one deadline for all times since the last deadline
         if waited_ns < self._newest_ns:
             patience_s = _MOMENT_S if self._is_in_order else self._max_delay_s
             self._silent.append((now_s + patience_s, self._newest_ns))

@@ -108,9 +108,9 @@ def _group_topics(clauses: Mapping[str, str]) -> list[list[str]]:
 
 
 _MANY_TOPICS: Final = 3
-"""Topics from which a contradiction is one sentence."""
+"""Least number of topics that share one sentence."""
 _MOST_NAMED: Final = 8
-"""Names at most in a sentence."""
+"""Limit of names in a sentence."""
 _FEW: Final = 3
 """Least number of messages or reports for a measurement."""
 
@@ -133,6 +133,7 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FIRST_YEAR, _LAST_YEAR = 2005, 2100
+"""Years in which robots are recorded."""
 
 
 def _year(time_ns: int) -> int | None:
@@ -175,6 +176,7 @@ def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _LONG_STILL_S, _LONG_STILL = 0.3, 5
+"""Longest time without a new stamp: seconds, and usual periods of the topic."""
 
 
 def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
@@ -193,7 +195,9 @@ def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _UNIT_ERROR: Final = 0.02
+"""Largest relative error of a factor between units."""
 _FACTORS: Final = (1e3, 1e6, 1e9)
+"""Factors between units of time."""
 
 
 def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
@@ -216,6 +220,7 @@ def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _OTHER_CLOCK_S, _SLOWEST_S, _STEADY_S = 5.0, 600.0, 0.5
+"""Limits of delays, seconds: between two clocks, of the slowest computation, and of a steady spread."""
 
 
 def _signed_s(late_s: float) -> str:
@@ -240,6 +245,7 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _MOST_UPRIGHT, _FEW_UPRIGHT, _SOME_TURNED = 0.9, 0.5, 0.05
+"""Shares of objects: upright in the other order, upright in this order, turned in the other order."""
 
 
 def _length_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
@@ -258,6 +264,7 @@ def _scaled_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _LENGTH_ERROR, _OUTLIERS = 0.05, 0.02
+"""Largest relative spread of lengths, and share of lengths ignored at each end."""
 
 
 def _is_unwrapped(evidence: TopicEvidence, turn: float) -> bool:
@@ -288,6 +295,7 @@ def _some_turns(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _ROUNDING: Final = 0.01
+"""Tolerance of a turn, radians."""
 
 
 def _beyond_a_turn(evidence: TopicEvidence, log: Log) -> str | None:
@@ -307,6 +315,7 @@ def _beyond_a_turn(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _A_TURN: Final = 360.5
+"""A turn with its tolerance, degrees."""
 
 
 def _heading(evidence: TopicEvidence, log: Log) -> str | None:
@@ -333,7 +342,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _compass(evidence: TopicEvidence, log: Log) -> str | None:
-    """Remark the zero of an angle next to fixes, if motions do not confirm it."""
+    """Return a clause on the zero of an angle next to fixes, unless motions confirm it."""
     yaw = None if evidence.planned.mapping is None else evidence.planned.mapping.yaw
     courses = evidence.motions.courses
     goes_along = abs(courses["read"]) > _STEADY and abs(phase(courses["read"])) < _ASKEW
@@ -350,8 +359,11 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FEW_STEPS: Final = 20
+"""Least number of steps for a comparison of yaw and course."""
 _STRAIGHT, _CLOSE = 0.8, 0.95
+"""Lengths of mean unit vectors: of courses on a straight path, of differences for a fitting angle."""
 _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
+"""Length of a steady mean unit vector, and limits of its angle: as read, and for another angle, radians."""
 
 
 def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
@@ -372,6 +384,7 @@ def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FAST_DEGREES: Final = 0.01
+"""Speed that objects do not reach in degrees, degrees per second."""
 
 
 def _upward(evidence: TopicEvidence, log: Log) -> str | None:
@@ -400,6 +413,7 @@ def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _NO_LATITUDE: Final = 91.0
+"""Latitude for a missing position in AIS (ITU-R M.1371)."""
 
 
 def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
@@ -414,6 +428,7 @@ def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FAR_DEGREES: Final = 2.0
+"""Largest distance from the origin, degrees (220 km)."""
 
 
 def _precision(evidence: TopicEvidence, log: Log) -> str | None:
@@ -435,7 +450,9 @@ def _precision(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _COARSE: Final = 0.05
+"""Largest step of float32, in sizes of the smallest objects."""
 _METRES_A_DEGREE: Final = 111_320.0
+"""Length of a degree at the equator, metres."""
 
 
 def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
@@ -460,6 +477,7 @@ def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _IN_TURN: Final = 0.01
+"""Least share of messages after a change back to an earlier publisher."""
 
 
 def _one_object(evidence: TopicEvidence, log: Log) -> str | None:
@@ -496,6 +514,7 @@ def _complete_list(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _REGULAR: Final = 0.8
+"""Least share of objects that return after the usual number of messages."""
 
 
 def _ordinal(number: int) -> str:
@@ -564,6 +583,7 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _THOUSAND, _SOUND, _SIZES_A_SECOND = 200, 343.0, 1_000.0
+"""Least ratio that shows millimetres, speed of sound in metres per second, and sizes per second."""
 
 
 def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
@@ -585,6 +605,7 @@ def _alternating(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _IN_PAIRS: Final = 0.5
+"""Least share of messages in which an alternating signal returns."""
 
 
 def _by_place(evidence: TopicEvidence, log: Log) -> str | None:
@@ -654,6 +675,7 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FEW_LEAPS, _FAST_LEAP, _FARTHER = 10, 20.0, 3.0
+"""Least number of steps, and limits of a leap and of a comeback in usual speeds."""
 
 _DEGREES: Final = "`yaw: {field: PATH, unit: deg}` reads degrees"
 

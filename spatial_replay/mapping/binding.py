@@ -56,7 +56,7 @@ BY_PLACE = "only the places in the list distinguish objects without an id: objec
 _LONGEST_NAME = 500
 _UUID_BYTES = 16
 _MOST_IN_NAME = 16
-"""Elements of a list at most that form one name, such as the ids of a bundle of tags."""
+"""Limit of list elements in one name, such as the ids of a bundle of tags."""
 
 
 class Codes(dict[Any, int]):
@@ -137,6 +137,7 @@ class Namer:
         codes = []
         for row in rows:
             value = get(*row)
+            # the list of a UUID is not hashable
             key = value if isinstance(value, str | int | float) else bytes(value)
             code = code_by_value.get(key)
             if code is None:
@@ -259,6 +260,7 @@ def _text(value: object, path: FieldPath) -> str:
         return _text(get_field(value, field_names(value)[0]), path)
     if _is_uuid(value):
         digits = bytes(value).hex()  # type: ignore[call-overload]
+        # a UUID of zeros was not set
         return str(digits) if digits.strip("0") else ""
     if is_list(value) and len(value) <= _MOST_IN_NAME:
         return "_".join(_text(part, path) for part in value)
@@ -406,6 +408,7 @@ def ns_from_text(text: str, unit_ns: int) -> int:
         ContentError: the text is none of these.
     """
     if number := _SECONDS.fullmatch(text):
+        # exact, while a float of seconds since 1970 resolves only 0.24 us
         return int(Decimal(number[1]) * (_SECOND_NS if number[2] else unit_ns))
     date = _DATE.fullmatch(text)
     try:
@@ -415,8 +418,8 @@ def ns_from_text(text: str, unit_ns: int) -> int:
     except ValueError:
         pass
     raise ContentError(
-        f"{text[:40]!r} is not a time; a text has to be a number or as 2026-03-02T10:00:00.5Z, with its"
-        " offset from UTC; `clock: log` takes the time of recording"
+        f"{text[:40]!r} is not a time; write a number, or a time with its offset from UTC, such as"
+        " 2026-03-02T10:00:00.5Z; `clock: log` takes the time of recording"
     )
 
 
@@ -606,7 +609,7 @@ def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
 
 
 class OrderError(FieldError):
-    """A quaternion of four numbers without an order in the mapping, or of named fields with one."""
+    """An order of a quaternion that is missing for a list, or superfluous for named fields."""
 
 
 def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:

@@ -94,6 +94,7 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     boxes, polygons, hulls, rounds = map(
         np.flatnonzero, (kind == BOX, kind == POLYGON, kind == HULL, _IS_ROUND[kind])
     )
+    # a tilted flat box needs no hexagon, because its projection has four corners
     is_tilted = ~np.isnan(size[boxes, 2]) & ~is_upright(solids.rotation[boxes])
     flat, tilted = boxes[~is_tilted], boxes[is_tilted]
     rings = [_ring(solids, piece) for piece in hulls.tolist()]
@@ -217,9 +218,9 @@ Numbers: TypeAlias = tuple[float, ...]
 GetField: TypeAlias = Callable[[Any, str], Any]
 
 MARKER_ADD, MARKER_DELETE, MARKER_DELETE_ALL = 0, 2, 3
-"""Actions of https://docs.ros.org/en/jazzy/p/visualization_msgs/interfaces/msg/Marker.html."""
+"""Actions of a marker, see https://docs.ros.org/en/jazzy/p/visualization_msgs/interfaces/msg/Marker.html."""
 DELETE_ALL_ENTITIES = (1, "ALL")
-"""Forms of ALL in https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion-type."""
+"""ALL as number and text, see https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion-type."""
 
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
@@ -550,6 +551,7 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
         origin: latitude and longitude in degrees.
     """
 
+    # geodetic to Earth-centred, Earth-fixed coordinates at height 0
     def to_earth_frame(degrees: Floats) -> Floats:
         latitude, longitude = np.radians(degrees[:, :2]).T
         radius = _EQUATOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)

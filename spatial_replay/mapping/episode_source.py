@@ -287,7 +287,7 @@ class _Frames(NamedTuple):
         )
 
     def divide(self, starts: Sequence[int]) -> Iterator[_Frames]:
-        """Yield the frames from each start to before the next one."""
+        """Yield the frames between successive starts."""
         objects = np.arange(len(self.names), dtype=np.int64)[:, None] * starts[-1]
         order = [(objects + np.arange(begin, end)).ravel() for begin, end in pairwise(starts)]
         rows = select(self.rows, np.concatenate(order))
@@ -298,11 +298,11 @@ class _Frames(NamedTuple):
 
 
 _MOST_FRAMES: Final = 2**15
-"""Frames at most that are read together, which bounds the memory."""
+"""Limit of frames read together, which bounds the memory."""
 
 
 def read_together(sources: Sequence[Source]) -> list[Source]:
-    """Return the same sources after reading episodes of one data set with one mapping together.
+    """Return the sources, with episodes that share a data set and a mapping read together.
 
     An episode that cannot be read stays unread, so that iterating over its blocks raises the error.
     """
@@ -320,7 +320,7 @@ def read_together(sources: Sequence[Source]) -> list[Source]:
 
 
 def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
-    """Yield episodes of one data set with one mapping; those with features of equal shapes are read."""
+    """Yield episodes of one data set with one mapping, after reading those with features of equal shapes."""
     columns_by_place: dict[int, EpisodeColumns] = {}
     frames = 0
     for place, source in enumerate(sources if sources[0].mapped_by is not None else ()):

@@ -28,22 +28,22 @@ _ANGLE: Final = re.compile(r"(^|[._])(bearing|azimuth|heading|theta|phi|yaw|angl
 """Names of fields with angles."""
 
 _MOST_VALUES: Final = 4_096
-"""Values at most that a `Spread` keeps for its median."""
+"""Limit of values that a `Spread` keeps for its median."""
 
 _ROWS_AT_ONCE: Final = 4_096
-"""Objects that are measured together, because a short column costs as much as a long one."""
+"""Number of objects measured together, because a short column costs as much as a long one."""
 
 _LONGEST_GAP: Final = 9
 """Longest counted gap between two reports of an object, messages; longer gaps are counted as this one."""
 
 _MOST_LEAPS: Final = 4
-"""Reports at most after which a return of an object to its place is searched for."""
+"""Limit of reports after which an object may return to its place."""
 
 _MOST_ROWS: Final = 32_768
-"""Last reports of objects at most that wait for the next one; the oldest are dropped."""
+"""Limit of last reports kept until the next report of an object; the oldest are dropped."""
 
 FAR_LEAP: Final = 5.0
-"""Least length of a suspicious step, sizes of the object."""
+"""Least length of a suspicious step, in sizes of the object."""
 
 _FAST: Final = 100.0
 """Speed from which a leap there and back cannot be one robot, footprint units per second."""
@@ -73,6 +73,7 @@ class Spread:
         if values[at] > self.greatest:
             self.greatest, self.greatest_ns = float(values[at]), 0 if times_ns is None else int(times_ns[at])
         self.least = min(self.least, float(values.min()))
+        # the stride continues over calls, so that the sample does not depend on their sizes
         held = np.concatenate([self._held, values[-self.count % self._stride :: self._stride]])
         while len(held) > _MOST_VALUES:
             held, self._stride = held[::2], 2 * self._stride
@@ -414,7 +415,7 @@ class Motions:
 
 
 _MOST_CHANGES: Final = 8
-"""Changes of classes at most that are kept."""
+"""Limit of kept changes of classes."""
 
 
 class _Objects(NamedTuple):

@@ -230,7 +230,7 @@ class Keyed:
     key: str
 
     def read(self, value: Any) -> object:
-        """Return the element; None, which makes a number unknown, without such an element.
+        """Return the element; None without one, which makes a number unknown.
 
         Raises:
             FieldError: the elements lack the field.

@@ -44,7 +44,7 @@ _WAITING_BYTES = 2**26
 """Size limit of raw messages that wait for their samples, bytes; above it, all are passed on."""
 
 _MOST_UNREAD = 20
-"""Topics at most that are listed one by one as undecodable."""
+"""Limit of undecodable topics listed one by one."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class MessageLayout:
         sizes: alternatives, each the paths of length, width and maybe height of a box.
         frame, stamp: alternatives in the object or, with `$.`, in the message. An empty frame of an object
             means the frame of its message.
-        own_stamp: path of an object's stamp, if the message has another; its transforms are those of its own.
+        own_stamp: path of an object's stamp, for its transforms, if the message has another stamp; "" if not.
         solids: kind of message that lists the solids of an object; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
         origin: latitude and longitude of (0, 0) if positions are latitudes and longitudes; otherwise None.
@@ -257,7 +257,7 @@ _LATITUDE, _LONGITUDE = re.compile(r"lat(itude)?", re.I), re.compile(r"lon|lng|l
 
 
 def geodetic_order(paths: Alternatives) -> Alternatives | None:
-    """Return the paths of latitude and longitude among the paths of a position; None if names show none."""
+    """Return the paths of latitude and longitude among the paths of a position; None without these names."""
     names = [path.rpartition(".")[2] for path in paths]
     latitude = [path for path, name in zip(paths, names, strict=True) if _LATITUDE.fullmatch(name)]
     longitude = [path for path, name in zip(paths, names, strict=True) if _LONGITUDE.fullmatch(name)]

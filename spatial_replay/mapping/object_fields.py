@@ -43,7 +43,7 @@ _FOUR_BOUNDS = (
     ("x1", "y1", "x2", "y2"),
     ("x_offset", "y_offset", "width", "height"),
 )
-"""Names of the four fields of a box: two corners; the last are those of sensor_msgs/RegionOfInterest."""
+"""Names of the four numbers of a box; the last four are corner and size (sensor_msgs/RegionOfInterest)."""
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "mmsi", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
 """Names of lists that name the elements of another list."""
@@ -138,13 +138,13 @@ class Guess:
 
     @property
     def is_body(self) -> bool:
-        """Whether it has a name, and an orientation, a size or an outline; required of further lists."""
+        """Whether it has a name and also an orientation, a size or an outline, as further lists must have."""
         has_extent = bool(self.size or self.polygon or self.bounds or self.orientation or self.yaw)
         return bool(self.names) and has_extent and not self.is_plan
 
     @property
     def has_compass(self) -> bool:
-        """Whether the yaw is a heading next to latitude and longitude, which is an angle from north."""
+        """Whether the yaw is an angle from north: a heading next to latitude and longitude."""
         is_geodetic = isinstance(self.position, tuple) and geodetic_order(self.position) is not None
         return is_geodetic and self.yaw is not None and _words(self.yaw)[-1] in ("heading", "course", "cog")
 
@@ -233,7 +233,7 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
 
 
 def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
-    """Yield paths of lists next to the list of objects that name each object."""
+    """Yield the paths of neighbouring lists with a name for each object."""
     if guess.objects is None or guess.objects.count("[*]") > 1:
         return
     prefix = guess.objects.rpartition(".")[0]
@@ -471,6 +471,7 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
     for path in _paths_by_name(fields, _BOUNDS):
         if _numbers(fields[path], 4):
             return path
+    # reversed, so that the first of several fields with one name is used
     paths = {
         "_".join(_words(path.split(".")[-1])): path for path in reversed(fields) if _is_number(fields[path])
     }
@@ -532,6 +533,7 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
                 return place, turn
     position: str | tuple[str, ...] | None = places[0] if places else None
     if position is None and all(_is_number(fields.get(name)) for name in "xy"):
+        # x and y next to w are parts of a quaternion
         position = None if _is_number(fields.get("w")) else ("x", "y")
     if position is None:
         position = geodetic_order(tuple(path for path, value in fields.items() if _is_number(value)))
@@ -589,7 +591,7 @@ def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
 
 
 def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
-    """Return the paths of fields that may distinguish objects: names and ids, then such as `fiducial_id`."""
+    """Return the paths of fields that may distinguish objects: `name`, `id`, then others as `fiducial_id`."""
     others = [
         path
         for path in fields

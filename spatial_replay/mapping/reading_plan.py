@@ -34,6 +34,7 @@ from spatial_replay.mapping.transforms import HISTORY_NS
 from spatial_replay.text import nearest_hint, plural
 from spatial_replay.trace.trace import LONG_PAUSE
 
+# bounded, so that a window needs to read only 11 s beyond its end and 13 s before its start
 _LONGEST_SILENCE_NS: Final = 10 * 10**9
 """Silence of the sampled topic that is always a pause, even if its messages are rare, nanoseconds."""
 
@@ -286,7 +287,7 @@ def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> fr
 
 
 _MANY_TIMES = 10
-"""Ratio of message counts from which sampling is called slow."""
+"""Least ratio of message counts for a remark on slow sampling."""
 
 
 def _slow_sampling(

@@ -353,6 +353,7 @@ def _first_corner(message: object) -> tuple[float, float] | None:
         text = str(walk(FieldPath.of("geojson"), message))
     except FieldError:
         return None
+    # longitude comes before latitude (RFC 7946, section 3.1.1)
     place = re.search(r'"coordinates":[\s[]*(-?[\d.]+)\s*,\s*(-?[\d.]+)', text)
     return None if place is None else (float(place[2]), float(place[1]))
 

@@ -53,7 +53,7 @@ _EXACT: Final = 1e-4
 _IN_PLANE: Final = ("[0:2]", "x", "y")
 _MOST_SIGNALS: Final = 20
 _MOST_EPISODES: Final = 8
-"""Episodes at most whose numbers are read."""
+"""Limit of episodes whose numbers are read."""
 
 
 class Suggestion(NamedTuple):
@@ -228,11 +228,13 @@ def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Sugg
     for stem, axes in points.items():
         position = tuple(axes[axis] for axis in "xyz" if axis in axes)
         suggestion = Suggestion(feature.name, stem or _last_word(feature.name), position, signals=signals)
+        # only the first object of a feature has its signals
         signals = ()
         parts = turns.get(stem, {})
         if set("wxyz") <= parts.keys():
             places, order = tuple(parts[part] for part in "xyzw"), "xyzw"
         elif set("0123") <= parts.keys():
+            # numbers do not show which part is w
             places, order = tuple(parts[part] for part in "0123"), ""
         else:
             yield suggestion

@@ -206,6 +206,7 @@ class Extractor:
                 from the others. Only a FieldError describes the difference.
         """
         values, index, order = self._flatten(messages)
+        # such as moveit_msgs/PlanningScene
         if messages and "is_diff" in field_names(messages[0]):
             get = lenient_getter(style_of(messages[0]))
             self.differences += sum(bool(get(message, "is_diff")) for message in messages)
@@ -365,6 +366,7 @@ class Extractor:
         for number, message in enumerate(messages):
             get = lenient_getter(style_of(message))
             for deletion in get(message, "deletions") or ():
+                # a deletion without a timestamp concerns all entities so far
                 stamp_ns = _stamp_of_scene(deletion) or LATEST_NS
                 if get(deletion, "type") in DELETE_ALL_ENTITIES:
                     names = list(stamps_ns)
@@ -466,13 +468,13 @@ _NO_STAMP = (
 )
 
 _PATIENCE = 100
-"""Messages of a topic that may misfit before the first that fits; more show a wrong mapping."""
+"""Misfitting messages before the first that fits that show a wrong mapping."""
 
 _MOST_UNNAMED, _LONGEST_UNNAMED = 8, 40
 """Limits of remarks on texts without a number: texts, and characters of a text."""
 
 _CHUNK = 256
-"""Messages at most that are decoded together; few, so that their contents are freed soon."""
+"""Limit of messages decoded together, low, so that their contents are freed soon."""
 _CHUNK_BYTES = 2**14
 """Usual size of messages that are decoded together, bytes."""
 
@@ -660,7 +662,7 @@ class TopicReader:
         if self.extractor is not None and self.extractor.is_bound and self.extractor.unseen:
             paths = ", ".join(self.extractor.unseen)
             raise self._misfit_error(
-                f"none of its messages has {paths}; with `missing: 0` it would be 0 in all"
+                f"none of its messages has {paths}; with `missing: 0` the position would be 0 in all of them"
             )
 
     def _read_each(
@@ -799,6 +801,7 @@ class TopicReader:
 
 def with_single_precision(numbers: Sequence[float]) -> list[float]:
     """Return numbers, and the same numbers rounded to float32, which fields may have."""
+    # 0.1 in a field of type float32 is read as 0.10000000149011612
     return [*numbers, *np.array(numbers, np.float32).astype(np.float64).tolist()]
 
 
@@ -883,6 +886,7 @@ class PendingMessages:
         if not (recorded[1:] > recorded[:-1]).all() or not (times[1:] >= times[:-1]).all():
             times = self._without_steps(times, sequences, recorded, upto_ns)
         if len(times) and not (times[1:] > times[:-1]).all():
+            # a stable sort, so that the order of arrival decides last
             order = np.lexsort((sequences, times))
             times, sequences, log_times = times[order], sequences[order], log_times[order]
             recorded, contents = recorded[order], [contents[i] for i in order.tolist()]

@@ -303,14 +303,14 @@ def _radius(covariance: Floats) -> Floats:
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
-"""Calls of `advance`, and observations, from which old observations are dropped. Dropping after each call
+"""Calls of `advance`, or observations, after which old observations are dropped. Dropping after each call
 would be slow, because a call may process a single message."""
 
 _FAR_NS = 366 * 86_400 * 10**9
 """Difference of stamp and recording that shows another clock or unit, nanoseconds."""
 
 _MOST_NAMES = 8
-"""Names at most in one remark."""
+"""Limit of names in one remark."""
 
 
 class _Following(NamedTuple):

@@ -122,19 +122,19 @@ HISTORY_NS = 10 * 10**9
 """Longest time between two transforms that are interpolated, nanoseconds."""
 
 _LONGEST_CHAIN = 100
-"""Frames at most from a frame to its root."""
+"""Limit of frames between a frame and its root."""
 _OFF_LENGTH = 0.01
 """Largest error of the squared length of a rotation's quaternion, as in tf2."""
 _LEAST_JUMP = 0.1
 """Least jump of a frame: distance in metres plus turn in radians."""
 _MANY_JUMPS = 3
-"""Jumps of a frame from which they are reported."""
+"""Least number of a frame's jumps for a remark."""
 _MOST_PUBLISHERS = 4
-"""Publishers at most that are assumed to send a frame in turn."""
+"""Limit of publishers that may send a frame in turn."""
 LEAST_STEP_NS = 10_000_000
 """Least step back of a clock, nanoseconds; recorders with several threads mix messages by less."""
 _MOST_RESTARTS = 1_000
-"""Restarts at most that are kept."""
+"""Limit of kept restarts."""
 
 
 class Transforms(NamedTuple):
@@ -307,6 +307,7 @@ class FrameTree:
         old, before, child.restart = child.moving[-1], child.restart, None
         if before in self._restarts and new.stamp_ns >= before.old.stamp_ns - DISORDER_NS:
             self._restarts.remove(before)
+            # cached series depend on the runs
             self._series.clear()
         if new.stamp_ns >= old.stamp_ns - DISORDER_NS or new.log_ns < old.log_ns:
             if new.stamp_ns < old.stamp_ns - LEAST_STEP_NS:
@@ -385,6 +386,7 @@ class FrameTree:
                 # an observation may come before the first transform of its run
                 is_early = np.abs(times_ns - new.stamp_ns) < np.abs(times_ns - old.stamp_ns)
                 runs[is_early & (log_ns > old.log_ns) & (log_ns < new.log_ns)] = number
+        # even for stamps near to the times of recording, odd for stamps far from them
         kinds = 2 * runs + (ask.by_stamp & (np.abs(log_ns - times_ns) > HISTORY_NS))
         return [
             ask.part(kinds == kind)._replace(run=kind // 2, is_apart=kind % 2 > 0)
@@ -706,6 +708,7 @@ class TransformReader:
         for transform in self._each(message):
             child, parent, seconds, rest, *pose = self._values(transform)
             stamp_ns = _nanoseconds(seconds, rest)
+            # tf wrote names with a slash in front, which tf2 does not have
             tree.add(
                 str(child).removeprefix("/"),
                 str(parent).removeprefix("/"),

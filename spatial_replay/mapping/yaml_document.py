@@ -37,6 +37,7 @@ LARGEST_TEXT = 256 * 1024
 
 _DEEPEST = 20
 """Nesting limit of lists and mappings."""
+# of at most 300 digits, so that its conversion to float does not overflow
 _INTEGER = re.compile(r"[-+]?[0-9]{1,300}", re.ASCII)
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
 _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None}
@@ -179,7 +180,7 @@ def _scalar(text: str) -> Value:
 
 
 MOST_FAULTS = 100
-"""Errors of a document at most that are listed."""
+"""Limit of listed errors of a document."""
 
 
 def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> str:
@@ -198,6 +199,7 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from None
     try:
+        # without the byte order mark that some editors write
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1

@@ -48,12 +48,13 @@ from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
+# rosbag2 adds .zstd to the names of files that it compresses as a whole
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
 LOG_ENDINGS = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
 """File endings of logs."""
 _MOST_LOOKED_AT = 20
-"""Entries of a folder at most that are searched for a data set."""
+"""Limit of folder entries searched for a data set."""
 _HEAD = 4096
 """Size of the beginning that identifies a file's format, bytes."""
 
@@ -303,11 +304,12 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
         names = bag_metadata_from_bytes(metadata.read(0, LARGEST_METADATA + 1)).files
     except MissingFileError as error:
         raise MissingFileError(
-            f"{error}; a ROS 2 bag is the address of its folder, and any other log that of one file, such as "
-            "s3://bucket/run.mcap"
+            f"{error}; give the address of a bag's folder for a ROS 2 bag, and of one file for any other log,"
+            " such as s3://bucket/run.mcap"
         ) from None
     except LogError as error:
         raise LogError(f"{metadata} cannot be used: {error}; copy the bag to this machine") from None
+    # paths in web addresses are percent-encoded, keys in buckets are not
     if is_web(metadata):
         names = tuple(map(quote, names))
     return [metadata, *(RemoteFile(folder + name) for name in names)]
@@ -354,6 +356,7 @@ def _head(path: LogFile) -> bytes:
 
 
 def _is_jsonl(head: bytes) -> bool:
+    # some editors write a byte order mark in front
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
 
 
@@ -424,7 +427,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
 
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
-    """Open our own log, which names its objects, or an external one, given a mapping."""
+    """Open an MCAP log: our own, which names its objects, or an external one with a mapping."""
     from spatial_replay.logs.mcap.read import McapSource
 
     source = McapSource(path, kind, options)

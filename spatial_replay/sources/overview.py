@@ -38,7 +38,7 @@ _STEP = 10_000
 _ENOUGH = 1024
 """Messages of a topic that are enough for a survey."""
 _LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
-"""Numbers of the decoded messages of a topic: the first ones, then powers of two, ever more rarely."""
+"""Numbers of the decoded messages of a topic: the first ones, then powers of two."""
 _EXAMPLE_BYTES = 2**22
 """Decoding limit of a topic after its first message, bytes; images and point clouds are large."""
 
@@ -148,8 +148,8 @@ class Regularity:
     """Regularity of samples or messages over a log.
 
     Attributes:
-        count: number of them.
-        rate: their rate in hertz with two decimals, rounded down.
+        count: number of samples or messages.
+        rate: rate in hertz with two decimals, rounded down.
         max_gap: longest pause in seconds with three decimals, rounded up. The pauses before the first and
             after the last one count.
     """
@@ -170,7 +170,7 @@ class Regularity:
         )
 
     def lacks(self, wanted: Mapping[str, Any], what: str) -> Iterator[str]:
-        """Yield a sentence for each limit in `wanted` that is missed; `what` is their subject."""
+        """Yield a sentence for each limit in `wanted` that is missed; its subject is `what`."""
         if self.rate < (rate := wanted.get("rate", 0.0)):
             yield f"{what} have {self.rate:g} a second, at least {rate:g} are required"
         if self.max_gap > (gap_ns(wanted.get("max_gap")) or math.inf) / 1e9:

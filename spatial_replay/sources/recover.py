@@ -28,7 +28,7 @@ from spatial_replay.text import Instant, Sentence, counted_from, plural
 from spatial_replay.trace.trace import FOREVER
 
 _MOST_GAPS = 1_000
-"""Sample gaps at most in a list; the last one listed is extended over later ones."""
+"""Limit of listed sample gaps; the last listed gap extends over later gaps."""
 _BY_ENDING: Mapping[str, type[MessageReader]] = {".mcap": McapLog, ".bag": Ros1Bag}
 """Readers by file ending, for files whose first bytes are damaged."""
 
@@ -199,6 +199,7 @@ def _write(
         )
         if not recovery.is_whole:
             recovery = replace(recovery, spans=_spans(recovery.faults), samples=samples.gaps())
+        # records of earlier recoveries stay, because their losses are still missing
         earlier = [data for name, data in metadata if name == RECOVERY]
         for record in [*earlier, *([] if recovery.is_whole else [recovery.metadata()])]:
             writer.add_metadata(RECOVERY, record)
@@ -213,8 +214,8 @@ def _open_log(file: LogFile) -> tuple[MessageReader, FaultList]:
     kind = format_of(file)
     if kind is not None and not kind.endswith(("MCAP", "bag")):
         raise UsageError(
-            f"{file.name} is a {kind}, a text file without an index; to write what can be read of it as a"
-            " log: spatial-replay record tracks"
+            f"{file.name} is a {kind}, a text file without an index; `spatial-replay record tracks` writes"
+            " its readable part as a log"
         )
     reader = _BY_ENDING.get(Path(file.name).suffix.lower())
     if kind is None and reader is not None:

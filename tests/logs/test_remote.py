@@ -273,7 +273,7 @@ def test_addresses_that_do_not_work_say_what_helps(
         sr.read_trace(server.url("none.mcap"))
     with pytest.raises(UsageError, match="names no file"):
         sr.read_trace("s3://fleet")
-    with pytest.raises(MissingFileError, match="bag is the address of its folder"):
+    with pytest.raises(MissingFileError, match="address of a bag's folder"):
         sr.read_trace(server.url("2026-11/"))
     with pytest.raises(UsageError, match="is an address; write to this machine"):
         sr.replay_log(server.url("drive.mcap"), SPEC, output="s3://fleet/out.mcap")
