@@ -1,6 +1,6 @@
-"""A running robot, monitored: messages over Foxglove's WebSocket protocol in; verdicts, logs and clips out.
+"""Monitor a running robot over Foxglove's WebSocket protocol.
 
-    client   one connection: it is kept up, and its messages wait in a bounded inbox
+    client   connection with reconnects, and a bounded inbox of its messages
     session  messages to samples, samples to verdicts, logs, clips and viewers
 
 Names are loaded when they are first used.

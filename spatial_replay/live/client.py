@@ -1,4 +1,4 @@
-"""A client of a robot's Foxglove server: connections, and arrived messages until they are read."""
+"""Client of a robot's Foxglove server: its connection, and an inbox of unread messages."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ with importing("a running robot is listened to with websockets", extra="live"):
     from websockets.typing import Subprotocol
 
 LARGEST_FRAME: Final = 64 * 2**20
-"""The most bytes of one frame; a server that sends more is disconnected."""
+"""Largest frame, bytes; a server that sends a larger frame is disconnected."""
 
 MOST_WAITING: Final = 8_192
 MOST_WAITING_BYTES: Final = 64 * 2**20
-"""Messages, and bytes of them, that may wait to be evaluated; of more, the oldest are dropped."""
+"""Most messages, and most bytes, that wait for evaluation; beyond that, the oldest are dropped."""
 
 MOST_WARNINGS: Final = 1_000
-"""Warnings of a server that are shown in one run."""
+"""Most warnings of a server that are shown in one run."""
 
 _MOST_CHANNELS: Final = 100_000
 _MOST_DEFINITION_BYTES: Final = 64 * 2**20
-"""Limit for all channels together."""
+"""Most bytes of the definitions of all channels."""
 _FRAMES: Final = 4
-"""Frames that wait to be decoded, each of up to `LARGEST_FRAME` bytes."""
+"""Most frames of up to `LARGEST_FRAME` bytes that wait to be decoded."""
 _LONGEST_TURN_S: Final = 0.02
 _OPEN_S: Final = 10.0
 _ALIVE_S: Final = 10.0
-"""How long a connection may take, and how often and for how long a server is asked whether it is there."""
+"""Timeout of a connection attempt; interval and timeout of pings, seconds."""
 
 _FIRST_PAUSE_S: Final = 0.25
 _LONGEST_PAUSE_S: Final = 8.0
-"""Pauses before another attempt to connect: each twice as long as the one before."""
+"""First and longest pause before a reconnect, seconds; each pause is twice as long as the previous one."""
 
 
 class Received(NamedTuple):
-    """A message as it came."""
+    """A message with its arrival time on the monotonic clock."""
 
     channel: Channel
     time_ns: int
@@ -68,7 +68,7 @@ class Offered(NamedTuple):
 
 
 class Disconnected(NamedTuple):
-    """The connection is lost; what the server sent up to then has come before."""
+    """Loss of the connection; all earlier messages of the server come before it."""
 
     reason: str
     arrived_s: float
@@ -78,10 +78,10 @@ Arrival: TypeAlias = Received | Connected | Offered | Disconnected | Warned
 
 
 class Inbox:
-    """Arrived and unread items, in order; see `MOST_WAITING`.
+    """Unread items in order of arrival; see `MOST_WAITING`.
 
     Attributes:
-        dropped: messages that were dropped for lack of room.
+        dropped: number of messages that were dropped for lack of room.
     """
 
     def __init__(self) -> None:
@@ -94,14 +94,14 @@ class Inbox:
         self.filled = asyncio.Event()
 
     def put(self, arrival: Arrival) -> None:
-        """Add what came; the oldest messages make room."""
+        """Add an item; if there is no room, drop the oldest messages."""
         if isinstance(arrival, Received):
             self._messages += 1
             self._bytes += len(arrival.payload)
             while self._messages > 1 and (self._messages > MOST_WAITING or self._bytes > MOST_WAITING_BYTES):
                 self._drop()
         if isinstance(arrival, Offered):
-            # channels are a view: what waits already says all that is offered now
+            # channels are a live view, so an unread item already has all channels that are offered now
             if self._offered is not None and self._offered.channels is arrival.channels:
                 return
             self._offered = arrival
@@ -115,7 +115,7 @@ class Inbox:
         self.filled.set()
 
     def take(self) -> list[Arrival]:
-        """Return all that waits."""
+        """Remove and return all unread items."""
         arrivals = [*self._others, *self._items]
         self._items.clear()
         self._others.clear()
@@ -125,6 +125,7 @@ class Inbox:
         return arrivals
 
     def _drop(self) -> None:
+        # only messages may be lost: other items before the oldest one are kept
         while not isinstance(oldest := self._items.popleft(), Received):
             self._others.append(oldest)
         self._messages -= 1
@@ -137,8 +138,8 @@ class Client:
     """A client that connects to a server, subscribes, and connects again when the connection is lost.
 
     Attributes:
-        wants: returns whether to subscribe to a topic.
-        record: takes each message as it comes, whether or not it can be evaluated in time.
+        wants: function that returns whether to subscribe to a topic.
+        record: receiver of each message at its arrival, even if it is dropped before evaluation.
     """
 
     address: str
@@ -183,7 +184,7 @@ class Client:
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
     async def _listen(self, connection: ClientConnection) -> str:
-        """Take what comes, until the connection ends; return why it did."""
+        """Put all items into the inbox until the connection ends; return the reason of its end."""
         offered: dict[int, Channel] = {}
         channels_now = offered.values()
         subscribed: dict[int, Channel] = {}
@@ -194,7 +195,7 @@ class Client:
             async for raw in connection:
                 arrived_s = time.monotonic()
                 if arrived_s - turn_s > _LONGEST_TURN_S:
-                    # a flood must not keep Ctrl-C and the evaluation waiting
+                    # a flood of messages must not block Ctrl-C and the evaluation
                     await asyncio.sleep(0)
                     turn_s = arrived_s
                 try:
@@ -247,6 +248,7 @@ def _definition_bytes(channel: Channel) -> int:
 
 
 def _closing_reason(closed: ConnectionClosed) -> str:
+    # 1009: message too big: https://www.rfc-editor.org/rfc/rfc6455#section-7.4.1
     if closed.sent is not None and closed.sent.code == 1009:
         return f"it sent a frame of more than {LARGEST_FRAME // 2**20} MB; subscribe to fewer topics"
     if closed.sent is not None and closed.rcvd is None:

@@ -1,4 +1,4 @@
-"""Frames of Foxglove's WebSocket protocol: bytes and texts in, values out."""
+"""Decode frames of Foxglove's WebSocket protocol, which are bytes or texts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.trace.trace import LATEST_NS
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""In the order of preference: that of the Foxglove SDK, and that of foxglove_bridge before it."""
+"""Subprotocols in order of preference: of the Foxglove SDK, and of earlier foxglove_bridge."""
 
 _SCHEMA_ENCODINGS: Final = {
     "json": "jsonschema",
@@ -23,7 +23,7 @@ _SCHEMA_ENCODINGS: Final = {
     "ros1": "ros1msg",
     "cdr": "ros2msg",
 }
-"""The encoding of schemas where a server does not name it."""
+"""Encodings of schemas by the encoding of messages, for servers that do not name them."""
 
 _BINARY_SCHEMAS: Final = frozenset({"protobuf", "flatbuffer"})
 # a binary frame with a message: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
@@ -33,13 +33,13 @@ _LONGEST_TEXT: Final = 200
 
 
 class Connected(NamedTuple):
-    """A connection stands; channels are advertised next."""
+    """The connection is open; channels are advertised next."""
 
     server: str
 
 
 class Warned(NamedTuple):
-    """The server says something about itself, or sends what breaks the protocol."""
+    """A warning of the server, or a warning about a frame that breaks the protocol."""
 
     text: str
 
@@ -51,7 +51,7 @@ class Advertised(NamedTuple):
 
 
 class Unadvertised(NamedTuple):
-    """Channels that a server offers no longer."""
+    """Numbers of channels that a server no longer offers."""
 
     numbers: tuple[int, ...]
 
@@ -68,10 +68,10 @@ Frame: TypeAlias = Connected | Advertised | Unadvertised | Warned | MessageData
 
 
 def decode_frame(raw: str | bytes) -> Frame | None:
-    """Decode a frame of a server; None for those that a monitor has no use for.
+    """Decode a frame of a server; None for a frame that a monitor does not need.
 
     Raises:
-        LogError: it does not keep to the protocol; what is wrong with it.
+        LogError: the frame breaks the protocol.
     """
     if isinstance(raw, str):
         return _decode_text(raw)
@@ -88,7 +88,7 @@ def decode_frame(raw: str | bytes) -> Frame | None:
 
 
 def subscribe(numbers: Iterable[int]) -> str:
-    """Return the request to subscribe to channels, each under its own number."""
+    """Return the request to subscribe to channels; a subscription gets the number of its channel."""
     subscriptions = [{"id": number, "channelId": number} for number in numbers]
     return json.dumps({"op": "subscribe", "subscriptions": subscriptions})
 
@@ -107,7 +107,7 @@ def _decode_text(raw: str) -> Frame | None:
             case {"op": "unadvertise", "channelIds": numbers}:
                 return Unadvertised(tuple(map(_number, numbers)))
             case {"op": "status", "message": text}:
-                # information, such as about a subscription, is no warning
+                # level 0 is information, such as about a subscription
                 return Warned(str(text)[:_LONGEST_TEXT]) if int(frame.get("level", 0)) > 0 else None
             case {"op": _}:
                 return None

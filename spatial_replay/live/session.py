@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
 
 class ObjectsAssembler:
-    """Decodes samples as they come; what it offers is that of `LiveAssembler`."""
+    """Decodes samples at their arrival, with the interface of `LiveAssembler`."""
 
     late = overdue = 0
     jump = None
@@ -75,7 +75,7 @@ class ObjectsAssembler:
         self.is_finished = False
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
-        """Add messages as they came; return their samples. Late and repeated samples are left out."""
+        """Decode messages in order of arrival to samples. Late and repeated samples are left out."""
         new_messages: list[Message] = []
         for message in messages:
             if message.log_time_ns < self._newest_ns - DISORDER_NS:
@@ -96,18 +96,18 @@ class ObjectsAssembler:
         return trace
 
     def arrived_s(self, time_ns: int) -> float:
-        """Samples do not wait here."""
+        """Return infinity, because samples do not wait."""
         return math.inf
 
     def due_s(self) -> None:
-        """Nothing waits."""
+        """Return None, because no sample waits."""
 
     def flush(self) -> Trace:
-        """Return the samples that wait: none."""
+        """Return no samples, because no sample waits."""
         return Trace.empty()
 
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
-        """Return a sample right after the newest, in which every object is unknown."""
+        """Return a sample 1 ns after the newest one, in which every object is unknown."""
         if self._newest_ns < 0 or not self._classes:
             return Trace.empty()
         self._newest_ns += 1
@@ -115,15 +115,15 @@ class ObjectsAssembler:
         return Trace.from_samples([Sample(self._newest_ns, unknown=unknown)])
 
     def finish(self) -> Trace:
-        """Return the remaining samples: none."""
+        """Return no samples, because no sample remains."""
         return Trace.empty()
 
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return what was lost since the last call, the first of each kind; at last, how many more."""
+        """Return the first fault of each new kind. With `last`, add counts of repeated faults."""
         return self._faults.take(last=last)
 
     def take_remarks(self) -> tuple[str, ...]:
-        """Return what is remarkable where nothing was lost: nothing."""
+        """Return no remarks."""
         return ()
 
     def find_doubts(self) -> tuple[Doubt, ...]:
@@ -137,19 +137,19 @@ class ObjectsAssembler:
 
 @dataclass(frozen=True, slots=True)
 class SessionStatus:
-    """How a session goes.
+    """State of a session.
 
     Attributes:
-        server: the name that the server gives itself, or None before it is connected.
-        is_connected: whether the connection stands.
-        waits_for: topics that the server does not offer yet.
-        samples, messages: evaluated, and received.
-        dropped: samples that were dropped because evaluation fell behind.
-        messages_dropped: messages that were dropped before they made samples.
-        late: messages that came after the samples of their time.
-        overdue: observations whose transforms did not come within `max_delay_s`.
-        delay_s: of the newest sample, from the arrival of its message to its verdict; NaN before.
-        time_ns: of the newest sample; None before the first.
+        server: name that the server gives itself; None before the first connection.
+        is_connected: whether the connection is open.
+        waits_for: needed topics that the server does not offer yet.
+        samples, messages: numbers of evaluated samples and of received messages.
+        dropped: number of samples that were dropped because evaluation fell behind.
+        messages_dropped: number of messages that were dropped before they became samples.
+        late: number of messages that arrived after the samples of their time.
+        overdue: number of observations whose transforms did not arrive within `max_delay_s`.
+        delay_s: time from the arrival of the newest sample's message to its verdict, seconds; NaN before.
+        time_ns: time of the newest sample; None before the first sample.
     """
 
     server: str | None
@@ -172,11 +172,10 @@ class LiveUpdate:
     Attributes:
         sample: the objects and signals.
         changes: verdicts and signs that changed with this sample, each with its reason.
-        notes: what happened besides since the last update: a connection that was lost, a topic that fell
-            silent.
-        delay_s: from the arrival of the message that completed it to its verdict.
-        dropped: how many samples were dropped so far.
-        updates: of each specification file, what its monitor gives.
+        notes: other events since the last update, such as a lost connection or a silent topic.
+        delay_s: time from the arrival of the message that completed the sample to its verdict, seconds.
+        dropped: number of samples that were dropped so far.
+        updates: update of the monitor of each specification file.
     """
 
     sample: Sample
@@ -193,12 +192,12 @@ class LiveUpdate:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the specs'."""
+        """The worst verdict of the specs."""
         return worst_verdict(update.verdict for update in self.updates)
 
     @property
     def specs(self) -> tuple[SpecUpdate, ...]:
-        """Every result spec."""
+        """The updates of all result specs."""
         return tuple(spec for update in self.updates for spec in update.specs)
 
     @cached_property
@@ -207,7 +206,7 @@ class LiveUpdate:
         return tuple(violation for update in self.updates for violation in update.violations)
 
     def node(self, name: str) -> NodeUpdate:
-        """Return the root node of a named spec, wherever it occurs.
+        """Return the root node of a named spec in any file.
 
         Raises:
             UsageError: no node has the name.
@@ -220,38 +219,38 @@ class LiveUpdate:
 
 
 MAX_DELAY_S: Final = 0.2
-"""How long a sample waits for transforms, and for topics that lag behind, by default."""
+"""Default time that a sample waits for transforms and for lagging topics, seconds."""
 
 LATE_S: Final = 1.0
-"""A sample that has waited longer than this for its evaluation is dropped if there is a newer one."""
+"""Wait for evaluation after which a sample is dropped if there is a newer one, seconds."""
 
 _OFFER_S: Final = 5.0
 _SETTLE_S: Final = 0.3
-"""How long the topics of the mapping may take to be offered; and further ones, such as transforms."""
+"""Longest wait for the topics of the mapping, then for further topics such as transforms, seconds."""
 
 _STAMPING_SERVERS: Final = frozenset({"foxglove_bridge"})
-"""Servers that give each message the time at which they send it."""
+"""Servers that stamp each message with the time of sending."""
 
 _PAUSE_S: Final = 0.005
-"""How long is waited before a log that is full is asked again."""
+"""Pause before another attempt to reserve room in a full log, seconds."""
 
 _SAMPLES_BEFORE_DOUBTS: Final = 100
-"""After so many samples, and after twice as many each time, a run is compared with its mapping."""
+"""Number of samples before a run is first compared with its mapping; it doubles each time."""
 
 _USUAL: Final = 9
-"""Intervals between messages of a topic that show which one is usual."""
+"""Number of intervals between messages of a topic whose median is the usual interval."""
 
 _GRACE_TURNS: Final = 5
-"""Turns of the loop in which messages that have arrived reach the inbox."""
+"""Number of turns of the event loop in which arrived messages reach the inbox."""
 
 _TURN_S: Final = 0.02
-"""How long samples are evaluated before what has come is taken in."""
+"""Time of evaluation between two polls of the inbox, seconds."""
 
 
 class LiveSession:
-    """One run of monitors over what a server sends: a process for one event loop.
+    """One run of monitors over the messages of a server, in one event loop.
 
-    Iterate over `updates` once, and `stop` it from anywhere in the loop.
+    Iterate over `updates` once; any task of the loop can `stop` it.
     """
 
     def __init__(
@@ -266,10 +265,10 @@ class LiveSession:
         topic_timeout_s: float | None = None,
         start_within_s: float | None = None,
     ) -> None:
-        """Compile everything, before the connection is made; see `monitor` for the arguments.
+        """Compile the specifications before connecting; see `monitor` for the other arguments.
 
         Args:
-            recorders: take every sample, and the messages of mapped topics and of `topics`, as they come.
+            recorders: receivers of all samples, and of messages on `topics`; by default, on mapped topics.
         """
         for name, value in (
             ("max_delay_s", max_delay_s),
@@ -301,7 +300,7 @@ class LiveSession:
         self._planned: dict[str, Channel] = {}
         self._offered_s = self._settled_s = math.inf
         self._last_s: dict[str, float] = {}
-        # when they sent their last messages
+        # silent topics, with the times of their last messages
         self._silent: dict[str, float] = {}
         self._heard: set[str] = set()
         self._rare: set[str] = set()
@@ -313,7 +312,7 @@ class LiveSession:
         self._server: str | None = None
         self._is_connected = False
         self.connected = asyncio.Event()
-        """Set once the first connection stands."""
+        """Set when the first connection is open."""
         self._samples = self._messages = self._dropped = 0
         self._delay_s = math.nan
         self._time_ns: int | None = None
@@ -330,11 +329,11 @@ class LiveSession:
         self.doubts: tuple[Doubt, ...] = ()
         """Assumptions that the run contradicts; known after `close`, or at the end of `updates`."""
         self.failure: LogError | None = None
-        """Why the run ended before it was stopped: time that jumped back."""
+        """Error that ended the run before it was stopped: time jumped back."""
 
     @property
     def status(self) -> SessionStatus:
-        """How it goes."""
+        """The current state."""
         return SessionStatus(
             self._server,
             self._is_connected,
@@ -350,7 +349,7 @@ class LiveSession:
         )
 
     def endings(self) -> tuple[Ending, ...]:
-        """Return the result of each spec if the run ends with the newest sample."""
+        """Return the result of each spec for a run that ends with the newest sample."""
         endings = (ending for monitor in self._monitors for ending in monitor.endings())
         return tuple(
             ending._replace(doubts=doubts_about(needs_of_spec(ending.spec), self.doubts, self._members))
@@ -358,7 +357,7 @@ class LiveSession:
         )
 
     def take_notes(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return what happened since the last update, if anything did; at last, how often besides."""
+        """Return the notes since the last update. With `last`, add counts of repeated faults."""
         self._note_overdue()
         if last and self._assembler is not None:
             self._notes += self._assembler.take_faults(last=True)
@@ -366,7 +365,7 @@ class LiveSession:
         return notes
 
     def _note_overdue(self) -> None:
-        """Note once that a transform did not come in time; before a run begins, that is usual."""
+        """Note once in a run that a transform is overdue; before the run begins, that is usual."""
         assembler = self._assembler
         if not isinstance(assembler, LiveAssembler) or assembler.overdue == self._overdue:
             return
@@ -381,13 +380,13 @@ class LiveSession:
             )
 
     def close(self) -> None:
-        """Compare the run with the assumptions of its mapping, where `updates` was left before its end."""
+        """Compare the run with the assumptions of its mapping, if `updates` was left before its end."""
         if self._assembler is not None and not self._is_closed:
             self._assembler.finish()
             self._conclude(self._assembler)
 
     def _conclude(self, assembler: LiveAssembler | ObjectsAssembler) -> None:
-        """Take the doubts and remarks of an assembler that has finished."""
+        """Collect the doubts and remarks of a finished assembler."""
         self._is_closed = True
         first_ns = self._ends.begin_ns or 0
         self.doubts = distinct_doubts(assembler.take_doubts(), first_ns)
@@ -397,7 +396,7 @@ class LiveSession:
             log.doubts = self.doubts
 
     def stop(self) -> None:
-        """End `updates` once what has come is evaluated."""
+        """End `updates` after the arrived messages are evaluated."""
         self._stopped = True
         if self._inbox is not None:
             self._inbox.filled.set()
@@ -408,13 +407,14 @@ class LiveSession:
         Raises:
             RemoteError: the first connection fails.
             UsageError: the mapping does not fit what the server sends.
-            LogError: a message cannot be brought into the order of time.
+            LogError: a topic changes its type, or a message cannot be sorted by time.
         """
         inbox = self._inbox = Inbox()
         client = Client(self._address, self._wants, inbox, self._record)
         listening = asyncio.create_task(client.run())
         listening.add_done_callback(lambda _: inbox.filled.set())
-        # all that is loaded by now stays: to look through it for garbage would keep samples waiting
+        # objects that are loaded by now stay, and scans of them for garbage would delay samples:
+        # https://docs.python.org/3/library/gc.html#gc.freeze
         gc.freeze()
         try:
             while not (self._stopped or self.failure):
@@ -424,7 +424,7 @@ class LiveSession:
                 async for update in self._turn(inbox):
                     yield update
             if self._assembler is None and self._is_connected and not self.failure:
-                # it ends before all topics are there: then this says which are not
+                # the run ends before all topics are offered: `_begin` reports the missing ones
                 async for update in self._turn(inbox):
                     yield update
                 if self._assembler is None:
@@ -452,7 +452,7 @@ class LiveSession:
         return topic in self._planned or self._is_named(topic, self._mapping)
 
     def _is_named(self, topic: str, mapping: LogMapping) -> bool:
-        # which topics have transforms is known once they are offered: their names say it to a client
+        # a client subscribes by names, so topics of transforms are recognised by their usual names
         is_frames = mapping.fixed_frame is not None and topic.rsplit("/", 1)[-1] in ("tf", "tf_static")
         return is_frames or topic in (mapping.sampling.topic, *(entry.topic for entry in mapping.topics))
 
@@ -460,7 +460,7 @@ class LiveSession:
         return is_kept(topic, self._topics, ()) if self._topics else self._is_evaluated(topic)
 
     def _record(self, received: Received) -> None:
-        """Hand a message to the recorders, before anything may drop it."""
+        """Copy a message to the recorders before it can be dropped."""
         channel = received.channel
         if not self._recorders or channel.topic in self._refused or not self._is_copied(channel.topic):
             return
@@ -482,27 +482,27 @@ class LiveSession:
                 times.append(min(waiting, default=math.inf) + self._topic_timeout_s)
         due_s = min(times)
         if inbox.filled.is_set() or due_s <= now_s:
-            # the client has to be let in, however much there is to evaluate
+            # the client gets a turn, however many samples wait for evaluation
             await asyncio.sleep(0)
             return
         with suppress(TimeoutError):
             async with asyncio.timeout(None if due_s == math.inf else due_s - now_s):
                 await inbox.filled.wait()
         for _ in range(_GRACE_TURNS):
-            # what arrived in time is not late, even if this process was held up
+            # messages that arrived in time are not late, even if this process was delayed
             if inbox.filled.is_set():
                 break
             await asyncio.sleep(0)
 
     async def _turn(self, inbox: Inbox) -> AsyncIterator[LiveUpdate]:
-        """Take in what has come, and evaluate the samples that are complete."""
+        """Process the items of the inbox, and evaluate the samples that are complete."""
         messages: list[Message] = []
         arrived_s = math.inf
         for arrival in inbox.take():
             if isinstance(arrival, Received):
                 topic = arrival.channel.topic
                 if self._assembler is None:
-                    # what comes while further topics are waited for is evaluated afterwards
+                    # messages that arrive before all topics are offered are evaluated after that
                     self._early.put(arrival)
                     continue
                 if topic not in self._planned:
@@ -512,7 +512,7 @@ class LiveSession:
                 self._note_return(topic, arrival.arrived_s)
                 messages.append(Message(topic, arrival.time_ns, arrival.time_ns, 0, arrival.payload))
                 continue
-            # what came before is evaluated first: afterwards it may be unknown
+            # earlier messages are evaluated first, because this item may make their objects unknown
             async for update in self._evaluate(self._add(messages), arrived_s):
                 yield update
             messages, arrived_s = [], math.inf
@@ -533,7 +533,7 @@ class LiveSession:
                     self._is_connected = False
                     self._offered_s = self._settled_s = math.inf
                     if self._assembler is None:
-                        # the run begins after the pause, so that no value holds on in it
+                        # the run begins after the pause, so that no value is held during the pause
                         self._early = Inbox()
                     else:
                         trace = self._assembler.flush()
@@ -562,7 +562,7 @@ class LiveSession:
                 yield update
 
     def _note_return(self, topic: str, arrived_s: float) -> None:
-        """Note when a topic has sent a message, and that it did so after silence."""
+        """Store the time of a message on a topic; note a return after silence."""
         intervals = self._intervals_s.setdefault(topic, deque(maxlen=_USUAL))
         since_s = arrived_s - self._last_s.get(topic, arrived_s)
         if topic in self._heard:
@@ -596,7 +596,7 @@ class LiveSession:
         return trace
 
     def _lose(self, topics: Sequence[str], what: str) -> Trace | None:
-        """Make unknown what some topics have reported; the newest note becomes an event that says so."""
+        """Make the objects of some topics unknown; report an event with the newest note."""
         if self._assembler is None:
             return None
         trace = self._assembler.lose(topics, time.monotonic())
@@ -607,7 +607,7 @@ class LiveSession:
         return trace
 
     def _silent_topics(self, now_s: float) -> list[str]:
-        """Return the topics that have been silent for too long since the last call."""
+        """Return the topics that exceeded the timeout since the last call."""
         if self._topic_timeout_s is None or self._assembler is None or not self._is_connected:
             return []
         watched = [topic for topic in self._assembler.topics if topic not in self._silent]
@@ -616,7 +616,7 @@ class LiveSession:
     # -------------------------------------------------------------------------------- planning
 
     def _plan(self) -> None:
-        """Look for the topics of the mapping among those that the server offers."""
+        """Find the topics of the mapping among the offered topics."""
         offered = {channel.topic: channel for channel in self._channels}
         if self._assembler is not None:
             changed = [
@@ -643,7 +643,7 @@ class LiveSession:
         self._settled_s = math.inf if self._missing else time.monotonic() + _SETTLE_S
 
     def _begin(self, inbox: Inbox, now_s: float) -> None:
-        """Begin to assemble samples from the topics that are offered now, with what came before."""
+        """Begin to assemble samples from the offered topics, from the earliest message on."""
         self._offered_s = self._settled_s = math.inf
         offered = {channel.topic: channel for channel in self._channels}
         if self._mapping is None:
@@ -689,7 +689,7 @@ class LiveSession:
             )
         self._early, early = Inbox(), self._early
         for arrival in early.take():
-            # it has waited for the beginning, not for evaluation that falls behind
+            # the wait for the beginning does not count as late evaluation
             inbox.put(arrival._replace(arrived_s=now_s) if isinstance(arrival, Received) else arrival)
 
     def _sampled_by_default(self) -> str | None:
@@ -706,10 +706,10 @@ class LiveSession:
     async def _evaluate(
         self, trace: Trace | None, arrived_s: float, remaining: Callable[[], list[Trace]] | None = None
     ) -> AsyncIterator[LiveUpdate]:
-        """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait.
+        """Evaluate samples, and yield their updates; late samples are dropped if newer ones wait.
 
         Args:
-            remaining: returns the samples that would wait for later ones, as far as they count.
+            remaining: function that returns the pending samples of `RunEnds`, to evaluate them too.
         """
         if trace is not None:
             trace = self._counting(trace, remaining)
@@ -718,7 +718,7 @@ class LiveSession:
         turn_s = time.monotonic()
         last_ns = int(trace.times_ns[-1])
         for sample in trace.samples():
-            # what is evaluated is in the log: while that is full, messages are dropped by their own rule
+            # the log must hold each evaluated sample; while it is full, the inbox drops messages
             while not all(log.reserve() for log in self._logs):
                 await asyncio.sleep(_PAUSE_S)
             now_s = time.monotonic()
@@ -733,12 +733,14 @@ class LiveSession:
             yield self._update(sample, arrived_s)
 
     def _counting(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
-        """Return the samples that count: none before each needed topic can be judged, nor where the run may
-        have ended."""
+        """Return the samples that count.
+
+        They begin when all needed topics can be judged, and stop where the run may have ended.
+        """
         self._members.add(trace)
         ends = self._ends
         had_begun, remarks = ends.begin_ns is not None, ends.remarks
-        # a sample that can be judged does not wait for the next one, which may not be
+        # samples are added one by one, so that none waits for the next one, which may not count
         parts = [trace.slice(place, place + 1) for place in range(len(trace))]
         counting = [part for added in (parts if had_begun else [trace]) for part in ends.add(added)]
         if remaining is not None:
@@ -755,7 +757,7 @@ class LiveSession:
         return counting[0] if len(counting) == 1 else Trace.concatenate(counting)
 
     def _note_doubts(self) -> None:
-        """Note new contradictions of the run so far; the next look is after twice as many samples."""
+        """Note new contradictions of the run to its mapping; compare again after twice as many samples."""
         self._next_doubts *= 2
         if self._assembler is None:
             return
@@ -789,11 +791,11 @@ class LiveSession:
 
 
 _WAITING = 65_536
-"""Samples, and messages, that may wait for a recorder: a robot waits for no disk."""
+"""Most samples, and most messages, that wait for a recorder, because a robot does not wait for a disk."""
 
 
 class _RunRecorder(Recorder):
-    """A recorder of a run that goes on whatever the disk does: it leaves out nothing that it can hold."""
+    """A recorder of a live run; it drops samples only beyond `_WAITING`, however slow the disk is."""
 
     most_lost_s: ClassVar[float] = math.inf
 
@@ -808,12 +810,12 @@ def open_recorders(
     *,
     overwrite: bool = False,
 ) -> Iterator[list[Recorder]]:
-    """Open the log of a whole run, and the recorder of clips, as far as they are wanted.
+    """Open a recorder of the whole run for `output`, and a recorder of clips for `clips`.
 
     Raises:
-        UsageError: a trigger without a folder, or the other way around, or one that is not understood; an
-            output that exists, unless it may be overwritten.
-        OutputError: something cannot be written.
+        UsageError: only one of trigger and clips is given, the trigger is invalid, or an output exists
+            without `overwrite`.
+        OutputError: a log cannot be written.
     """
     if (trigger is None) != (clips is None):
         raise UsageError("clips take a trigger and a folder; give both")
@@ -838,7 +840,7 @@ def open_recorders(
 
 
 def _about(mapping: LogMapping | None) -> Mapping[str, str]:
-    """Return what a log says about a run: nothing that depends on where it took place."""
+    """Return the metadata of a run in its log; nothing in it depends on the machine."""
     if mapping is None:
         return {"source": "live"}
     named = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
@@ -861,24 +863,25 @@ async def monitor(
 ) -> AsyncIterator[LiveUpdate]:
     """Monitor a running robot; yield an update for each sample.
 
-    The connection is made again whenever it is lost; everything is unknown until it is back. Leave the loop
-    to end; what happened last is then evaluated and the log closed.
+    After a lost connection, the client connects again; everything is unknown until then. Leave the loop to
+    end the run; its log is then closed.
 
     Args:
-        address: of foxglove_bridge or another server of Foxglove's WebSocket protocol: ws://robot:8765.
-        mapping: as for a log of the same topics; without one, the server has the topic /spatial/objects.
-        output: a log to write, as `Recorder` does, with the messages that came beside the samples.
-        trigger, clips: when to write which part of the run to a log of its own, and the folder of these.
-        topics: patterns of the topics whose messages are written; those that are mapped by default.
-        max_delay_s: how long a sample waits for transforms, and for topics whose stamps lag behind.
-        topic_timeout_s: after so much silence of a topic, what it reported is unknown.
-        start_within_s: how long the run waits for each topic that the specification needs; by default the
-            `max_age` of the topic.
-        overwrite: replace an output that exists.
+        address: address of foxglove_bridge or another server of Foxglove's WebSocket protocol, such as
+            ws://robot:8765.
+        mapping: mapping as for a log of the same topics; without one, the server needs /spatial/objects.
+        output: path of a log of samples and messages, which is written as `Recorder` does.
+        trigger, clips: trigger of clips, which are logs of a part of the run, and the folder of clips.
+        topics: patterns of topics whose messages are written; by default, the mapped topics.
+        max_delay_s: longest wait of a sample for transforms, and for topics whose stamps lag, seconds.
+        topic_timeout_s: silence of a topic after which its objects are unknown, seconds.
+        start_within_s: longest wait of the run for each topic that the specification needs, seconds; by
+            default, the `max_age` of the topic.
+        overwrite: whether to replace an existing output.
 
     Raises:
-        UsageError: a template, options that do not work, a mapping that does not fit what is sent, an output
-            that exists.
+        UsageError: a template, an invalid option, a mapping that does not fit the messages, or an existing
+            output.
         RemoteError: the first connection fails.
         LogError: time jumps back by more than a second.
         OutputError: the log cannot be written.
@@ -902,20 +905,20 @@ async def monitor(
             async for update in session.updates():
                 yield update
         finally:
-            # the log of a run that is left has its doubts, too
+            # the log also gets the doubts of a run whose loop was left
             session.close()
         if session.failure is not None:
             raise session.failure
 
 
 _GATHER_S: Final = 1 / 30
-"""How long samples are gathered before viewers are sent them."""
+"""Time in which samples are gathered before they are sent to viewers, seconds."""
 
 _MOST_WAITING: Final = 4_096
 
 
 class _ViewerLog(RecorderLog):
-    """The log of a run, of which nothing is kept: viewers are sent each message, and miss others unseen."""
+    """The log of a run for viewers: messages are sent and not stored, and viewers may miss some."""
 
     gather_s = _GATHER_S
 
@@ -926,14 +929,14 @@ class _ViewerLog(RecorderLog):
         warm_up(files, self._recording.automata)
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
-        """Send the next samples and messages, and what follows from them."""
+        """Send the next samples and messages, and the results of the samples."""
         self._recording.add(trace, messages)
         self._publish()
         if len(trace):
             self._server.send_time(int(trace.times_ns[-1]))
 
     def report(self, event: RunEvent) -> None:
-        """Send what happens to the run beside its samples."""
+        """Send an event of the run, such as a lost connection."""
         self._recording.report(event)
         self._publish()
 
@@ -949,10 +952,10 @@ class _ViewerLog(RecorderLog):
 
 
 class Viewing(SampleWriter):
-    """Shows a run to viewers: a writer that a session is given beside recorders."""
+    """A writer that shows a run to viewers; a session gets it in its list of recorders."""
 
     def __init__(self, files: Sequence[Specification], about: Mapping[str, str], server: RunServer) -> None:
-        """Compile everything."""
+        """Compile the specifications."""
         refuse_templates(files)
         self.address = server.address
         super().__init__(_ViewerLog(files, about, server), "the view", _MOST_WAITING, block=False)
@@ -968,15 +971,15 @@ def open_viewing(
     origins: Sequence[str] = (),
     fire: Callable[[str], None] | None = None,
 ) -> Iterator[Viewing]:
-    """Serve a run to viewers while it goes on.
+    """Serve a live run to viewers, as a context.
 
     Args:
-        port: 0 for any that is free.
-        origins: of web pages that may connect, besides those of Foxglove and of this machine.
-        fire: what the service `trigger` calls, with the reason that it is given.
+        port: port of the server; 0 for any free port.
+        origins: origins of web pages that may connect, in addition to Foxglove and this machine.
+        fire: function that the service `trigger` calls with the given reason.
 
     Raises:
-        UsageError: nothing can listen there, a text that is no origin, or the library for it is not
+        UsageError: the server cannot listen on host and port, an origin is invalid, or foxglove-sdk is not
             installed.
     """
     with importing("serving takes foxglove-sdk", extra="live"):
@@ -994,10 +997,10 @@ def open_viewing(
 
 
 def layout_of_run(files: Sequence[Specification], mapping: LogMapping | None) -> str:
-    """Return the layout for viewers of a run, as JSON: its curves and states are drawn as they come.
+    """Return the layout for viewers of a live run, as JSON, with curves and states that grow.
 
     Raises:
-        UsageError: a template, since its objects are not known yet.
+        UsageError: a template, because its objects are not known before the run.
     """
     recording = Recording(MemorySink(), files, _axes(mapping))
     return recording.layout_ahead().data.decode()
