@@ -1,1 +1,1 @@
-"""Falsification: simulated runs that violate a specification, found by an optimiser rather than by chance."""
+"""Falsification: an optimiser searches for simulated runs that violate a specification."""

@@ -1,7 +1,7 @@
-"""A search for failures: runs are simulated in rounds, failing ones are made smaller and cut.
+"""Search for failing simulated runs, which are then reduced and cut to clips.
 
-A search continues from the file of its earlier runs. CMA-ES chooses the next cases by the robustness of
-earlier ones; this is the only module that knows the package `cma`.
+Runs are simulated in rounds. CMA-ES chooses the next cases by the robustness of earlier runs. A search
+continues from the file of its earlier runs. No other module imports the package `cma`.
 """
 
 from __future__ import annotations
@@ -51,21 +51,21 @@ from spatial_replay.trace.trace import Sample
 from spatial_replay.version import __version__
 
 _MOST_FAILURES: Final = 20
-"""The most failures in the text; JSON has all."""
+"""Most failures in the text; JSON lists all."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchedRun:
-    """A run that was simulated.
+    """Simulated run.
 
     Attributes:
-        number: in the order of the search, from 1.
-        case: the value of each parameter; None where it was left out.
-        verdict: the worst of all specifications'.
-        robustness: the least upper end of their intervals: below 0 if and only if one is violated.
-        spec: whose that is.
-        unit: of the robustness; "" if none is declared.
-        seconds: how long the run took, in its own time.
+        number: number of the run in the search, from 1.
+        case: value of each parameter by name; None if it is left out.
+        verdict: worst verdict of all specifications.
+        robustness: least upper end of all robustness intervals, below 0 if and only if a spec is violated.
+        spec: title of the spec with this robustness.
+        unit: unit of the robustness; "" if none is declared.
+        seconds: duration of the run in simulated time.
     """
 
     number: int
@@ -83,16 +83,16 @@ class SearchedRun:
 
     @property
     def document(self) -> dict[str, Any]:
-        """It as JSON."""
+        """The run as values for JSON."""
         values = json_fields(self)
         return {"run": values.pop("number"), **values}
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> SearchedRun:
-        """Return a run from JSON.
+        """Return a run from its JSON document.
 
         Raises:
-            KeyError, TypeError, ValueError: it is not of this form.
+            KeyError, TypeError, ValueError: the document has another form.
         """
         case = {
             str(name): None if value is None else float(value) for name, value in document["case"].items()
@@ -110,14 +110,14 @@ class SearchedRun:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A run that violates.
+    """Run that violates a specification.
 
     Attributes:
-        run: as it was found.
-        smaller: the same with less of what was varied; `run` itself if nothing could be left out.
-        log, smaller_log: their logs; one and the same if there is nothing smaller.
-        clip: the shortest part of `smaller_log` that shows the violation.
-        command: what repeats `smaller` as a log; None for a simulation of one's own.
+        run: run of the search.
+        smaller: run with fewer or smaller variations; `run` itself if nothing can be reduced.
+        log, smaller_log: logs of both runs; the same path if nothing can be reduced.
+        clip: shortest part of `smaller_log` that shows the violation.
+        command: command that records `smaller` as a log; None for a user's simulation.
     """
 
     run: SearchedRun
@@ -129,18 +129,18 @@ class Failure:
 
     @property
     def is_smaller(self) -> bool:
-        """Whether something could be left out."""
+        """Whether a variation could be reduced."""
         return self.smaller.case != self.run.case
 
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """The tried values of one parameter.
+    """Tried values of one parameter.
 
     Attributes:
-        low, high: its range; of times in a run, `high` is the end of the first run.
-        runs: how many had a value in each tenth of the range.
-        least_robustness: that of those; None where there were none.
+        low, high: range; for a time in a run, `high` is the end of the first run.
+        runs: number of runs with a value in each tenth of the range.
+        least_robustness: least robustness in each tenth of the range; None without a run.
     """
 
     parameter: str
@@ -156,13 +156,13 @@ class Falsification(Printed):
     """Result of a search for failures.
 
     Attributes:
-        name: of the scenario or the simulation.
-        parameters: what was varied.
-        runs: all runs, in the order of the search; the first one with nothing varied.
-        failures: those that violate, the worst first.
-        impossible: how many cases were left out, since objects would have lain in each other.
-        simulations: how many further runs made failures smaller.
-        is_exhausted: whether the search ended early, as there was nothing else to try.
+        name: name of the scenario or the simulation.
+        parameters: varied parameters.
+        runs: all runs in the order of the search; the first one has no variation.
+        failures: violating runs, the worst first.
+        impossible: number of cases that were skipped because objects would overlap.
+        simulations: number of further runs for reducing failures.
+        is_exhausted: whether the search ended early because there was no new case.
     """
 
     name: str
@@ -175,12 +175,12 @@ class Falsification(Printed):
 
     @property
     def first(self) -> SearchedRun:
-        """The run with nothing varied."""
+        """The run without variations."""
         return self.runs[0]
 
     @property
     def lowest(self) -> SearchedRun:
-        """The run of the least robustness."""
+        """The run with the least robustness."""
         return min(self.runs, key=lambda run: run.robustness)
 
     @property
@@ -194,13 +194,13 @@ class Falsification(Printed):
         return tuple(map(self._coverage_of, self.parameters))
 
     def text_of(self, case: Case) -> str:
-        """Return what is varied in a case: "noise 0.004 m, slip@3.2s, start.red 0.47,-0.09,0.4"."""
+        """Return the variations of a case: "noise 0.004 m, slip@3.2s, start.red 0.47,-0.09,0.4"."""
         texts_by_group: dict[str, str] = {}
         for parameter in self.parameters:
             value = case[parameter.name]
             if value is None or (value == parameter.rest and not parameter.is_drawn):
                 continue
-            # those of one group are written as one
+            # the values of a group share one text
             text_before = texts_by_group.get(parameter.group)
             if parameter.group == parameter.name:
                 texts_by_group[parameter.group] = parameter.text_of(value)
@@ -213,7 +213,7 @@ class Falsification(Printed):
         return ", ".join(texts_by_group.values()) or "nothing varied"
 
     def lines(self) -> Iterator[str]:
-        """Yield the failures, the worst first, or the lowest run; and the coverage."""
+        """Yield lines of text: the failures, the worst first, or else the lowest run, and the coverage."""
         yield f"run 1, with nothing varied: {_verdict_text(self.first)}"
         for parameter in self.parameters:
             if parameter.unit == "s" and self.first.seconds < parameter.high < math.inf:
@@ -268,7 +268,7 @@ class Falsification(Printed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """All of it as JSON, but for the runs that do not violate; files are relative to the folder."""
+        """The result as values for JSON; runs without a violation are left out, paths are relative."""
         return {
             "simulation": self.name,
             "runs": len(self.runs),
@@ -295,7 +295,7 @@ class Falsification(Printed):
         }
 
     def _coverage_of(self, parameter: Parameter) -> Coverage:
-        # the first run varies nothing, and what is left out has no place in a range
+        # the first run has no variation, and a parameter that is left out has no value
         values = [
             (value, run.robustness)
             for run in self.runs[1:]
@@ -337,38 +337,38 @@ def _table(covered: tuple[Coverage, ...]) -> Iterator[str]:
 # --------------------------------------------------------------------------------------------------- descents
 
 LARGEST_COST: Final = 1e9
-"""Stands for infinite costs, of which an optimiser can make nothing; impossible cases cost more."""
+"""Substitute for an infinite cost, which an optimiser cannot use; impossible cases cost more."""
 _LOOK: Final = 10
-"""Points of a look around, spread over the whole space."""
+"""Points before each descent, spread over the whole space."""
 _STEP: Final = 0.2
-"""The standard deviation with which a descent begins, as a share of the ranges."""
+"""Initial standard deviation of a descent, as a fraction of the ranges."""
 _NARROWEST: Final = 2e-3
-"""The standard deviation at which a descent has arrived."""
+"""Standard deviation at which a descent ends, as a fraction of the ranges."""
 _FLAT: Final = 3
-"""Generations of equal costs after which a descent is given up."""
+"""Generations with equal costs after which a descent ends."""
 _STALLED: Final = 5
 _FALLS: Final = 1e-3
-"""Generations after which a descent is given up whose least cost does not fall by such a part of itself."""
+"""A descent ends after `_STALLED` generations without a decrease of the least cost by this fraction."""
 _PROPOSED: Final = 20
-"""Points that CMA-ES draws for each one that is asked for."""
+"""Proposals of CMA-ES for each simulated point."""
 _PARTS: Final = 3
-"""Rounds of a generation: the model knows the costs of one when it picks the next."""
+"""Rounds of a generation; the model uses the costs of earlier rounds to choose the points of the next."""
 _KNOWN: Final = 80
-"""Points that the model is fitted to: half of them the best, half the newest."""
+"""Points that the model is fitted to: the best and the newest, one half each."""
 _LENGTHS: Final = (0.15, 0.3, 0.6)
-"""Over how much of the ranges costs vary; the likeliest length is taken."""
+"""Candidate length scales of the costs, as fractions of the ranges; the likeliest is used."""
 _NOISE: Final = 1e-2
-"""The share of the costs' variance that points do not explain: contacts, and what else is drawn."""
+"""Fraction of the variance of costs that points do not explain, because of contacts and seeds."""
 
 
 class Descents:
-    """Points of the unit cube, asked for in rounds, each of which gets its costs; a process for one search.
+    """Optimiser of one search: it proposes points of the unit cube in rounds, and receives their costs.
 
-    The seed decides all points, for equal costs: no state of other modules counts, nor does theirs change.
+    The seed and the costs decide all points. The global random state is neither used nor changed.
     """
 
     def __init__(self, size: int, seed: int) -> None:
-        """Begin with a look around.
+        """Prepare the first round, which is spread over the whole space.
 
         Raises:
             UsageError: `cma` is not installed.
@@ -379,28 +379,29 @@ class Descents:
             remedy = "pip install 'spatial-replay[falsify]'"
             raise UsageError(f"searching for failures needs cma, which is not installed: {remedy}") from None
         self._cma: Any = cma
-        # CMA-ES takes no fewer than two dimensions: a second one that decides nothing does no harm
+        # pycma does not support one dimension (https://github.com/CMA-ES/pycma/issues/86); a second one
+        # without effect does no harm
         self._size, self._searched = size, max(size, 2)
         self._random = np.random.default_rng([seed, 0])
         self._strategy: Any = None
         self._least, self._stalled = np.inf, 0
         self._asked: list[NDArray[np.float64]] = []
-        # of the generation that is being asked for: what was drawn, and the points and costs so far
+        # the current generation: remaining proposals, and points with their costs so far
         self._drawn: list[NDArray[np.float64]] = []
         self._generation: list[tuple[NDArray[np.float64], float]] = []
         self._points: list[NDArray[np.float64]] = []
         self._costs: list[float] = []
 
     def ask(self) -> list[NDArray[np.float64]]:
-        """Return the points of the next round, each (size,), from 0 to 1."""
+        """Return the points of the next round, each (size,) with numbers from 0 to 1."""
         self._asked = self._look() if self._strategy is None else self._promising()
         return [point[: self._size] for point in self._asked]
 
     def take(self, costs: Sequence[float], *, is_found: bool) -> None:
-        """Take the cost of each point of the last round.
+        """Receive the cost of each point of the last round.
 
         Args:
-            is_found: whether one of them is what is searched for: the next descent then begins elsewhere.
+            is_found: whether one of the points is a failure; if so, the next descent begins elsewhere.
         """
         self._remember(costs)
         self._generation += zip(self._asked, costs, strict=True)
@@ -416,7 +417,7 @@ class Descents:
         self._generation, self._drawn = [], []
 
     def _look(self) -> list[NDArray[np.float64]]:
-        """Return points of which each tenth of each dimension has one."""
+        """Return a Latin hypercube: each tenth of each dimension has one point."""
         columns = [
             (self._random.permutation(_LOOK) + self._random.random(_LOOK)) / _LOOK
             for _ in range(self._searched)
@@ -434,7 +435,7 @@ class Descents:
             self._strategy = None
 
     def _promising(self) -> list[NDArray[np.float64]]:
-        """Return those points of a generation that the model expects the least costs of, a part of it."""
+        """Return the proposals with the least expected costs, for one round of a generation."""
         size = self._strategy.popsize
         if not self._drawn:
             self._drawn = self._strategy.ask(_PROPOSED * size)
@@ -450,7 +451,7 @@ class Descents:
         return promising
 
     def _remember(self, costs: Sequence[float]) -> None:
-        """Keep the newest points, and the best of those before them."""
+        """Store the newest points, and the best older points."""
         self._points += [point[: self._size] for point in self._asked]
         self._costs += costs
         older = len(self._costs) - _KNOWN // 2
@@ -462,7 +463,7 @@ class Descents:
     def _descent(self, start: NDArray[np.float64]) -> Any:
         options = {
             "bounds": [0.0, 1.0],
-            # numbers of its own, in place of those of the whole process
+            # own random numbers, because the default is the global state of NumPy; NaN leaves its seed alone
             "randn": lambda *shape: self._random.standard_normal(shape),
             "seed": np.nan,
             "tolx": _NARROWEST,
@@ -475,16 +476,18 @@ class Descents:
 def expected_costs(
     points: NDArray[np.float64], costs: NDArray[np.float64], others: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the costs (M,), less their mean, that a Gaussian process predicts at other points.
+    """Return the costs that a Gaussian process predicts at other points, (M,), relative to the mean cost.
 
-    Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1, with a squared exponential
-    kernel whose length has the greatest likelihood.
+    The method is algorithm 2.1 of Rasmussen and Williams, Gaussian Processes for Machine Learning
+    (https://gaussianprocess.org/gpml), with a squared exponential kernel. The length of the kernel has the
+    greatest likelihood.
 
     Args:
-        points: (N, D), from 0 to 1, with their `costs`, (N,).
-        others: (M, D).
+        points: (N, D), points with numbers from 0 to 1.
+        costs: (N,), costs of the points.
+        others: (M, D), points of the prediction.
     """
-    # a case that is impossible, or a cost that is infinite, is as bad as the worst one that is neither
+    # impossible cases and infinite costs count as the worst finite cost
     finite = costs[costs < LARGEST_COST]
     centred = np.minimum(costs, finite.max()) if finite.size else np.zeros_like(costs)
     centred = centred - centred.mean()
@@ -494,7 +497,7 @@ def expected_costs(
         scale = -0.5 / (length * length * points.shape[1])
         lower = np.linalg.cholesky(np.exp(scale * among) + _NOISE * np.eye(len(points)))
         weights = np.linalg.solve(lower.T, np.linalg.solve(lower, centred))
-        # the variance of the costs is the likeliest one
+        # the maximum-likelihood variance of the costs
         variance = max(float(centred @ weights) / len(points), np.finfo(float).tiny)
         likelihood = -0.5 * len(points) * np.log(variance) - np.log(np.diag(lower)).sum()
         if likelihood > best:
@@ -503,7 +506,7 @@ def expected_costs(
 
 
 def _squares(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the squared distance of each of some points (N, D) from each of others (M, D), as (N, M)."""
+    """Return the squared distances between points (N, D) and other points (M, D), as (N, M)."""
     return np.asarray(((some[:, None] - others[None]) ** 2).sum(axis=-1))
 
 
@@ -511,13 +514,13 @@ def _squares(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[
 
 
 class RunFile:
-    """Runs by their cases, kept in a file; a process for one search, which must be the only one.
+    """File of runs, which are looked up by case; only one search may use it at a time.
 
-    A line is written at once, and one that was not written to its end is dropped when the file is read again.
+    Each run is written at once as a line. An incomplete last line is removed when the file is opened again.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read what an earlier search has left.
+        """Read the runs of earlier searches.
 
         Raises:
             LogError: a line cannot be read.
@@ -537,7 +540,7 @@ class RunFile:
             self._known[key_of(run.case)] = run
         try:
             self._stream = path.open("ab")
-            # what a killed search has begun to write
+            # remove the incomplete line of a killed search
             self._stream.truncate(len(whole))
         except OSError as error:
             raise output_error(path, error) from error
@@ -549,10 +552,10 @@ class RunFile:
         return key_of(case) in self._known
 
     def add(self, run: SearchedRun) -> None:
-        """Keep a run.
+        """Append a run.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the run cannot be written.
         """
         line = json.dumps(run.document, allow_nan=False).encode() + b"\n"
         try:
@@ -572,12 +575,12 @@ class RunFile:
 _Result = TypeVar("_Result")
 
 Rounds: TypeAlias = Generator[Sequence[Case], Sequence[SearchedRun], _Result]
-"""Yields the cases of a round, and is sent their runs."""
+"""Generator that yields the cases of a round and receives their runs."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A case to simulate; `log` is written if it violates."""
+    """Case to simulate; its log is written if it violates a specification."""
 
     number: int
     case: Case
@@ -592,12 +595,12 @@ def simulate_rounds(
     advance: Callable[[int], None],
     logs: Path | None = None,
 ) -> _Result:
-    """Simulate the cases of each round that are not in a file yet, and return what the rounds return.
+    """Simulate the new cases of each round, and return the result of the generator of rounds.
 
     Args:
-        file: gets a line for each run, in the order of the cases.
-        advance: called with the number of runs that are there.
-        logs: the folder for the logs of those that violate; None for none.
+        file: file of runs; runs in it are not simulated again. New lines have the order of the cases.
+        advance: function that is called with the number of runs finished since its last call.
+        logs: folder for the logs of violating runs; None writes no logs.
 
     Raises:
         LogError: the file is damaged.
@@ -613,12 +616,12 @@ def simulate_rounds(
 
 
 class _Queue(Generic[_Result]):
-    """The tasks of one round after the other: none while runs of a round are missing, more when it is whole.
+    """Tasks of one round after another; the next round starts when all runs of a round are finished.
 
-    An iterator of this kind has an end several times, as workers ask again after each result.
+    Unlike other iterators, this one can continue after its end, as workers ask again after each result.
 
     Attributes:
-        result: what the rounds have returned, once the last one is whole.
+        result: result of the generator of rounds, set after the last round.
     """
 
     result: _Result
@@ -643,7 +646,7 @@ class _Queue(Generic[_Result]):
         return self._waiting.popleft()
 
     def take(self, task: _Task, run: SearchedRun) -> None:
-        """Take the run of a task; runs are written in the order of the tasks, whichever ends first."""
+        """Receive the run of a task; runs are written in the order of the tasks, not of their ends."""
         self._arrived[task.number] = run
         while self._unwritten and self._unwritten[0].number in self._arrived:
             self._known.add(self._arrived.pop(self._unwritten.popleft().number))
@@ -651,7 +654,7 @@ class _Queue(Generic[_Result]):
         self._begin()
 
     def _begin(self) -> None:
-        """Begin the next round, and more of them until something is not known."""
+        """Start the next rounds, up to a round with a case that is not in the file."""
         while not self._unwritten:
             try:
                 if self._round is None:
@@ -697,14 +700,14 @@ def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
 
 
 def write_whole(write: Callable[[Path], None], log: Path) -> None:
-    """Write a log under another name first, so that it is whole or not there."""
+    """Write a log under another name and rename it, so that it is never incomplete."""
     unfinished = log.with_name(f".{log.name}.partial")
     write(unfinished)
     unfinished.replace(log)
 
 
 def lost_worker_error(worker: WorkerLost) -> OutputError:
-    """Return the error about a worker that died."""
+    """Return the error for a worker that died."""
     return OutputError(f"a run could not be simulated: {worker}; the same command goes on from there")
 
 
@@ -714,11 +717,11 @@ FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
 _SEARCH: Final = "search.json"
 _HALVINGS: Final = 3
-"""How often a value that cannot be at rest is brought half way there."""
+"""Most times that a value is moved half way to rest, if the failure needs a value other than rest."""
 _BARREN: Final = 50
-"""Rounds without a new case after which there is nothing else to try."""
+"""Rounds without a new case after which the search ends."""
 _DRAWN: Final = 10
-"""Runs of a round where nothing but seeds is varied."""
+"""Runs of a round in which only seeds are varied."""
 
 
 @named_arguments
@@ -733,28 +736,29 @@ def falsify(
     planned: bool = False,
     jobs: int = 1,
 ) -> Falsification:
-    """Search for simulated runs that violate a specification, and make those found smaller.
+    """Search for simulated runs that violate a specification, and reduce their variations.
 
-    An optimiser chooses the runs, with their robustness as cost. A call with the same arguments goes on where
-    an earlier one ended, also with a larger budget.
+    An optimiser chooses the runs, with their robustness as cost. A call with the same arguments continues an
+    earlier search, also with a larger budget.
 
     Args:
-        simulation: a scenario ("push", "pick-place", "table-setting"), or a function from the values of the
-            parameters, by name, to the samples of a run. Equal values must give equal samples.
-        specifications: what has to hold, parsed or as files; without any, the scenario's own.
-        output: the folder for runs, logs and clips.
-        vary: of a scenario as on the command line, `["noise=0:0.01", "slip@T"]`, by default `["start"]`; of a
-            function ranges by name, `{"wind": (-2, 2)}`.
-        budget: the most runs, but for those that make failures smaller.
-        seed: of the search.
-        planned: let the planner act in the scenario, not the script.
-        jobs: how many processes simulate; the result does not depend on it.
+        simulation: scenario ("push", "pick-place", "table-setting"), or function from the values of the
+            parameters by name to the samples of a run. Equal values must give equal samples.
+        specifications: specifications or their files; by default the one of the scenario.
+        output: folder for runs, logs and clips.
+        vary: parameters to vary. For a scenario they are texts as on the command line,
+            `["noise=0:0.01", "slip@T"]`, by default `["start"]`; for a function ranges by name,
+            `{"wind": (-2, 2)}`.
+        budget: most runs, without those that reduce failures.
+        seed: seed of the search.
+        planned: whether the planner acts in the scenario instead of the script.
+        jobs: number of processes that simulate; the result does not depend on it.
 
     Raises:
-        UsageError: what cannot be varied, a folder of another search, an extra that is not installed.
-        SpecificationError: a specification with errors, one that no run violates or none satisfies,
-            or names that the world does not have.
-        LogError: what an earlier search has left is damaged.
+        UsageError: a parameter that cannot be varied, a folder of another search, or a missing extra.
+        SpecificationError: a specification has errors, has a result that no run can violate or satisfy, or
+            mentions objects that the world does not have.
+        LogError: a file of an earlier search is damaged.
         OutputError: a file cannot be written.
     """
     if isinstance(specifications, Specification | str | PathLike):
@@ -786,19 +790,19 @@ def search_failures(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> Falsification:
-    """Look for runs that violate a specification; what an earlier search has simulated counts.
+    """Search for runs that violate a specification; runs of an earlier search in the folder are used.
 
     Args:
-        folder: where runs, logs and clips go; made if need be.
-        budget: the most runs to simulate, but for those that make failures smaller.
-        seed: of the search; equal arguments give equal files, with any number of workers.
-        progress: shows how many runs there are.
+        folder: folder for runs, logs and clips; it is created if it is missing.
+        budget: most runs, without those that reduce failures.
+        seed: seed of the search; equal arguments give equal files with any number of workers.
+        progress: display of the number of runs.
 
     Raises:
-        UsageError: nothing to vary, no budget, the folder is not one of this search.
-        SpecificationError: a specification that no run violates, or none satisfies.
-        LogError: what an earlier search has left is damaged.
-        OutputError: a file cannot be written; the same call goes on from there.
+        UsageError: nothing to vary, an invalid budget or seed, or a folder of another search.
+        SpecificationError: a specification has a result that no run can violate or satisfy.
+        LogError: a file of an earlier search is damaged.
+        OutputError: a file cannot be written; the same call continues the search.
     """
     if not 1 <= budget <= MOST_RUNS:
         raise UsageError(f"the budget is {budget:,} runs; give 1 to {MOST_RUNS:,}")
@@ -830,7 +834,7 @@ def _distinct(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
 
 
 def _identity(simulation: Simulation, space: Space, seed: int) -> dict[str, Any]:
-    """Return what all results of a search depend on, but for its budget."""
+    """Return the inputs that decide the results of a search, without its budget."""
     return {
         "format": FORMAT,
         "version": __version__,
@@ -845,10 +849,11 @@ def _identity(simulation: Simulation, space: Space, seed: int) -> dict[str, Any]
 
 
 def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
-    """Make a folder that of a search, or check that it is.
+    """Mark a folder as the folder of a search, or check its mark.
 
     Raises:
-        UsageError: it is that of another search, or holds something else.
+        UsageError: the folder has another search, or other files.
+        LogError: the mark is damaged.
     """
     names = files.names()
     if _SEARCH not in names:
@@ -875,13 +880,13 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
 
 
 def _varied_text(varied: Mapping[str, Sequence[Any]]) -> str:
-    """Return what a search varies: "speed from 0.6 to 1.4, slip from 0.0 to the end of the run"."""
+    """Return the varied ranges in words: "speed from 0.6 to 1.4, slip from 0.0 to the end of the run"."""
     ranges = (f"{name} from {low} to {high}" for name, (low, high) in varied.items())
     return ", ".join(range_text.replace("to inf", "to the end of the run") for range_text in ranges)
 
 
 class _Search:
-    """One search in a folder that is locked."""
+    """One search in a locked folder."""
 
     def __init__(
         self, simulation: Simulation, space: Space, files: LocalFolder, workers: Workers, progress: Progress
@@ -894,7 +899,7 @@ class _Search:
             (self._folder / name).mkdir(exist_ok=True)
 
     def run(self, budget: int, seed: int) -> Falsification:
-        """Search, make what fails smaller, and cut clips of that."""
+        """Search, reduce the failures, and cut their clips."""
         with self._progress("runs", budget) as advance:
             runs = self._simulate_rounds(self._descend(budget, seed), "runs", advance, self._folder / "runs")
         failing = sorted(
@@ -930,7 +935,7 @@ class _Search:
         return simulate_rounds(rounds, self._simulation, self._workers, file, advance, logs)
 
     def _descend(self, budget: int, seed: int) -> Rounds[list[SearchedRun]]:
-        """Let an optimiser choose the cases, with the least robustness as cost."""
+        """Yield the cases that an optimiser chooses, with the robustness as cost; return all runs."""
         (first,) = yield [self._space.at_rest()]
         runs = [replace(first, number=1)]
         self._space = space = self._space.ending_at(first.seconds)
@@ -954,7 +959,7 @@ class _Search:
         while len(runs) < budget and barren < _BARREN and not first.is_violated:
             points: Sequence[Any] = descents.ask() if descents is not None else [()] * _DRAWN
             draws = [
-                # the seed that came nearest so far, or another one
+                # the seeds with the least cost so far, or new ones
                 best[1] if best is not None and random.random() < 0.5 else space.draw(random)
                 for _ in points
             ]
@@ -975,7 +980,7 @@ class _Search:
             if len(asked) < len(new):
                 break
             reported = [costs[key_of(case)] for case in cases]
-            # what was found before draws no descent to itself
+            # a failure that is already known does not end a descent
             is_found = any(key_of(case) in new and costs[key_of(case)] < 0 for case in cases)
             least = int(np.argmin(reported))
             if is_found:
@@ -990,7 +995,7 @@ class _Search:
     def _shrink(
         self, failing: Sequence[SearchedRun], known: Mapping[str, SearchedRun]
     ) -> Rounds[tuple[list[SearchedRun], int]]:
-        """Make failures smaller, each by one run in a round; return them, and how many runs that took."""
+        """Reduce all failures, by one run each in a round; return them and the number of further runs."""
         tried: dict[str, SearchedRun] = {}
         least = list(failing)
         trials = [self._smaller(run) for run in failing]
@@ -1012,7 +1017,7 @@ class _Search:
         return least, len(tried)
 
     def _smaller(self, failure: SearchedRun) -> Generator[Case, SearchedRun, None]:
-        """Yield cases with less of what is varied, until no group can be brought to rest by itself."""
+        """Yield cases with fewer or smaller variations, until no group can return to rest on its own."""
         case, halvings = failure.case, dict.fromkeys(self._space.groups, _HALVINGS)
         is_changed = True
         while is_changed:
@@ -1042,7 +1047,7 @@ class _Search:
 
 
 def _finish(simulation: Simulation, failure: Failure) -> None:
-    """Write what is not there yet of a failure: its log, the smaller one, and the clip of that."""
+    """Write the missing files of a failure: its log, the reduced log, and the clip of the reduced log."""
     if not failure.log.exists():
         write_whole(simulation.run(failure.run.case).write, failure.log)
     if not failure.smaller_log.exists():

@@ -1,4 +1,4 @@
-"""Simulations to search: those of a scenario or of a user, with the parameters that vary in each case."""
+"""Simulations to search, by a scenario or by a function of a user, with their varied parameters."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ from spatial_replay.trace.trace import Sample, Trace, duration_ns_from_text
 # ------------------------------------------------------------------------------------------------- parameters
 
 Case: TypeAlias = Mapping[str, float | None]
-"""The value of each parameter by name; None where it is left out."""
+"""Value of each parameter by name; None if it is left out."""
 
 Range: TypeAlias = tuple[float, float]
 
 TENTHS: Final = 10
-"""Parts of a range in which runs are counted."""
+"""Parts of a range, in each of which runs are counted."""
 _DIGITS: Final = 6
-"""Digits by which values of a range without a resolution of its own differ."""
+"""Decimal digits of values relative to the width of the range, for ranges without their own resolution."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number that is varied.
+    """Varied number.
 
     Attributes:
-        low, high: its range; `high` is infinite until the first run has ended, of times in a run.
-        digits: decimals to which values are rounded, so that a written value is read back exactly.
-        rest: its value in the unvaried run; None if that run lacks it.
-        group: a search sets all parameters of a group back to rest together.
+        low, high: range; for a time in a run, `high` is infinite until the first run has ended.
+        digits: decimals of a rounded value, so that a written value is read back exactly.
+        rest: value in the run without variations; None if that run does not have the parameter.
+        group: name of the parameters that a search sets back to rest together.
         unit: "m", "rad", "s", or "".
-        is_drawn: whether its values have no order, as seeds: they are drawn, not optimised.
+        is_drawn: whether values have no order, such as seeds, and are drawn instead of optimised.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Parameter:
 
     @classmethod
     def of_range(cls, name: str, low: float, high: float) -> Parameter:
-        """Return the parameter of a simulation of one's own; at rest it is as near to 0 as its range allows.
+        """Return a parameter of a user's simulation; its value at rest is the value nearest to 0.
 
         Raises:
             UsageError: the range is empty or not finite.
@@ -78,17 +78,17 @@ class Parameter:
         return cls(name, low, high, digits, min(max(low, 0.0), high), name)
 
     def value_at(self, share: float) -> float:
-        """Return the value at a share of the range, from 0 to 1."""
+        """Return the value at a fraction of the range, from 0 to 1."""
         value = round(self.low + share * (self.high - self.low), self.digits)
-        # rounding may leave the range
+        # rounding may leave the range; + 0.0 turns -0.0 into 0.0
         return min(max(value, self.low), self.high) + 0.0
 
     def tenth_of(self, value: float) -> int:
-        """Return the tenth of the range that a value is in, from 0."""
+        """Return the tenth of the range that contains a value, from 0."""
         return min(TENTHS - 1, int(TENTHS * (value - self.low) / (self.high - self.low)))
 
     def text_of(self, value: float) -> str:
-        """Return a value with its name and unit, with all digits that it has: fewer would be another case."""
+        """Return a value with name and unit, and with all digits, because fewer digits are another case."""
         number = f"{value:.12g}"
         if self.unit == "s":
             return f"{self.name}@{number}s"
@@ -96,10 +96,10 @@ class Parameter:
 
 
 def refuse_range(name: str, low: float, high: float) -> None:
-    """Check a range.
+    """Raise an error for an invalid range.
 
     Raises:
-        UsageError: it is empty or not finite.
+        UsageError: the range is empty or not finite.
     """
     for end in (low, high):
         if not math.isfinite(end):
@@ -110,23 +110,23 @@ def refuse_range(name: str, low: float, high: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """All that is varied."""
+    """Space of all varied parameters."""
 
     parameters: tuple[Parameter, ...]
 
     @property
     def ordered(self) -> tuple[Parameter, ...]:
-        """The parameters that an optimiser can descend along."""
+        """The parameters with ordered values, which an optimiser can use."""
         return tuple(parameter for parameter in self.parameters if not parameter.is_drawn)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups: mishaps first, then numbers, then starts; not seeds, of which none is smaller."""
+        """The groups in the order of reduction: mishaps, numbers, starts; no seed is smaller than another."""
         places = sorted(self.ordered, key=lambda parameter: (parameter.unit != "s", parameter.rest is None))
         return tuple(dict.fromkeys(parameter.group for parameter in places))
 
     def at_rest(self, case: Case | None = None, group: str | None = None) -> dict[str, float | None]:
-        """Return a case with one group at rest, or all of it."""
+        """Return a case with one group at rest; without a case, return the case with all at rest."""
         return {
             parameter.name: parameter.rest
             if case is None or parameter.group == group
@@ -135,7 +135,7 @@ class Space:
         }
 
     def nearer(self, case: Case, group: str) -> dict[str, float | None] | None:
-        """Return a case with a group half way to rest; None for one that is left out there, or is there."""
+        """Return a case with a group half way to rest; None if it is at rest, or has no value at rest."""
         values = dict(case)
         for parameter in self.parameters:
             value = case[parameter.name]
@@ -146,7 +146,7 @@ class Space:
         return None if values == dict(case) else values
 
     def case_at(self, shares: Iterable[float], drawn: Sequence[float]) -> dict[str, float | None]:
-        """Return the case at shares of the ordered parameters' ranges, with values for the others."""
+        """Return the case at fractions of the ordered parameters' ranges, with drawn values of the others."""
         coming, others = iter(shares), iter(drawn)
         return {
             parameter.name: next(others) if parameter.is_drawn else parameter.value_at(float(next(coming)))
@@ -154,7 +154,7 @@ class Space:
         }
 
     def draw(self, random: np.random.Generator) -> list[float]:
-        """Return values of the parameters that are drawn."""
+        """Return random values of the drawn parameters."""
         return [
             float(random.integers(int(parameter.low), int(parameter.high), endpoint=True))
             for parameter in self.parameters
@@ -162,7 +162,7 @@ class Space:
         ]
 
     def ending_at(self, seconds: float) -> Space:
-        """Return this space once it is known how long a run takes."""
+        """Return the space with the duration of a run as the end of all times."""
         return Space(
             tuple(
                 replace(parameter, high=round(seconds, parameter.digits))
@@ -174,7 +174,7 @@ class Space:
 
 
 def key_of(case: Case) -> str:
-    """Return a text that is equal for equal cases."""
+    """Return a key that is equal for equal cases."""
     return json.dumps(case, sort_keys=True)
 
 
@@ -182,7 +182,7 @@ def parse_range(text: str) -> tuple[str, str, str]:
     """Split `NAME=LOW:HIGH`.
 
     Raises:
-        UsageError: it is not of this form.
+        UsageError: the text has another form.
     """
     name, _, span = (part.strip() for part in text.partition("="))
     low, _, high = (part.strip() for part in span.partition(":"))
@@ -192,10 +192,10 @@ def parse_range(text: str) -> tuple[str, str, str]:
 
 
 def number_from(text: str, of: str) -> float:
-    """Read a number.
+    """Return the number of a text.
 
     Raises:
-        UsageError: it is none.
+        UsageError: the text is not a number.
     """
     try:
         return float(text)
@@ -210,7 +210,7 @@ _FORMS: Final = "noise=0:0.01, seed=0:999, start, start=0.02, start.OBJECT=0.02,
 
 
 class SimulatedCase(NamedTuple):
-    """The run of a case: its samples, what writes it as a log, and the unit of lengths in it, if declared."""
+    """Run of a case: its samples, a function that writes its log, and its unit of lengths if declared."""
 
     trace: Trace
     write: Callable[[Path], None]
@@ -225,15 +225,15 @@ def scenario_simulation(
     *,
     is_planned: bool = False,
 ) -> tuple[Simulation, tuple[Parameter, ...]]:
-    """Return the runs of a scenario, and what is varied in them; by default where objects start.
+    """Return the simulation of a scenario and its varied parameters, by default the starts of objects.
 
     Args:
-        vary: as on the command line.
-        options: those of `record` that give the specifications: files, constants.
+        vary: parameters as on the command line.
+        options: options of `record` for the specifications: files, constants.
 
     Raises:
-        UsageError: there is no such scenario, no simulator, or what cannot be varied.
-        SpecificationError: names that the world does not have.
+        UsageError: an unknown scenario, a missing simulator, or a parameter that cannot be varied.
+        SpecificationError: a specification mentions objects that the world does not have.
     """
     specifications = tuple(files) or (default_specification(scenario),)
     with closing(make_world(scenario)) as world:
@@ -250,13 +250,14 @@ def own_simulation(
     vary: Mapping[str, tuple[float, float]] | Sequence[str],
     jobs: int = 1,
 ) -> tuple[Simulation, tuple[Parameter, ...]]:
-    """Return the runs of a function, and what is varied in them.
+    """Return the simulation by a function and its varied parameters.
 
     Args:
-        vary: ranges by name, or as `NAME=LOW:HIGH`.
+        vary: ranges by name, or texts `NAME=LOW:HIGH`.
 
     Raises:
-        UsageError: no specification or a template, an empty range, or a function that no other process has.
+        UsageError: no specification, a template, an empty range, or a function that other processes cannot
+            import.
     """
     if not files:
         raise UsageError("a simulation of one's own has no specification yet; give what has to hold")
@@ -281,13 +282,13 @@ def own_simulation(
 
 @dataclass(frozen=True, slots=True)
 class OwnSimulation:
-    """A simulation of the caller's: a function from the values of a case to samples.
+    """Simulation by a user's function from the values of a case to samples.
 
     Equal cases have equal runs.
 
     Attributes:
-        name: what is simulated.
-        files: what has to hold.
+        name: name of the simulation.
+        files: specifications of the runs.
     """
 
     simulate: Callable[[Mapping[str, float]], Iterable[Sample]]
@@ -296,18 +297,18 @@ class OwnSimulation:
 
     @property
     def identity(self) -> Mapping[str, bool]:
-        """The other inputs of its runs, for the folder of a search."""
+        """Further inputs of the runs, which identify the folder of a search."""
         return {}
 
     def is_possible(self, case: Case) -> bool:
-        """Return whether there is such a run: False where objects would lie in each other."""
+        """Return whether a case has a run; False if objects would overlap at the start."""
         return True
 
     def run(self, case: Case) -> SimulatedCase:
         """Simulate a case.
 
         Raises:
-            UsageError: the function returns anything but samples.
+            UsageError: the function returns something other than samples.
         """
         values = {name: value for name, value in case.items() if value is not None}
         samples = list(self.simulate(values))
@@ -318,16 +319,16 @@ class OwnSimulation:
         return _simulated_case(samples, self.files, about)
 
     def command(self, case: Case) -> None:
-        """Return the command that repeats the run of a case; None if there is none."""
+        """Return the command that records the run of a case; None for a user's simulation."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScenarioRuns:
-    """The runs of a simulated world.
+    """Simulation of a scenario.
 
     Attributes:
-        spec_options: those options of `record` that give the specifications: files, constants.
-        is_planned: whether a planner decides, for the scenario's own specification, in place of the script.
+        spec_options: options of `record` for the specifications: files, constants.
+        is_planned: whether the planner acts for the scenario's specification, instead of the script.
     """
 
     name: str
@@ -373,7 +374,7 @@ class ScenarioRuns:
             options += ["--inject", str(injection)]
         for start in conditions["starts"]:
             options += ["--start", str(start)]
-        # what the planner knows nothing of
+        # the planner plans for the scenario's specification; other files are only evaluated
         others = ["--also" if word == "--spec" else word for word in self.spec_options]
         verb = ["plan", self.name, *others] if self.is_planned else ["record", self.name, *self.spec_options]
         words = ["spatial-replay", *verb, "-o", "again.mcap", *options]
@@ -383,7 +384,7 @@ class ScenarioRuns:
         specification = default_specification(self.name)
         task, also = specification, [file for file in self.files if file != specification]
         if self.spec_options and "--spec" not in self.spec_options:
-            # values of the constants of the scenario's own specification
+            # without --spec, the only file is the scenario's specification with other constants
             (task,), also = self.files, []
         with TemporaryDirectory() as folder:
             log = Path(folder, "run.mcap")
@@ -397,10 +398,10 @@ class ScenarioRuns:
         return SimulatedCase(trace, write, unit="m")
 
     def parameters(self, text: str) -> list[Parameter]:
-        """Return what is varied, as it is written on the command line.
+        """Return the parameters for a text of the command line.
 
         Raises:
-            UsageError: what cannot be varied in this world.
+            UsageError: a parameter that cannot be varied in this world.
         """
         name = text.partition("=")[0].strip()
         kind, at, when = text.partition("@")
@@ -427,7 +428,7 @@ class ScenarioRuns:
     def _mishap(self, kind: str, when: str) -> Parameter:
         begin, colon, end = when.partition(":")
         try:
-            # the world itself says what cannot happen in it
+            # the world refuses injections that cannot happen in it
             with closing(make_world(self.name, injections=[Injection.parse(f"{kind}@1s")])):
                 pass
             span = (0.0, math.inf)
@@ -436,7 +437,7 @@ class ScenarioRuns:
                     raise UsageError(f"write {kind}@T for any time of the run, or {kind}@2s:9s")
                 span = duration_ns_from_text(begin) / 1e9, duration_ns_from_text(end) / 1e9
         except UsageError as error:
-            # that a second was tried concerns no one
+            # the time of the trial, 1 s, would only confuse
             why = str(error).removeprefix(f"{kind}@1s: ")
             raise UsageError(f"--vary {kind}@{when}: {why}") from None
         if colon:
@@ -489,7 +490,7 @@ def _conditions(case: Case) -> Conditions:
 
 
 def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float) -> Footprint:
-    """Return what a body covers at the beginning; with the room that the seed may take."""
+    """Return the footprint of a body at the start; without a given start it includes the scatter of seeds."""
     x, y, turn, room = placement.x, placement.y, placement.yaw, scatter_m
     if (start := starts.get(placement.body.name)) is not None:
         x, y, turn, room = start.x, start.y, turn if start.turn is None else start.turn, 0.0
@@ -500,7 +501,7 @@ def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float
 
 
 def _is_beside(one: Placement, other: Placement) -> bool:
-    """Return whether two bodies are at the same height, so that they must not overlap."""
+    """Return whether two bodies have common heights, so that their footprints must not overlap."""
     return (
         one.bottom < other.bottom + other.body.shape.height
         and other.bottom < one.bottom + one.body.shape.height
