@@ -1,1 +1,1 @@
-"""Comparing: which edit changed a verdict, where two runs part, and the smallest log that shows a verdict."""
+"""Comparisons: the edit that changed a verdict, differences of two runs, the smallest log with a verdict."""

@@ -43,7 +43,7 @@ from spatial_replay.tuning.tuned import last_that_holds
 
 
 class KeptNode(NamedTuple):
-    """A node whose verdict a clip keeps, by its id, and what it is called."""
+    """Node whose verdict a clip keeps, by result and id, with its title."""
 
     result: SpecResult
     node: int
@@ -51,9 +51,10 @@ class KeptNode(NamedTuple):
 
 
 def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptNode]:
-    """Return the results and named specs within them that are asked for, by default those that are violated.
+    """Return the results and named specs in `of`; by default the violated results, else all results.
 
-    Where none is violated these are all results.
+    Raises:
+        UsageError: a name that no result or spec has.
     """
     if not of:
         violated = [result for result in results if result.verdict is Verdict.VIOLATED]
@@ -73,13 +74,13 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
 
 
 class _Path(NamedTuple):
-    """The decision of a node.
+    """Path from a node to its deciding atom.
 
     Attributes:
-        nodes: the ids on the path to the deciding atom.
-        decided_ns: the sample that decides.
-        number: the interval of the last of these nodes there.
-        missed: the implication on the path that failed.
+        nodes: ids of the nodes on the path.
+        decided_ns: time of the deciding sample.
+        number: robustness interval of the last node at that sample.
+        missed: failed implication on the path, or None.
     """
 
     nodes: tuple[int, ...]
@@ -89,16 +90,16 @@ class _Path(NamedTuple):
 
 
 class _Decision(NamedTuple):
-    """The verdict of a node and its reason, which a clip has to repeat.
+    """Verdict of a node and its reason, which a clip must repeat.
 
     Attributes:
-        verdict: of the node.
-        certain_ns: the sample that made the verdict certain.
-        numbers: the end that decides, and the nominal one, of the node and of that part. The other end may be
-            unknown because of a sample that decides nothing.
-        cause: the part that failed first.
-        path: to the atom that decides the node over all samples.
-        settled: to the atom that settled that part, or the verdict, when it did.
+        verdict: verdict of the node.
+        certain_ns: time of the sample that made the verdict certain, or None.
+        numbers: deciding end of the robustness, wide and nominal, for the node and for its cause. The other
+            end is left out: it may be unknown because of a sample that decides nothing.
+        cause: id of the part that failed first, or None.
+        path: path to the deciding atom of the node over all samples.
+        settled: path to the atom that settled the cause or the verdict, at that time.
     """
 
     verdict: Verdict
@@ -109,7 +110,7 @@ class _Decision(NamedTuple):
     settled: _Path
 
     def difference(self, other: _Decision | None) -> str:
-        """Say how another decision differs from this one."""
+        """Return a verb phrase for the difference of another decision from this one."""
         if other is None:
             return "has no sample"
         if self.verdict is not other.verdict:
@@ -120,7 +121,7 @@ class _Decision(NamedTuple):
 
 
 class _Part:
-    """One node of a result, evaluated over any window of its samples."""
+    """Node of a result that can be evaluated over any window of its samples."""
 
     def __init__(self, kept: KeptNode, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
         result = kept.result
@@ -137,7 +138,7 @@ class _Part:
             column = trace.names.index(result.object)
             self._seen_ns = trace.times_ns[trace.rows[:, column] != ABSENT]
         self._decision = self._decide(result, self._leaves)
-        # the last one of equal times is the one that is said
+        # of several events at one time, the last entry is shown
         self._moments = {
             self._decision.settled.decided_ns: f", where `{kept.title}` was settled",
             self._decision.path.decided_ns: f", where the robustness of `{kept.title}` is decided",
@@ -149,22 +150,22 @@ class _Part:
         self._title = kept.title
 
     def moment(self, time_ns: int) -> str | None:
-        """Say what happened at a time that decides; None at others."""
+        """Return the event at a deciding time as a clause; None at other times."""
         return self._moments.get(time_ns)
 
     def holds_over(self, start_ns: int, end_ns: int) -> bool:
-        """Say whether all of it is the same over the samples from one time to another, both included."""
+        """Return whether the decision is the same over the samples between two times, both included."""
         return self._decision_over(start_ns, end_ns) == self._decision
 
     def change_over(self, start_ns: int, end_ns: int) -> str | None:
-        """Say what is different over the samples from one time to another; None if nothing is."""
+        """Return the change over the samples between two times as a clause; None without a change."""
         decision = self._decision_over(start_ns, end_ns)
         if decision == self._decision:
             return None
         return f": in a shorter clip `{self._title}` {self._decision.difference(decision)}"
 
     def _decision_over(self, start_ns: int, end_ns: int) -> _Decision | None:
-        """Return the decision over the samples from one time to another; None without a sample."""
+        """Return the decision over the samples between two times; None without a sample."""
         if self._seen_ns is not None:
             begin, end = window_of(self._seen_ns, start_ns, end_ns + 1)
             if begin == end:
@@ -180,7 +181,7 @@ class _Part:
         return self._decide(result, leaves)
 
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
-        """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
+        """Return the leaves of a window as in its own log, in which nothing is known before its start."""
         leaves = np.ascontiguousarray(self._leaves[:, :, begin:end])
         samples, duration_ns, to_reports = self._reach
         if self._trace is None or not self._reach:
@@ -188,7 +189,7 @@ class _Part:
         times_ns = self._times_ns[begin:end]
         count = max(samples, to_reports, int(np.searchsorted(times_ns, first_ns + duration_ns)))
         if to_reports and (self._trace.reported_ns is not None or self._trace.signals_reported_ns):
-            # which report comes before the window may matter as long as its second one is shown
+            # a rate reads the last two reports: up to the second report in the window, one is from before it
             count = len(times_ns)
         from_, to = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
         head = self._trace.slice(from_, min(from_ + count, to))
@@ -202,7 +203,7 @@ class _Part:
         return leaves
 
     def _decide(self, result: SpecResult, leaves: Floats) -> _Decision:
-        """Return the verdict over the samples of a result, given their leaves, and its reason."""
+        """Return the verdict over the samples of a result with given leaves, and its reason."""
         times_ns, certain_ns = result.times_ns, result.certain_ns(self._node)
         cause = result.first_cause(self._node)
         part, settled_ns = (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
@@ -220,7 +221,7 @@ class _Part:
 
 
 def _deciding_numbers(done: OfflineNodes, node: int) -> tuple[float, ...]:
-    """Return the end of a node's interval that decides, and the nominal one; none if both are open."""
+    """Return the deciding end of a node's interval, wide and nominal; nothing if the verdict is open."""
     end = End.of(final_verdict(*done.interval(node)))
     if end is End.OPEN:
         return ()
@@ -241,7 +242,7 @@ def _path(done: OfflineNodes, node: int) -> _Path:
 
 
 class ClipSearch:
-    """Searches the window: from the samples that decide outwards, then from both ends inwards."""
+    """Search for the window of a clip: outwards from the deciding samples, then inwards from both ends."""
 
     def __init__(
         self,
@@ -271,7 +272,7 @@ class ClipSearch:
         self._known: dict[tuple[int, int], bool] = {}
 
     def reasons(self, start_ns: int, end_ns: int) -> Iterator[Sentence]:
-        """Say why a window that was found neither begins later nor ends earlier; times count from 0."""
+        """Yield sentences on why the window cannot begin later or end earlier; times count from 0."""
         first, last = np.searchsorted(self._times_ns, [start_ns, end_ns]).tolist()
         for verb, at, shorter in (("begins", first, (first + 1, last)), ("ends", last, (first, last - 1))):
             time_ns = int(self._times_ns[at])
@@ -296,7 +297,7 @@ class ClipSearch:
             first, last = begin, end
 
     def _outwards(self) -> tuple[int, int]:
-        """Widen the window in doubling steps until it has the results; small ones cost least."""
+        """Widen the window in doubling steps until it has the results, because small windows cost least."""
         low, high = self._inner
         last, step = len(self._times_ns) - 1, 0
         while True:
@@ -306,14 +307,17 @@ class ClipSearch:
             step = max(2 * step, 1)
 
     def _cut(self, outer: int, inner: int, holds: Callable[[int], bool]) -> int:
-        """Return an end near the inner one that holds; the outer one does, and windows near it cost most."""
+        """Return the end nearest to the inner end with which the window still has the results.
+
+        The outer end has them. The search starts at the inner end, because long windows cost most.
+        """
         if inner == outer or holds(inner):
             return inner
         towards = 1 if outer > inner else -1
         return last_that_holds(inner, outer - towards, lambda at: not holds(at)) + towards
 
     def _holds(self, first: int, last: int) -> bool:
-        """Say whether a window has every result, for the same reason."""
+        """Return whether a window has every result for the same reason."""
         if (first, last) not in self._known:
             times = int(self._times_ns[first]), int(self._times_ns[last])
             self._known[first, last] = all(part.holds_over(*times) for part in self._parts)
@@ -322,7 +326,7 @@ class ClipSearch:
 
 def _join_times(times_ns: Sequence[Integers]) -> Integers:
     first = times_ns[0]
-    # objects of a template may come one after the other, each for as many samples
+    # lengths alone prove nothing: objects of a template can appear one after another for equally many samples
     if all(np.array_equal(sample_times, first) for sample_times in times_ns):
         return first
     return np.unique(np.concatenate(times_ns))
@@ -330,14 +334,14 @@ def _join_times(times_ns: Sequence[Integers]) -> Integers:
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A clip that was written.
+    """Written clip.
 
     Attributes:
-        whole, replayed: the replay of the log, without a certificate, and that of the clip.
+        whole, replayed: replay of the log without a certificate, and replay of the clip.
         start_ns, end_ns: times of the first and the last sample of the clip.
-        kept: the titles of the results, and names of specs within them, that are as in the log.
-        source_bytes, clip_bytes: sizes of the files; None for a log that is not one file here.
-        reasons: why the clip neither begins later nor ends earlier, as sentences.
+        kept: titles of results, and names of specs in them, with the same decision as in the log.
+        source_bytes, clip_bytes: sizes of the files; `source_bytes` is None if the log is not a single file.
+        reasons: sentences on why the clip cannot begin later or end earlier.
     """
 
     whole: Replayed
@@ -351,7 +355,7 @@ class Clip:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The titles of results of which nothing is kept, in the order of the log."""
+        """Titles of results without a kept node, in the order of the log."""
         kept_names = {*self.kept}
         return tuple(
             result.title
@@ -361,12 +365,12 @@ class Clip:
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing smaller has the same verdict and witness."""
+        """Whether the clip has all samples, because no smaller part has the same verdict and witness."""
         return self.replayed.samples == self.whole.samples
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """The titles of results with another verdict than in the log; none of `kept`."""
+        """Titles of results with another verdict than in the log; kept results are not among them."""
         verdicts = {result.title: result.verdict for result in self.whole.results}
         return tuple(
             result.title
@@ -376,7 +380,7 @@ class Clip:
 
     @property
     def added(self) -> tuple[str, ...]:
-        """The named parts that fail in the clip alone, of results with the verdict of the log."""
+        """Named parts that fail in the clip but not in the log, in results with an unchanged verdict."""
         results = {result.title: result for result in self.whole.results}
         parts = (
             cause.spec
@@ -401,19 +405,20 @@ def cut_clip(
 ) -> Clip:
     """Write the smallest part of a log that has its verdicts, robustness and witnesses.
 
-    Neither end can be cut further, by one sample or by any power of two, without another result. Messages are
-    those in the window, and before it the last of each topic and the last transform of each frame. Times
-    stay.
+    If either end is cut by one more sample, or by any power of two of samples, a result changes. The clip has
+    all messages in its window. It also has the last message of each topic, and the last transform of each
+    frame, before the window. Times do not change.
 
     Args:
-        options: what is evaluated; `keep` chooses the topics.
-        around_ns: keep at least so much before and after the samples that decide.
-        of: names of the specs to keep; without it the violated results, or all where none is violated.
-        inputs: files that the output must not be.
+        options: options of the evaluation; `keep` selects the topics.
+        around_ns: least time that is kept before and after the deciding samples.
+        of: names of the specs to keep; by default the violated results, or all if none is violated.
+        inputs: files that the output must not overwrite.
 
     Raises:
-        UsageError: no such spec, an option that cannot work, an output that is an input.
-        LogError: no sample in the log. OutputError: the output cannot be written.
+        UsageError: an unknown spec, an option that clips do not support, or an output that is an input.
+        LogError: the log has no sample.
+        OutputError: the output cannot be written.
     """
     if options.window.every != 1:
         raise UsageError("a clip keeps every sample; leave out --every")
@@ -455,7 +460,7 @@ def cut_clip(
 
 
 def _size_of(source: Source) -> int | None:
-    """Return the size of a log that is one file."""
+    """Return the size of a log that is a single file; None for other logs."""
     path = source.path
     if isinstance(path, RemoteFile):
         return path.size

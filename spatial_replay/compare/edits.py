@@ -1,4 +1,4 @@
-"""Edits between two versions of a formula: declarations, trees, shared names, and kinds of edits."""
+"""Edits between two versions of a formula: changed declarations, aligned trees, and kinds of edits."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ from spatial_replay.spec.walks import (
 def unify_regions(
     formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
 ) -> tuple[list[Formula], dict[str, Outline]]:
-    """Rename the regions of some formulas that others have with another shape; texts stay.
+    """Rename regions in formulas whose names have other shapes in `others`; texts of atoms do not change.
 
     Returns:
-        The formulas, and the regions of both.
+        The formulas, and the regions of both sides by name.
     """
     renamed: dict[str, str] = {}
     joined = dict(others)
@@ -80,7 +80,7 @@ def unify_regions(
 
 
 def _rename_regions(term: Any, regions: Mapping[str, str], *, without_groups: bool = False) -> Any:
-    """Return a term with other names of regions and, on request, with groups known by their members alone."""
+    """Return a term with renamed regions; `without_groups` removes the names of groups."""
     if isinstance(term, Group) and without_groups:
         return replace(term, name="")
     if isinstance(term, RegionName):
@@ -103,11 +103,11 @@ _KINDS: Final[Mapping[str, DeclarationKind]] = MappingProxyType(
     }
 )
 _MOST_CHANGES: Final = 32
-"""Declarations that edits are traced back to; two texts that differ in more are hardly versions of one."""
+"""Most declarations that edits are traced to; texts with more differences are hardly versions of one text."""
 
 
 class TextPlace(NamedTuple):
-    """A line of a specification file, from 1, or a statement that begins there, written on one line."""
+    """Place in a specification file: a line, from 1, with its text or the statement that begins there."""
 
     filename: str
     line: int
@@ -115,7 +115,7 @@ class TextPlace(NamedTuple):
 
 
 class DeclarationChange(NamedTuple):
-    """A declaration that the versions do not share; `old` or `new` is None if only the other has it."""
+    """Declaration that differs between the versions; `old` or `new` is None if that version lacks it."""
 
     kind: DeclarationKind
     name: str
@@ -130,17 +130,17 @@ class _Statement(NamedTuple):
 
 
 _Key: TypeAlias = tuple[str, str]
-"""The word that a statement begins with, and the name that it declares."""
+"""First word of a statement, and the name that it declares."""
 
 
 class TextVersions:
-    """Two versions of a text, and what lies between them: some declarations of one put into the other.
+    """Two versions of a text, and mixed versions with some declarations exchanged.
 
-    Holds what was parsed, for one diff.
+    Parsed versions are cached for one diff.
 
     Attributes:
-        old, new: the specifications, with numbers instead of their names.
-        changes: the declarations that differ by more than blanks and comments; of very many, the first.
+        old, new: specifications with numbers instead of the names of enumerated values.
+        changes: declarations that differ by more than blanks and comments; only the first of very many.
     """
 
     def __init__(self, old: Specification, new: Specification, units: Mapping[str, str]) -> None:
@@ -148,7 +148,7 @@ class TextVersions:
         self.old, self.new = with_numbers(old, units), with_numbers(new, units)
         self._statements = statements_of(old), statements_of(new)
         old_statements, new_statements = self._statements
-        # specs are compared node by node
+        # specs are left out, because they are compared node by node
         keys = [key for key in dict.fromkeys((*old_statements, *new_statements)) if key[0] != "SPEC"]
         self._keys = [key for key in keys if _words(old_statements, key) != _words(new_statements, key)][
             :_MOST_CHANGES
@@ -162,15 +162,16 @@ class TextVersions:
         self._known: dict[tuple[bool, frozenset[int]], Specification | None] = {}
 
     def version(self, changes: Collection[int], *, is_undone: bool) -> Specification | None:
-        """Return the old text with some declarations of the new one, by number; None if it has errors.
+        """Return the old text with some new declarations, parsed; None if it has errors.
 
         Args:
-            is_undone: return the new text with these of the old one instead.
+            changes: indices of the declarations in `changes`.
+            is_undone: whether the result is the new text with these old declarations instead.
         """
         version = is_undone, frozenset(changes)
         if version not in self._known:
             keys = [self._keys[number] for number in changes]
-            # what is exchanged may need declarations that only the other text has
+            # an exchanged declaration may need others that only its own text has
             texts = (self._exchange(keys, is_undone, is_strict) for is_strict in (True, False))
             versions = (self._parse(text, keys, is_undone) for text in texts)
             self._known[version] = next(
@@ -181,13 +182,13 @@ class TextVersions:
     def edited_lines(
         self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
     ) -> tuple[TextPlace | None, TextPlace | None]:
-        """Return a line that differs of the first of some specs that was edited, in either text.
+        """Return a changed line of the first edited spec, as its place in the old and in the new text.
 
-        None stands for a line that the other text does not have, or, twice, for no such spec.
+        A place is None if its text does not have the line. Both places are None if no spec was edited.
 
         Args:
-            specs: their names in the old text and in the new one.
-            spans: of several lines that differ, that of either of these is looked for.
+            specs: names of each spec in the old and in the new text.
+            spans: preferred places in the old and in the new text, if several lines changed.
         """
         for names in specs:
             statements = [of.get(("SPEC", name)) for of, name in zip(self._statements, names, strict=True)]
@@ -235,14 +236,14 @@ class TextVersions:
             version = parse_specification(text, filename=file.filename, profile=profile)
             atoms = (atom for spec in version.specs for atom in iter_atoms(spec.formula))
             signals = {name for atom in atoms for name in signals_in(atom.expression)}
-            # a constant that only the other text declares is no signal
+            # without its declaration, a constant of the other text is parsed as a signal
             if not any(word == "CONST" and name in signals for word, name in self._keys):
                 return with_numbers(version, self._units)
         return None
 
 
 class _Line(NamedTuple):
-    """A line of a statement; wanted is that of a certain place."""
+    """Line of a statement; `is_wanted` marks the line with the preferred place."""
 
     place: TextPlace
     is_wanted: bool
@@ -261,7 +262,7 @@ def _lines_of(file: Specification, statement: Span, span: Span | None) -> list[_
 def _edited_places(
     block: tuple[Sequence[_Line], Sequence[_Line]],
 ) -> tuple[TextPlace | None, TextPlace | None]:
-    """Return the wanted line of either text, or else the one as far down as that of the other."""
+    """Return the preferred line of each text, or else its line at the same position in the block."""
     wanted_lines = [number for lines in block for number, line in enumerate(lines) if line.is_wanted]
     old, new = (
         next((line.place for line in lines if line.is_wanted), None)
@@ -272,7 +273,7 @@ def _edited_places(
 
 
 def statements_of(file: Specification) -> dict[_Key, _Statement]:
-    """Return the statements of a specification's text by what they declare."""
+    """Return the statements of a specification's text by first word and declared name."""
     source = SourceText.of(file.source, file.filename)
     faults = Faults(source)
     statements: dict[_Key, _Statement] = {}
@@ -289,7 +290,7 @@ def statements_of(file: Specification) -> dict[_Key, _Statement]:
 
 
 def _on_one_line(source: str, tokens: Sequence[Token]) -> str:
-    """Return a statement as written, but for ends of lines and comments within it."""
+    """Return the text of a statement without line breaks and comments."""
     pieces: list[str] = []
     at = span_of(tokens[0]).start
     for token in tokens:
@@ -315,24 +316,28 @@ def _text(file: Specification, span: Span) -> str:
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
 ]
-"""Kinds of edits: a number, a named shape or group, the meaning of a macro or relation (`def`, profile,
-`scale`), the node itself, one operand of a conjunction or disjunction, only its place or its name."""
+"""Kinds of edits.
+
+A "constant" is a number or a window. A "region" or "group" is a declaration. A "definition" changes the
+meaning of a macro or relation (`def`, profile, `scale`). A node is "replaced"; an operand of a conjunction or
+disjunction is "added" or "removed". An edit of the place alone is "moved", of the name alone "renamed".
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """One edit of a formula, wherever it occurs in it.
+    """One edit of a formula with all its occurrences.
 
     Attributes:
-        spec: the innermost named spec that it is in.
+        spec: innermost named spec that contains the edit.
         old, new: canonical text of the node before and after; None if it was added or removed.
         old_nodes, new_nodes: ids of the nodes in the two trees.
-        old_span, new_span: the place of the first of them in the two texts.
-        depth: of the deepest of them, from 0 at the root.
-        subject: the constant, region, group or macro whose declaration was edited, if it was one.
-        change: that declaration in both texts; None if the text of a spec was edited.
-        old_specs, new_specs: the specs whose text may have been edited, the innermost first, by their names
-            in both texts; of what was moved, where it was and where it is.
+        old_span, new_span: place of the first node in each text.
+        depth: depth of the deepest node; the root has depth 0.
+        subject: name of the edited constant, region, group or macro; None for other edits.
+        change: edited declaration in both texts; None if the text of a spec was edited.
+        old_specs, new_specs: specs whose text may have been edited, innermost first, each with its names in
+            both texts. For a move, these are the specs of the old place and of the new place.
     """
 
     kind: EditKind
@@ -368,11 +373,11 @@ class Edit:
 
 
 class Origin(NamedTuple):
-    """The nodes of two trees that follow from one edit of their texts.
+    """Nodes of two trees that depend on one edit of their texts.
 
     Attributes:
-        change: the declaration that was edited; None for the text of the specs themselves.
-        old, new: ids of the nodes.
+        change: edited declaration; None for the text of the specs.
+        old, new: ids of the nodes in each tree.
     """
 
     change: DeclarationChange | None
@@ -382,7 +387,7 @@ class Origin(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A node with its id, the names of the specs that it is in, the innermost first, and its depth."""
+    """Node with its id, the names of its specs, innermost first, and its depth."""
 
     node: Formula
     id: int
@@ -391,12 +396,12 @@ class Place:
 
     @property
     def around(self) -> tuple[str, ...]:
-        """The specs whose text has the node: not the one that it is itself, by name."""
+        """Names of the specs whose text contains the node; a named node is not in its own spec."""
         return self.specs if self.node.name is None else self.specs[1:] or self.specs
 
     @property
     def operands(self) -> list[Place]:
-        """The nodes below, through specs that only repeat another."""
+        """Places of the operands of the node."""
         places, identifier = [], self.id + 1
         for operand in operands_of(self.node):
             specs = self.specs if operand.name is None else (operand.name, *self.specs)
@@ -405,10 +410,10 @@ class Place:
         return places
 
     def members(self, operator: str, *, through_names: bool = False) -> list[Place]:
-        """The operands of a conjunction or disjunction, and in place of those that are one, too, theirs.
+        """Return the operands of a conjunction or disjunction; nested ones are replaced by their operands.
 
         Args:
-            through_names: look into specs, too.
+            through_names: whether named specs are replaced by their operands, too.
         """
         places: list[Place] = []
         for place in self.operands:
@@ -419,7 +424,7 @@ class Place:
 
     @property
     def bare(self) -> Place:
-        """The node itself, or what it only repeats under another name."""
+        """The node; a spec that only repeats another spec is replaced by that one."""
         place = self
         while isinstance(place.node, Boolean) and place.node.operator == "spec":
             place = place.operands[0]
@@ -427,7 +432,7 @@ class Place:
 
 
 class FoundSite(NamedTuple):
-    """A place where the trees differ, with what was edited there; `parts` are those within a quantifier."""
+    """Place where the trees differ, with its kind of edit; `parts` are differences within a quantifier."""
 
     kind: EditKind
     old: Place | None
@@ -437,7 +442,7 @@ class FoundSite(NamedTuple):
 
     @property
     def ids(self) -> tuple[range, range]:
-        """The ids of the nodes that differ; of those with another window or name, only their own."""
+        """The ids of the nodes that differ; after a change of window or name, operands are left out."""
         is_window = self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
         is_alone = self.kind == "renamed" or is_window
         old, new = (
@@ -447,7 +452,7 @@ class FoundSite(NamedTuple):
         return old, new
 
     def follows_from(self, origin: Origin) -> bool:
-        """Say whether an edit of the texts changed it."""
+        """Return whether the difference depends on an edit of the texts."""
         return self.kind != "renamed" and not (
             origin.old.isdisjoint(self.ids[0]) and origin.new.isdisjoint(self.ids[1])
         )
@@ -459,7 +464,7 @@ def _size(formula: Formula) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A place where the trees differ, by its number."""
+    """Place where the trees differ, by its index."""
 
     site: int
     old: Formula | None
@@ -468,7 +473,7 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Inner:
-    """A node of both trees with operands that differ, or, if `site` is given, with another window."""
+    """Node of both trees whose operands may differ; if `site` is given, its window differs, too."""
 
     site: int | None
     old: Boolean | Temporal
@@ -481,10 +486,10 @@ Merged: TypeAlias = "Formula | Site | Inner"
 
 @dataclass(frozen=True, eq=False)
 class TreeDiff:
-    """The edits between two formulas; none if they mean the same under the same names.
+    """Edits between two formulas; empty if their meaning and names are the same.
 
     Attributes:
-        units: edits that the tree can only show together: one, or declarations that share a node.
+        units: groups of edits that can only be applied together: one edit, or all that share a node.
     """
 
     units: tuple[tuple[Edit, ...], ...]
@@ -498,11 +503,11 @@ class TreeDiff:
 
     @property
     def effective(self) -> tuple[int, ...]:
-        """The numbers of the units that change what the formula means: all but new names."""
+        """The indices of the units that change the meaning of the formula; renames do not."""
         return tuple(number for number, unit in enumerate(self.units) if unit[0].kind != "renamed")
 
     def formula(self, units: Collection[int]) -> Formula:
-        """Return the old formula with only these of the units made, by number."""
+        """Return the old formula with only some units of edits applied, by index."""
         sites = frozenset(site for site, unit in self._unit_of_site.items() if unit in units)
         built = _build(self._merged, sites)
         return Truth(True) if built is None else built
@@ -523,7 +528,7 @@ def _build(merged: Merged, chosen: frozenset[int]) -> Formula | None:
 
 
 def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
-    """Return what of a node was edited, and the region or group if that is it."""
+    """Return the kind of edit of a node, and the name of an edited region or group."""
     if isinstance(old, Atom) and isinstance(new, Atom) and old.relation == new.relation:
         if old.text == new.text:
             for old_term, new_term in zip(iter_terms([old]), iter_terms([new]), strict=False):
@@ -541,7 +546,7 @@ def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
 
 def _without_numbers(atom: Atom) -> Hashable:
     texts = tuple(parameter for parameter in atom.parameters if isinstance(parameter, str))
-    # the number of a signal's comparison is a text too: NAME, comparison, number
+    # a signal's comparison has the parameters name, sign and limit; the limit can be a text, too
     texts = texts[:2] if atom.relation == "signal" else texts
     if atom.relation == "sum":
         zero = Number(0.0)
@@ -550,7 +555,7 @@ def _without_numbers(atom: Atom) -> Hashable:
 
 
 def similarity(old: Formula, new: Formula) -> float:
-    """Return how much of what two nodes are about is the same, 0 to 1."""
+    """Return the fraction of common terms and signals of two nodes, 0 to 1."""
     old_subjects, new_subjects = _subjects(old), _subjects(new)
     return (old_subjects & new_subjects).total() / max((old_subjects | new_subjects).total(), 1)
 
@@ -574,9 +579,9 @@ def compare_trees(
     """Compare two formulas over the same regions (see `unify_regions`).
 
     Args:
-        name: what the formulas are called.
-        origins: the edits of the two texts that nodes follow from; without them, each node has its own.
-        specs: the names of all specs of the two texts.
+        name: name of the formulas.
+        origins: edits of the texts with the nodes that depend on them; other nodes have their own edits.
+        specs: names of all specs in the old and in the new text.
     """
     comparison = _Comparison(regions, specs)
     merged = comparison.align(Place(old, 0, (name,), 0), Place(new, 0, (name,), 0))
@@ -584,7 +589,7 @@ def compare_trees(
 
 
 def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) -> frozenset[int]:
-    """Return the ids of the nodes of a new formula that differ from an old one, and of those within them."""
+    """Return the ids of the nodes of a new formula that differ from an old one, descendants included."""
     comparison = _Comparison(regions)
     comparison.align(Place(old, 0, ("",), 0), Place(new, 0, ("",), 0))
     sites = [site for site in comparison.sites if site.kind != "renamed"]
@@ -592,7 +597,7 @@ def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) ->
 
 
 class _Comparison:
-    """Aligns two trees; numbers meanings, so that equal ones are found at once."""
+    """Alignment of two trees; meanings are numbered, so that equal nodes are found quickly."""
 
     def __init__(
         self, regions: Mapping[str, Outline], specs: tuple[Collection[str], Collection[str]] = ((), ())
@@ -607,7 +612,10 @@ class _Comparison:
         self.sites: list[FoundSite] = []
 
     def meaning(self, node: Formula) -> int:
-        """Return a number that nodes of equal meaning share: names and the order of operands do not count."""
+        """Return a number that is the same for nodes of equal meaning.
+
+        Names, and the order of operands of commutative operators, do not matter.
+        """
         entry = self._known.get(id(node))
         if entry is None:
             entry = self._known[id(node)] = (node, self._meaning(node))
@@ -626,7 +634,7 @@ class _Comparison:
             case Boolean(operator="spec"):
                 return self.meaning(node.operands[0])
             case Boolean(operator="and" | "or" as operator):
-                # brackets around some of the operands mean nothing
+                # brackets around operands of the same operator do not change the meaning
                 members = Place(node, 0, ("",), 0).members(operator, through_names=True)
                 key = (operator, tuple(sorted(self.meaning(member.node) for member in members)))
             case Boolean(operator="xor" | "<->"):
@@ -638,12 +646,12 @@ class _Comparison:
         return self._numbers.setdefault(key, len(self._numbers))
 
     def align(self, old: Place, new: Place) -> Merged:
-        """Compare two nodes that stand in for each other."""
+        """Compare two corresponding nodes."""
         names = old.node.name, new.node.name
         is_renamed = names[0] != names[1] and None not in names
         is_equal = self.meaning(old.node) == self.meaning(new.node)
         if is_renamed and not is_equal and (names[0] in self._specs[1] or names[1] in self._specs[0]):
-            # another spec stands there, and neither was edited
+            # the reference changed to another spec; neither spec was edited
             return self._site(FoundSite("replaced", old, new))
         if is_renamed:
             self._renamed.add(names)
@@ -675,7 +683,7 @@ class _Comparison:
         return self._site(FoundSite(kind, old, new, subject))
 
     def _parts(self, old: Place, new: Place) -> tuple[FoundSite, ...]:
-        """Return where the bodies of two quantifiers differ, which are evaluated as one."""
+        """Return the differences of two quantifiers' bodies, each of which is evaluated as one node."""
         count = len(self.sites)
         bodies = [
             Place(place.node.body, place.id, place.specs, place.depth + 1)
@@ -692,7 +700,7 @@ class _Comparison:
         return tuple(site._replace(old=inside(site.old, old), new=inside(site.new, new)) for site in parts)
 
     def join_sites(self, merged: Merged, origins: Sequence[Origin]) -> TreeDiff:
-        """Join the sites of one edit, wherever they occur, and return the edits."""
+        """Join the sites of each edit, and return the edits."""
         declared = [origin for origin in origins if origin.change is not None]
         shared: list[tuple[set[int], list[int]]] = []
         rest: list[int] = []
@@ -701,7 +709,7 @@ class _Comparison:
             if not followed:
                 rest.append(number)
                 continue
-            # declarations that share a node are edited together
+            # declarations that share a node form one unit
             joined = [unit for unit in shared if unit[0] & followed]
             shared = [unit for unit in shared if not unit[0] & followed]
             shared.append(
@@ -726,7 +734,7 @@ class _Comparison:
         )
 
     def _join(self, sites: Sequence[FoundSite]) -> Iterable[list[int]]:
-        """Join places that follow from one edit of the text of the specs, by number."""
+        """Return the indices of sites, grouped by the edit of the specs' text that they depend on."""
         removed, added = (
             {
                 self.meaning(place.node)
@@ -752,7 +760,7 @@ class _Comparison:
         return joined.values()
 
     def _specs_of(self, old: Place | None, new: Place | None) -> tuple[tuple[str, str], ...]:
-        """Return the specs that have the two places in their text, innermost first, by both names."""
+        """Return the specs whose text contains both places, innermost first, by old and new name."""
         if old is None or new is None:
             return tuple((name, name) for place in (old, new) if place is not None for name in place.around)
         pairs = [(old_name, new_name) for new_name in new.specs for old_name in old.specs]
@@ -761,7 +769,7 @@ class _Comparison:
     def _unit(
         self, sites: Sequence[int], declared: Sequence[Origin], text: Sequence[Origin]
     ) -> Iterator[Edit]:
-        """Yield the edits that sites follow from together: of each declaration, and of the specs' text."""
+        """Yield the edits of a unit: first those of declarations, then those of the specs' text."""
         unit_sites = [self.sites[site] for site in sites]
         for origin in declared:
             if origin.change is not None:
@@ -805,7 +813,7 @@ class _Comparison:
         return Site(len(self.sites) - 1, old, new)
 
     def _align_names(self, old: Place, new: Place) -> None:
-        """Note the nodes within equal ones that have other names."""
+        """Add a site for each renamed node within equal nodes."""
         for old_operand, new_operand in zip(old.operands, new.operands, strict=False):
             if self.meaning(old_operand.node) == self.meaning(new_operand.node):
                 if old_operand.node.name != new_operand.node.name and None not in (
@@ -822,7 +830,7 @@ class _Comparison:
         return any(self.meaning(place.node) == self.meaning(operand.node) for operand in operands)
 
     def _match(self, old_node: Any, olds: Sequence[Place], new_node: Any, news: Sequence[Place]) -> Inner:
-        """Match the operands of a conjunction or disjunction: equal ones, those of one name, similar ones."""
+        """Match the operands of a conjunction or disjunction: by meaning, then by name, then similar ones."""
         partner: dict[int, int] = {}
         matched_indices: set[int] = set()
 
@@ -851,7 +859,7 @@ class _Comparison:
 
 
 def _is_alike(old: Place, new: Place, least: float, *, by_operator: bool) -> bool:
-    """Say whether two nodes are about the same, of one operator or of any."""
+    """Return whether two nodes are similar enough, and on request whether they have the same operator."""
     old_node, new_node = old.bare.node, new.bare.node
     return (not by_operator or operator_of(old_node) == operator_of(new_node)) and similarity(
         old_node, new_node
@@ -859,7 +867,7 @@ def _is_alike(old: Place, new: Place, least: float, *, by_operator: bool) -> boo
 
 
 def _ranges_alike(old: Quantified, new: Quantified) -> bool:
-    """Say whether two quantifiers differ in their bodies alone."""
+    """Return whether two quantifiers differ only in their bodies."""
     return (old.quantifier, old.variables, old.group) == (new.quantifier, new.variables, new.group)
 
 
@@ -869,6 +877,6 @@ def _place_text(place: Place | None, kind: EditKind) -> str | None:
     if kind == "renamed":
         return place.node.name
     if kind == "constant" and isinstance(place.node, Temporal):
-        # the operands stay or have edits of their own
+        # the operands are unchanged, or have their own edits
         return f"{place.node.operator}{format_bound(place.node.bound)} …"
     return format_formula(place.node)

@@ -1,4 +1,4 @@
-"""Two runs: how their samples align, and which objects, signals, results and decisions differ since when."""
+"""Differences of two runs: their alignment, and the objects, signals, results and decisions that differ."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ AlignmentKind: TypeAlias = Literal["time", "event", "progress"]
 
 
 class Knot(NamedTuple):
-    """Two times, one in each run, that stand beside each other."""
+    """Two corresponding times, one in each run."""
 
     a_ns: int
     b_ns: int
@@ -57,13 +57,14 @@ class Knot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How the samples of run A correspond to those of run B.
+    """Correspondence between the samples of run A and of run B.
 
     Attributes:
-        kind: by "time" since the zero of each log, by an "event", by the "progress" of an automaton.
-        about: what the event or the progress is of.
-        knots: at least one; between two, time runs evenly, and outside them as fast in both.
-        a, b: (P,) indices of the samples that stand beside each other, by time in A.
+        kind: "time" since the zero of each log, an "event", or the "progress" of an automaton.
+        about: spec of the event or of the automaton; None for "time".
+        knots: corresponding times, at least one pair. Between two knots times are interpolated linearly;
+            before the first and after the last one, time runs equally fast in both runs.
+        a, b: (P,), indices of corresponding samples, by time in A.
     """
 
     kind: AlignmentKind
@@ -79,11 +80,11 @@ class Alignment:
 
 
 class Parting(NamedTuple):
-    """Where the paths of two runs through one automaton part: the first states that differ.
+    """Divergence of two runs in one automaton: their first states that differ.
 
     Attributes:
-        a_ns, b_ns: when each run enters its own; None if it ends before.
-        a_states, b_states: these states; () if the run ends before.
+        a_ns, b_ns: time at which each run enters its differing states; None if it ends before.
+        a_states, b_states: differing states of each run; () if it ends before.
     """
 
     a_ns: int | None
@@ -102,14 +103,14 @@ def align_runs(
     """Align two runs.
 
     Args:
-        times_ns: of the samples of A and of B, at least one each.
-        zeros_ns: the times that texts about A and B count from.
-        results: of both runs, in pairs.
+        times_ns: times of the samples of A and of B, at least one each.
+        zeros_ns: times of A and B that texts count from.
+        results: pairs of results of both runs.
         align: "time", "progress", "progress:NAME", or the name of a spec, whose first change of sign is the
             event.
 
     Raises:
-        UsageError: no such spec, a spec that never changes its sign, no result with an automaton.
+        UsageError: an unknown spec, a spec that never changes its sign, or no result with an automaton.
     """
     a, b = times_ns
     if align == "time":
@@ -137,7 +138,7 @@ def align_runs(
             f"{name + ' has no' if name else 'no spec has an'} automaton to align by (past operators and "
             "bounds in seconds have none); align by time, or by a spec's name"
         )
-    # without temporal operators, an automaton ends where it begins
+    # the most knots win: the automaton of a formula without temporal operators gives hardly any
     name, knots = max(candidates, key=lambda candidate: len(candidate[1]))
     return _alignment("progress", name, knots, a, b)
 
@@ -145,7 +146,11 @@ def align_runs(
 def _find_pairs(
     results: Sequence[tuple[SpecResult, SpecResult]], wanted: str
 ) -> list[tuple[SpecResult, SpecResult]]:
-    """Return the pair of results of a name or title."""
+    """Return the pairs of results with a name or title.
+
+    Raises:
+        UsageError: no result has the name.
+    """
     pairs = [pair for pair in results if wanted in (pair[0].title, pair[0].name)]
     if not pairs:
         titles = [result.title for result, _ in results]
@@ -155,7 +160,7 @@ def _find_pairs(
 
 
 def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification]) -> Parting | None:
-    """Return where two runs of one spec part in its automaton; None if they do not, or it has none."""
+    """Return the divergence of two runs in the automaton of a spec; None without one."""
     paths = [_path(result, files) for result in (one, other)]
     if paths[0] is None or paths[1] is None or paths[0] == paths[1]:
         return None
@@ -183,7 +188,7 @@ def _alignment(
     before = after - 1
     after = np.minimum(after, len(b_ns) - 1)
     nearest = np.where(beside_ns - b_ns[before] <= b_ns[after] - beside_ns, before, after)
-    # where one run has no sample within a step, there is nothing to compare with
+    # a sample of A has no counterpart if B has no sample within one step
     steps = [int(np.median(np.diff(times_ns))) for times_ns in (a_ns, b_ns) if len(times_ns) > 1]
     step_ns = max(steps, default=0)
     is_beyond = (beside_ns < b_ns[0]) | (beside_ns > b_ns[-1])
@@ -193,9 +198,9 @@ def _alignment(
 
 
 def _times_beside(a_ns: Integers, knots: Sequence[Knot]) -> Integers:
-    """Return the times in B that stand beside times in A."""
+    """Return the times in B that correspond to times in A."""
     first, last = knots[0], knots[-1]
-    # relative to the first knot, so that doubles hold every nanosecond of a long log
+    # relative to the first knot, because floats are exact only up to 2**53 ns (104 days)
     x = np.array([knot.a_ns - first.a_ns for knot in knots], np.float64)
     y = np.array([knot.b_ns - first.b_ns for knot in knots], np.float64)
     inner = np.round(np.interp((a_ns - first.a_ns).astype(np.float64), x, y)).astype(np.int64) + first.b_ns
@@ -204,13 +209,17 @@ def _times_beside(a_ns: Integers, knots: Sequence[Knot]) -> Integers:
 
 
 def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
-    """Return the times at which the value of a named spec first changes its sign in each run."""
+    """Return the times at which the value of a named spec first changes its sign in each run.
+
+    Raises:
+        UsageError: an unknown spec, or a spec that never changes its sign.
+    """
     names: list[str] = []
     for result_a, result_b in results:
         names += [node.name for node in result_a.nodes if node.name is not None]
         if name not in names:
             continue
-        # the value of a spec without temporal operators is that of the first sample, and stays
+        # `value` of a spec without temporal operators is constant, so `now` is used if it never changes
         pairs = [
             [_first_change(result.times_ns, series(result.node(name))) for result in (result_a, result_b)]
             for series in (attrgetter("value"), attrgetter("now"))
@@ -235,14 +244,14 @@ def _first_change(times_ns: Integers, values: Floats) -> int | None:
 
 
 class _Visit(NamedTuple):
-    """States of an automaton, and the first sample after which a run is in them."""
+    """States of an automaton, with the time of the first sample after which a run is in them."""
 
     time_ns: int
     states: tuple[int, ...]
 
 
 def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | None:
-    """Return the states of a run, each as often as it is entered; None without an automaton."""
+    """Return the states that a run enters, in order; None without an automaton."""
     if result.leaves is None or not len(result.times_ns) or result.semantics != "ltlf":
         return None
     file = file_of(files, result)
@@ -264,17 +273,17 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
 
 
 def file_of(files: Sequence[Specification], result: SpecResult) -> Specification | None:
-    """Return the file that a result comes from; None if it is another one."""
+    """Return the specification of a result; None if it is not in `files`."""
     as_evaluated = [with_numbers(file, result.evidence.units) for file in files]
     pairs = [(file, spec.formula) for file in as_evaluated for spec in file.specs]
     same = (file for file, formula in pairs if formula is result.formula)
-    # one that was parsed by another profile is evaluated as it is logged: equal, and another object
+    # a specification parsed by another profile is evaluated in its logged form, an equal but different object
     equal = (file for file, formula in pairs if formula == result.formula)
     return next(same, None) or next(equal, None)
 
 
 def _common(one: Sequence[_Visit], other: Sequence[_Visit]) -> int:
-    """Count the states that two paths begin with."""
+    """Return the number of common states at the beginning of two paths."""
     pairs = zip(one, other, strict=False)
     return next(
         (index for index, (a, b) in enumerate(pairs) if a.states != b.states), min(len(one), len(other))
@@ -282,20 +291,20 @@ def _common(one: Sequence[_Visit], other: Sequence[_Visit]) -> int:
 
 
 _PAIRS_AT_ONCE: Final = 16_384
-"""Observations that are compared at once: few enough for the processor's cache."""
+"""Observations in one comparison, few enough for the cache of the processor."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectDiff:
-    """One object in two aligned runs.
+    """Difference of one object between two aligned runs; times are those of samples of A.
 
     Attributes:
-        first_ns: the first sample of A in which it is not just where, or as, it is in B.
-        apart_ns: the first one in which the two footprints do not touch; None if they always do.
-        greatest_distance: the greatest signed distance between the two footprints, at `greatest_ns`; NaN
-            where none was measured.
-        greatest_shift: how far its vertices' mean is away at most.
-        samples_only_in_a, samples_only_in_b: in how many pairs of samples only one run has it.
+        first_ns: first time at which the object differs in position, shape or another property.
+        apart_ns: first time at which its two footprints do not touch; None if they always touch.
+        greatest_distance: greatest signed distance between its two footprints; NaN without a measurement.
+        greatest_ns: time of the greatest distance, or `first_ns` without a measurement.
+        greatest_shift: greatest displacement of the mean of its vertices.
+        samples_only_in_a, samples_only_in_b: number of pairs of samples in which only one run has the object.
     """
 
     name: str
@@ -310,12 +319,13 @@ class ObjectDiff:
 
 @dataclass(frozen=True, slots=True)
 class SignalDiff:
-    """One signal in two aligned runs.
+    """Difference of one signal between two aligned runs; times are those of samples of A.
 
     Attributes:
-        first_ns: the first sample of A in which its value is not that in B.
-        greatest_difference: that of two known numbers, at `greatest_ns`; NaN where there are none.
-        ratio: how many times as large the median of its magnitudes is in B; NaN if one of them is 0.
+        first_ns: first time with different values.
+        greatest_difference: greatest difference of two known numbers; NaN if there are none.
+        greatest_ns: time of the greatest difference, or `first_ns` without numbers.
+        ratio: median magnitude in B divided by that in A; NaN if one of them is 0.
     """
 
     name: str
@@ -326,12 +336,12 @@ class SignalDiff:
 
     @property
     def has_other_unit(self) -> bool:
-        """Whether it seems to be in another unit in B: percent instead of parts, millimetres for metres."""
+        """Whether the unit seems to be another one in B, such as millimetres instead of metres."""
         return self.ratio >= OTHER_UNITS or self.ratio <= 1.0 / OTHER_UNITS
 
 
 def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDiff, ...]:
-    """Return the common signals with other values."""
+    """Return the differences of common signals."""
     times_ns = a.times_ns[alignment.a]
     diffs = []
     for name in sorted(set(a.signals) & set(b.signals)):
@@ -339,7 +349,7 @@ def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDif
         differs = (values_a != values_b) & ~(np.isnan(values_a) & np.isnan(values_b))
         if not differs.any():
             continue
-        # texts are not apart by an amount
+        # two texts have no numeric difference
         numeric = np.flatnonzero((values_a > TEXTS) & (values_b > TEXTS))
         apart = np.abs(values_b - values_a)
         farthest = int(numeric[apart[numeric].argmax()]) if len(numeric) else None
@@ -360,10 +370,10 @@ def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDif
 
 
 def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDiff, ...]:
-    """Return the common objects that moved differently: those apart first come first, then the farthest.
+    """Return the differences of common objects, sorted by `apart_ns` and then by greatest displacement.
 
     Raises:
-        UsageError: no object is in both runs, or one run is in another unit.
+        UsageError: the runs have no common object, or different units.
     """
     names = sorted(set(a.names) & set(b.names))
     if not names and (a.names or b.names):
@@ -418,11 +428,11 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
 
 
 def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tuple[Booleans, Floats, Floats]:
-    """Compare observations in pairs.
+    """Compare pairs of observations.
 
     Returns:
-        Which differ, the squared shift of their vertices' mean, and the signed distance of the two
-        footprints; NaN for those that do not differ.
+        For each pair: whether it differs, the squared displacement of the mean of the vertices, and the
+        signed distance of the footprints, which is NaN without a difference.
     """
     first, second = a.footprints.select(a_rows), b.footprints.select(b_rows)
     moved = ~_are_equal(first, second)
@@ -430,7 +440,7 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
     columns += [(a.yaw[a_rows], b.yaw[b_rows]), (a.uncertainty[a_rows], b.uncertainty[b_rows])]
     for value, beside in columns:
         moved |= (value != beside) & ~(np.isnan(value) & np.isnan(beside))
-    # relative to one vertex, so that coordinates far from the origin do not cancel
+    # relative to one vertex, because means of coordinates far from the origin lose digits when subtracted
     corner = first.vertices[first.vertex_start[first.part_start[:-1]]]
     x, y = _mean_vertices(second, corner) - _mean_vertices(first, corner)
     distance = np.full(len(a_rows), np.nan)
@@ -441,7 +451,7 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
 
 
 def _are_equal(first: FootprintBatch, second: FootprintBatch) -> Booleans:
-    """Return which rows have the same parts."""
+    """Return whether each row has the same parts in both batches."""
     sizes = [
         (np.diff(batch.part_start), np.diff(batch.vertex_start[batch.part_start]))
         for batch in (first, second)
@@ -457,7 +467,7 @@ def _are_equal(first: FootprintBatch, second: FootprintBatch) -> Booleans:
 
 
 def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
-    """Return the mean of each row's vertices, (2, R), relative to a point of its own."""
+    """Return the mean of each row's vertices relative to the origin of the row, (2, R)."""
     counts = np.diff(batch.vertex_start[batch.part_start])
     rows = np.repeat(np.arange(len(batch)), counts)
     sums = [np.bincount(rows, coordinates, len(batch)) for coordinates in (batch.vertices - origin[rows]).T]
@@ -465,7 +475,7 @@ def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
 
 
 def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
-    """Return since when an object moved differently, and how far the two are apart."""
+    """Return a sentence on the first difference of an object and its greatest distance."""
     parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
     if diff.greatest_shift:
         parts.append(f", by up to {with_unit(diff.greatest_shift, unit)}")
@@ -480,7 +490,7 @@ def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
 
 
 def _signal_sentence(diff: SignalDiff, start_ns: int, unit: str) -> Sentence:
-    """Return since when a signal has other values, by how much, and whether its unit may be another."""
+    """Return a sentence on the first and the greatest difference of a signal, and on its unit."""
     parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
     greatest = diff.greatest_difference
     if greatest > 0.0 and not names_from_unit(unit):
@@ -493,14 +503,15 @@ def _signal_sentence(diff: SignalDiff, start_ns: int, unit: str) -> Sentence:
 
 @dataclass(frozen=True, eq=False)
 class RunSpecDiff:
-    """One result in two runs.
+    """Difference of one result between two runs.
 
     Attributes:
-        a, b: the results.
-        first_ns: the first sample of A with a value of another sign than the one beside it in B, or None.
-        nodes: ids of the deepest nodes whose verdicts differ.
-        parting: where the runs part in its automaton; None if the verdict is the same, or it has none.
-        moved: the objects that the deciding atoms are about, as far as they moved differently.
+        a, b: results of both runs.
+        first_ns: time of the first sample of A whose value has another sign than in B, or None.
+        nodes: ids of the deepest nodes with different verdicts; for equal verdicts with different robustness,
+            the deciding node of A.
+        parting: divergence in the automaton; None for equal verdicts or without an automaton.
+        moved: differences of the objects that these nodes mention.
     """
 
     a: SpecResult
@@ -512,16 +523,16 @@ class RunSpecDiff:
 
     @property
     def is_flipped(self) -> bool:
-        """Whether the verdict differs."""
+        """Whether the verdicts differ."""
         return self.a.verdict is not self.b.verdict
 
     @property
     def is_different(self) -> bool:
-        """Whether the verdict or a final number differs."""
+        """Whether the verdicts or the final numbers differ."""
         return not EditOutcome.of(self.a).same_as(EditOutcome.of(self.b))
 
     def sentences(self, zeros_ns: tuple[int, int]) -> Iterator[Sentence]:
-        """Yield what differs; times of each run count from its own start."""
+        """Yield sentences on the differences; times of each run count from its zero."""
         yield Sentence(" | ".join(map(outcome_text, (self.a, self.b))) + difference_text(self.a, self.b))
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, zeros_ns[0]))
@@ -545,7 +556,7 @@ class RunSpecDiff:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The same as values for JSON."""
+        """The difference as values for JSON."""
         return {
             "name": self.a.name,
             "object": self.a.object,
@@ -570,7 +581,7 @@ def compare_results(
     """Compare the results of one spec in two aligned runs.
 
     Args:
-        objects: those that moved differently.
+        objects: differences of objects.
     """
     moved = {diff.name: diff for diff in objects}
     nodes = _deepest_flips(one, other)
@@ -588,7 +599,7 @@ def compare_results(
 
 
 def _deepest_flips(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
-    """Return the nodes with other verdicts that have no such node below."""
+    """Return the deepest nodes with different verdicts; none if the root has the same verdict."""
     flipped = {
         node.id
         for node, beside in zip(one.nodes, other.nodes, strict=True)
@@ -597,7 +608,7 @@ def _deepest_flips(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
     if 0 not in flipped:
         return ()
     below = {one.nodes[node].parent for node in flipped}
-    # of a conjunction only what brought it about: the way down from the root is flipped, too
+    # a node counts only if all nodes from the root down to it have different verdicts
     reached = {0}
     for node in sorted(flipped):
         if one.nodes[node].parent in reached:
@@ -618,7 +629,7 @@ def _objects_of(result: SpecResult, node: int) -> frozenset[str]:
 def _first_sign(
     one: SpecResult, other: SpecResult, alignment: Alignment, traces: tuple[Trace, Trace]
 ) -> int | None:
-    """Return the first sample with a value of another sign than the one beside it."""
+    """Return the time of the first sample whose value has another sign than its counterpart."""
     signs = []
     for result, trace, samples in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
         value = np.full(len(trace), np.nan)
@@ -635,13 +646,13 @@ def _entry_parts(time_ns: int | None, states: Sequence[int], start_ns: int) -> t
 
 
 class DecisionDiff(NamedTuple):
-    """The first decision of two planned runs that differs.
+    """First decision that differs between two planned runs.
 
     Attributes:
-        number: of the decision, from 0.
-        a, b: the decisions in words, or that there is none.
-        a_ns, b_ns: when they were made.
-        maps: the objects whose gradient maps differ.
+        number: index of the decision.
+        a, b: decision of each run in words; a missing decision is stated.
+        a_ns, b_ns: times of the decisions; None for a missing decision.
+        maps: names of the objects with different gradient maps.
     """
 
     number: int
@@ -652,7 +663,7 @@ class DecisionDiff(NamedTuple):
     maps: tuple[str, ...]
 
     def lines(self) -> Iterator[str]:
-        """Yield both decisions and what differs."""
+        """Yield both decisions, and the objects with different maps, as lines of text."""
         yield f"A: {self.a}"
         yield f"B: {self.b}"
         if self.maps:
@@ -660,7 +671,7 @@ class DecisionDiff(NamedTuple):
 
 
 def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
-    """Return the first decision that differs, or None; of logs that were not planned, None."""
+    """Return the first decision that differs; None if there is none, or if no log was planned."""
     decisions: list[tuple[PlanDecision, ...]] = []
     for source in sources:
         path = source.path
@@ -683,7 +694,7 @@ def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
 
 
 def _bytes_to_compare(decision: PlanDecision | None) -> bytes | None:
-    """Return what of a decision counts: what is to be done and why, not when it was made or how it went."""
+    """Return the comparable part of a decision: action and reason, without time and outcome."""
     if decision is None:
         return None
     copy = PlanDecision.FromString(decision.SerializeToString())
@@ -713,23 +724,23 @@ _MOST_LISTED: Final = 12
 
 @dataclass(frozen=True, eq=False)
 class LogDiff(Printed, Displayed):
-    """Two runs side by side.
+    """Differences between two runs.
 
     Attributes:
-        a, b: the names of the logs.
-        samples: how many each has, where they were compared.
-        zeros_ns: the times that sentences count from: of the first sample of each log.
-        alignment: how samples correspond.
-        objects: those that moved differently, the first apart first.
-        signals: those with other values, in the order of their names.
-        only_a, only_b: objects and signals that one run never has, and results of templates for them.
-        specs: results of both runs.
-        decision: the first decision that differs; None if none does, or the runs were not planned.
+        a, b: names of the logs.
+        samples: number of compared samples of each log.
+        zeros_ns: times that sentences count from, one of each log.
+        alignment: correspondence of the samples.
+        objects: differences of objects, the first ones apart first.
+        signals: differences of signals, in the order of their names.
+        only_a, only_b: objects, signals and results of templates that only one run has.
+        specs: differences of results.
+        decision: first decision that differs; None if there is none, or if no run was planned.
         has_equal_samples: whether all samples are equal.
-        faults: what was lost while reading.
+        faults: sentences on data that was lost while reading.
         doubts: remarks on assumptions that a log contradicts.
         missing: a warning for each name in the specifications that a log never has.
-        traces: the samples.
+        traces: samples of both runs.
     """
 
     a: str
@@ -751,23 +762,23 @@ class LogDiff(Printed, Displayed):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing differs: no sample, no result, no decision."""
+        """Whether samples, results and decisions are equal."""
         return self.has_equal_samples and self.decision is None
 
     @property
     def movements(self) -> list[Sentence]:
-        """Sentences on `objects`."""
+        """A sentence for each of `objects`."""
         unit = self.traces[0].units.get("", "")
         return [_movement_sentence(diff, self.zeros_ns[0], unit) for diff in self.objects]
 
     @property
     def signal_changes(self) -> list[Sentence]:
-        """Sentences on `signals`."""
+        """A sentence for each of `signals`."""
         units = self.traces[0].units
         return [_signal_sentence(diff, self.zeros_ns[0], units.get(diff.name, "")) for diff in self.signals]
 
     def lines(self) -> Iterator[str]:
-        """Yield the diff as text, as the command `diff` prints it."""
+        """Yield the lines of text that the command `diff` prints."""
         yield f"A {self.a} | B {self.b}"
         if self.is_empty:
             yield f"  the same {plural(self.samples[0], 'sample')}"
@@ -795,7 +806,7 @@ class LogDiff(Printed, Displayed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """The diff as values for JSON."""
+        """The differences as values for JSON."""
         return {
             "a": self.a,
             "b": self.b,
@@ -827,19 +838,20 @@ def diff_sources(
     align: str = "time",
     advance: Callable[[int], None] = lambda samples: None,
 ) -> LogDiff:
-    """Compare two logs by all of their samples.
+    """Compare two logs sample by sample.
 
     Args:
-        options: how each log is evaluated.
-        align: "time" since the zero of each log, "progress" of the automaton with the most states in common,
-            or "progress:NAME" of a spec's automaton. The name of a spec aligns by its first change of sign in
+        options: options of the evaluation of each log.
+        align: "time" since the zero of each log, "progress" of the automaton with the most common states, or
+            "progress:NAME" of a spec's automaton. The name of a spec aligns by its first change of sign in
             each run.
-        advance: called with the number of samples of each block that is read.
+        advance: function that is called with the number of samples of each read block.
 
     Raises:
-        UsageError: no sample in a run, no common object, other units, nothing to align by.
+        UsageError: a run has no sample, the runs have no common object or different units, or there is
+            nothing to align by.
         LogError: a log cannot be read.
-        SpecificationError: names that a log never has, if names are strict.
+        SpecificationError: the specifications mention names that a log never has, if names are strict.
     """
     selections = [
         Selection(source, tuple(files), replace(reading, keep=()))

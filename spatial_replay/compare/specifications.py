@@ -48,11 +48,11 @@ from spatial_replay.text import (
 from spatial_replay.trace.trace import Trace
 
 _MOST_EVALUATIONS: Final = 256
-"""Formulas that are evaluated to find the cause of one change; the cause found by then stands."""
+"""Most formulas that are evaluated for the cause of one change; then the cause found so far is returned."""
 
 
 class EditOutcome(NamedTuple):
-    """The result of a formula on a finished log; the robustness is NaN if not determined."""
+    """Result of a formula on a finished log; the robustness is NaN if it is not determined."""
 
     verdict: Verdict
     robustness: float
@@ -64,7 +64,7 @@ class EditOutcome(NamedTuple):
         return cls(result.verdict, result.robustness, result.lower, result.upper)
 
     def same_as(self, other: EditOutcome, *, verdict_only: bool = False) -> bool:
-        """Say whether two outcomes have one verdict and, unless that is all that counts, the same numbers."""
+        """Return whether two outcomes have the same verdict and, unless `verdict_only`, the same numbers."""
         if verdict_only:
             return self.verdict is other.verdict
         pairs = zip(self[1:], other[1:], strict=True)
@@ -72,7 +72,7 @@ class EditOutcome(NamedTuple):
 
 
 class EditOutcomes:
-    """Numbers of the old formula with some of the edits, from atoms that are evaluated already."""
+    """Outcomes of the old formula with some of the edits, from atoms that are already evaluated."""
 
     def __init__(self, one: SpecResult, other: SpecResult, diff: TreeDiff) -> None:
         self._diff = diff
@@ -89,7 +89,7 @@ class EditOutcomes:
         self.count = 0
 
     def __call__(self, units: Sequence[int]) -> EditOutcome:
-        """Return the outcome of the old formula with only these units of edits made."""
+        """Return the outcome of the old formula with only some units of edits applied."""
         edited_units = frozenset(units)
         if edited_units not in self._known:
             self.count += 1
@@ -117,13 +117,13 @@ class EditOutcomes:
 def find_cause(
     diff: TreeDiff, outcome: Callable[[Sequence[int]], EditOutcome], old: EditOutcome, new: EditOutcome
 ) -> tuple[int, ...]:
-    """Return the units of edits that changed a verdict or, if that stayed, the numbers; deepest first.
+    """Return the units of edits that changed the verdict or, for equal verdicts, the numbers; deepest first.
 
-    Making only these gives the new verdict (numbers), making all the others the old one, and none of them can
-    be left out. A single one is looked for first, the deepest before others.
+    These units alone give the new outcome, and all other units alone give the old outcome. No unit can be
+    left out. Single units are tried first, the deepest ones before others.
 
     Args:
-        outcome: returns the outcome of the old formula with some of the units.
+        outcome: function that returns the outcome of the old formula with some units applied.
     """
     if old.same_as(new):
         return ()
@@ -148,9 +148,10 @@ def find_cause(
 
 
 def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Return some of the parts for which a condition, which holds for all of them, still holds.
+    """Return a subset of parts for which a condition holds; it must hold for all parts.
 
-    None of these can be left out alone (delta debugging: larger pieces are left out first).
+    No single part of the subset can be left out. The method is delta debugging, which removes larger pieces
+    first (Zeller and Hildebrandt 2002, https://doi.org/10.1109/32.988498).
     """
     current = list(parts)
     size = max(len(current) // 2, 1)
@@ -168,7 +169,7 @@ def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> li
 
 
 class FirstDifference(NamedTuple):
-    """The first sample with another value of a result, and both values (NaN: not determined)."""
+    """First sample with different values of a result, and both values; NaN is not determined."""
 
     time_ns: int
     old: float
@@ -177,16 +178,16 @@ class FirstDifference(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SpecDiff(Displayed):
-    """One spec before and after the edit, or one object's instance of a template.
+    """One spec, or the instance of a template for one object, before and after the edits.
 
     Attributes:
-        name: in the new file; `old_name` in the old one.
-        old, new: its results over the log.
-        tree: the edits between the two formulas, and what the old one becomes with some of them.
-        cause: the edits that changed the verdict or, if that stayed, the robustness; none if both stayed.
-            Making only these gives the new outcome, making all others the old one.
-        alone: for each edit of the cause, the outcome with that edit only; None if it cannot be made alone.
-        old_places, new_places: the declarations or lines that were edited in the two texts, by edit.
+        name, old_name: name in the new file and in the old file.
+        old, new: results over the log.
+        tree: edits between the two formulas; it can apply some of them to the old formula.
+        cause: edits that changed the verdict or, for equal verdicts, the robustness; empty if both are equal.
+            These edits alone give the new outcome, and all others alone give the old outcome.
+        alone: for each edit of the cause, the outcome with only this edit; None if it needs other edits.
+        old_places, new_places: edited declaration or line in each text, by edit.
     """
 
     name: str
@@ -201,7 +202,7 @@ class SpecDiff(Displayed):
 
     @property
     def edits(self) -> tuple[Edit, ...]:
-        """The edits between the two formulas, named specs within them included."""
+        """The edits between the two formulas, those in named specs included."""
         return self.tree.edits
 
     @property
@@ -216,7 +217,7 @@ class SpecDiff(Displayed):
 
     @cached_property
     def first(self) -> FirstDifference | None:
-        """The first sample with another value; None if there is none."""
+        """The first sample with different values; None if there is none."""
         if self.old.times_ns.shape != self.new.times_ns.shape:
             return None
         old_values, new_values = self.old.series[0, 0], self.new.series[0, 0]
@@ -228,15 +229,15 @@ class SpecDiff(Displayed):
 
     @property
     def title(self) -> str:
-        """Its name with the object that it is about, and its old name if that was another."""
+        """Name with the object of a template, and the old name if it was another."""
         title = self.name if self.old.object is None else f"{self.name}({self.old.object})"
         return title if self.name == self.old_name else f"{title} (was {self.old_name})"
 
     def sentences(self, first_ns: int, shown: Collection[DeclarationChange] = ()) -> Iterator[Sentence]:
-        """Yield what changed, one sentence each, with times counted from `first_ns`.
+        """Yield one sentence for each change; times count from `first_ns`.
 
         Args:
-            shown: declarations whose lines need not be repeated.
+            shown: declarations whose lines are not repeated.
         """
         outcomes = (self.old, self.new) if self.is_different else (self.old,)
         yield Sentence(" → ".join(map(outcome_text, outcomes)) + difference_text(self.old, self.new))
@@ -266,7 +267,7 @@ class SpecDiff(Displayed):
             yield Sentence(f"and {plural(len(others) - _MOST_LISTED, 'other edit')}")
 
     def _together(self) -> str:
-        """Say how the edits of a cause bring it about, if there are several."""
+        """Return a sentence on how several edits of a cause act together."""
         new = EditOutcome.of(self.new)
         enough = sum(
             outcome is not None and outcome.same_as(new, verdict_only=self.is_flipped)
@@ -289,7 +290,7 @@ class SpecDiff(Displayed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """The same as values for JSON."""
+        """The difference as values for JSON."""
         return {
             **json_fields(self, "name", "old_name"),
             "object": self.old.object,
@@ -317,7 +318,7 @@ class SpecDiff(Displayed):
 
 
 _MOST_LISTED: Final = 8
-"""Edits without effect that are listed; JSON has all."""
+"""Most edits without effect in the text; JSON lists all."""
 
 
 def outcome_text(result: SpecResult) -> str:
@@ -326,7 +327,7 @@ def outcome_text(result: SpecResult) -> str:
 
 
 def difference_text(first: SpecResult, second: SpecResult) -> str:
-    """Return ", the same", or by how much two outcomes differ whose texts are equal; "" for other texts."""
+    """Return ", the same" for equal outcomes, the difference if only their texts are equal, or ""."""
     outcomes = EditOutcome.of(first), EditOutcome.of(second)
     if outcomes[0].same_as(outcomes[1]):
         return ", the same"
@@ -339,14 +340,16 @@ def difference_text(first: SpecResult, second: SpecResult) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SpecificationDiff(Printed, Displayed):
-    """Two versions of a specification over one log.
+    """Differences between two versions of a specification over one log.
 
     Attributes:
-        old, new: the specifications.
-        specs: what both have, by the order of the new one: results of either, renamed ones included.
-        removed, added: names of results that only the old, or only the new one has.
-        first_ns: the time that sentences count from.
-        faults: what was lost while reading.
+        log: name of the log.
+        samples: number of evaluated samples.
+        first_ns: time that sentences count from.
+        old, new: specifications.
+        specs: specs of both versions that are results in either, renamed ones included, in the new order.
+        removed, added: names of results that only the old or only the new version has.
+        faults: sentences on data that was lost while reading.
         doubts: remarks on assumptions that a log contradicts.
         missing: a warning for each name in the specifications that the log never has.
     """
@@ -365,15 +368,15 @@ class SpecificationDiff(Printed, Displayed):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing differs: no formula, new names aside, no verdict, no number."""
+        """Whether formulas, verdicts and numbers are equal; names may differ."""
         is_edited = any(edit.kind != "renamed" for spec in self.specs for edit in spec.edits)
         return not (self.removed or self.added or is_edited or any(spec.is_different for spec in self.specs))
 
     def spec(self, name: str) -> SpecDiff:
-        """Return the first diff of a spec, by its new name.
+        """Return the first difference of a spec, by its new name.
 
         Raises:
-            UsageError: no such spec.
+            UsageError: an unknown spec.
         """
         for spec in self.specs:
             if spec.name == name:
@@ -382,7 +385,7 @@ class SpecificationDiff(Printed, Displayed):
         raise UsageError(f"no spec {name!r} to compare; {nearest_hint(name, names) or ', '.join(names)}")
 
     def lines(self) -> Iterator[str]:
-        """Yield the diff as text, as the command `diff` prints it."""
+        """Yield the lines of text that the command `diff` prints."""
         yield f"{self.log}: {plural(self.samples, 'sample')}; {self.old.filename} → {self.new.filename}"
         same = 0
         printed_changes: set[DeclarationChange] = set()
@@ -402,7 +405,7 @@ class SpecificationDiff(Printed, Displayed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """The diff as values for JSON."""
+        """The differences as values for JSON."""
         return {
             "log": {
                 "name": self.log,
@@ -430,16 +433,16 @@ def diff_over_source(
     *,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> SpecificationDiff:
-    """Evaluate two versions of a specification over a log, and find what changed the results.
+    """Evaluate two versions of a specification over a log, and find the edits that changed the results.
 
     Args:
-        advance: called with the number of samples of each block that is read.
+        advance: function that is called with the number of samples of each read block.
 
     Raises:
-        UsageError: no spec has a counterpart, another parameter of a template, no sample in the window, or
-            what `evaluate` raises.
+        UsageError: the versions have no common spec or different parameters of a template, the window has no
+            sample, or `evaluate` raises it.
         LogError: the log cannot be read.
-        SpecificationError: names that the log never has, if names are strict.
+        SpecificationError: the specifications mention names that the log never has, if names are strict.
     """
     selection = Selection(source, (old, new), replace(options, keep=()))
     trace, missing, zero_ns = selection.checked_trace(advance)
@@ -475,7 +478,7 @@ def diff_over_source(
 
     @cache
     def by_version(changes: frozenset[int], name: str, *, is_undone: bool) -> Evaluation | None:
-        """Evaluate a spec of the new text with declarations undone, or of the old one with some edited."""
+        """Evaluate a spec of the new text with old declarations, or of the old text with new declarations."""
         file = versions.version(changes, is_undone=is_undone)
         spec = _find_spec(file, name)
         return None if file is None or spec is None else evaluate_version([spec], file, file.regions)
@@ -514,7 +517,7 @@ def evaluate_with(options: ReplayOptions, file: Specification, trace: Trace) -> 
 def _pair_specs(
     old: Specification, new: Specification
 ) -> tuple[list[tuple[NamedSpec, NamedSpec]], tuple[str, ...], tuple[str, ...]]:
-    """Return the specs that are results in either file, in pairs, and the results without a counterpart."""
+    """Return pairs of specs that are results in either file, and names of results without a counterpart."""
     olds, news = ({spec.name: spec for spec in file.specs} for file in (old, new))
     pairs = [
         (olds[spec.name], spec)
@@ -550,7 +553,7 @@ def _pair_specs(
 
 
 def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterator[Origin]:
-    """Yield which nodes of a spec follow from each declaration, and which from the text of the specs."""
+    """Yield the nodes of a spec that depend on each declaration, and those that depend on text of specs."""
     old, new = versions.old, versions.new
     for number, change in enumerate(versions.changes):
         applied, undone = (versions.version({number}, is_undone=is_undone) for is_undone in (False, True))
@@ -565,7 +568,7 @@ def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterat
             _changes(old, one, versions.version(every, is_undone=True), other.name),
             _changes(new, other, versions.version(every, is_undone=False), one.name),
         )
-        # where the two cannot be distinguished, every node may follow from the text
+        # without a valid mixed version, every node may depend on the text of specs
         all_nodes = frozenset(range(MAX_SIZE))
         yield Origin(None, *(all_nodes if changed is None else changed for changed in nodes))
 
@@ -573,7 +576,7 @@ def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterat
 def _changes(
     file: Specification, spec: NamedSpec, version: Specification | None, name: str
 ) -> frozenset[int] | None:
-    """Return the nodes of a spec that another version of its text does not have; None without a version."""
+    """Return the ids of nodes of a spec that another version lacks; None if that version is invalid."""
     counterpart = _find_spec(version, name)
     if version is None or counterpart is None:
         return None
@@ -597,14 +600,14 @@ def _spec_diff(
     units = find_cause(tree, outcomes, before, after)
 
     def with_edit(edit: Edit, *, is_undone: bool) -> EditOutcome | None:
-        """Return the outcome with only an edit made, or all but that; None if there is no such text."""
+        """Return the outcome with only one edit, or with all others; None if no text has just these edits."""
         changes: Sequence[int] = range(len(versions.changes))
         if edit.change is not None:
             changes = (versions.changes.index(edit.change),)
         elif sum(other_edit.change is None and other_edit.kind != "renamed" for other_edit in tree.edits) > 1:
             return None
         else:
-            # the only edit of the specs' text: the new one with all declarations undone has only this
+            # the only edit of the specs' text: the new text with all old declarations has just this edit
             is_undone = not is_undone
         evaluation = by_version(
             frozenset(changes), other.name if is_undone else one.name, is_undone=is_undone
@@ -625,7 +628,7 @@ def _spec_diff(
 
     cause = [(edit, unit) for unit in units for edit in tree.units[unit]]
     if len(units) == 1 and len(cause) > 1:
-        # edits that share a node: one of them may do
+        # of several edits that share a node, one may be enough
         cause = next(([pair] for pair in cause if suffices(pair[0])), cause)
     alone = [
         outcomes((unit,)) if len(tree.units[unit]) == 1 else with_edit(edit, is_undone=False)
@@ -646,7 +649,7 @@ def _spec_diff(
 def _places(
     edits: Sequence[Edit], versions: TextVersions
 ) -> tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]]:
-    """Return where each edit is in the two texts: the declaration, or a line of a spec, that changed."""
+    """Return the place of each edit in the two texts: the changed declaration or line of a spec."""
     places_by_edit: tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]] = {}, {}
     for edit in edits:
         spans = edit.old_span, edit.new_span
