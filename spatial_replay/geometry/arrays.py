@@ -153,6 +153,7 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
     """
     if isinstance(rows, slice):
         return _map_columns(table, lambda name: getattr(table, name)[rows])
+    # converted once, and only if some column is not an array
     row_numbers = cache(rows.tolist)
 
     def selected_column(name: str) -> Any:

@@ -125,6 +125,7 @@ def _is_farther(rows: Rows, p: int, q: int, reach: float) -> bool:
     a, b = rows.vertex_start[p], rows.vertex_start[q]
     reach += rows.edges[a, 3] + rows.edges[b, 3]
     dx, dy = rows.vertices[a, 0] - rows.vertices[b, 0], rows.vertices[a, 1] - rows.vertices[b, 1]
+    # 1e-9 covers the rounding of the squares
     return reach < 0.0 or dx * dx + dy * dy > (1.0 + 1e-9) * reach * reach
 
 
@@ -325,7 +326,8 @@ def _union_protrusion(
 ) -> float:
     """Return the protrusion of a union of rows from another.
 
-    It is the greatest protrusion of a part, and that of a part is the least over the parts of the other.
+    Each part of the first union protrudes by the least over the parts of the second. The result is the
+    greatest of these protrusions.
     """
     greatest = -np.inf
     for i in range(first[0], first[1]):

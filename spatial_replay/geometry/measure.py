@@ -220,7 +220,7 @@ def closest_rows(
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     width = members.shape[1]
     boxes = np.full((width, 4), np.inf)
-    # from left to right; objects move little between samples, so that an insertion sort hardly moves anything
+    # footprints from left to right, by insertion sort, because their order changes little between samples
     order = np.arange(width)
     for t in range(result.shape[0]):
         present, size, widest = 0, 0.0, 0.0

@@ -143,6 +143,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
             if winding == 0:
                 _copy(vertices, first, scratch, 0, counts[p])
                 left = _tidy(scratch, counts[p], tolerance)
+                # strict, because nearly collinear vertices have been dropped
                 winding = _winding(scratch, 0, left, 0.0) if left > 2 else 1
                 if winding == 0:
                     fault[p] = NOT_CONVEX
@@ -150,6 +151,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
                     _copy(scratch, 0, vertices, first, left)
                     counts[p] = left
             if winding == -1:
+                # the first vertex stays the first
                 _reverse(vertices, first + 1, first + counts[p])
         _copy(vertices, first, vertices, used, counts[p])
         used += counts[p]

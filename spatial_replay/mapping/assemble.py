@@ -636,9 +636,11 @@ class _Silences:
             if len(times_ns) and not is_filled[-2] and times_ns[-1] < self._window_ns[1]:
                 is_filled[-2] = self.goes_on()
         elif len(times_ns):
+            # until the silence after the last message is decided, samples end at that message
             last_ns = int(times_ns[-1])
             upto_ns = upto_ns if last_ns > upto_ns or is_filled[-2] else last_ns
         elif self._others_begin_ns is not None and not is_filled[-1]:
+            # not yet decided whether samples begin at fallback topics
             upto_ns = min(upto_ns, self._others_begin_ns - 1)
         self._times_ns, self._is_filled = times_ns, is_filled
         # past messages stay past, even if this request ends before them
@@ -899,6 +901,7 @@ class LiveAssembler(_Assembling):
         self._now_s = now_s
         self._lost |= newly_lost
         self._held = [waiting for waiting in self._held if waiting.topic not in newly_lost]
+        # lost topics send nothing more, so that samples up to their last message are final
         gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in newly_lost))
         so_far = self._settle(max(self._upto_ns(now_s), gone_ns), is_last=True)
         lost_ns = self._settled_ns + 1
@@ -976,6 +979,7 @@ class LiveAssembler(_Assembling):
         reached = (self._latest_of[topic] - self._back_ns[topic] for topic in self._in_step)
         upto_ns = min(reached, default=newest_ns)
         if self._is_in_order:
+            # all messages before the newest time have arrived, but more messages of that time may follow
             upto_ns = max(upto_ns, newest_ns - 1)
         while self._silent and self._silent[0][0] <= now_s:
             self._patient_ns = self._silent.popleft()[1]

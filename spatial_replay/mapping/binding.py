@@ -609,7 +609,7 @@ def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
 
 
 class OrderError(FieldError):
-    """An order of a quaternion that is missing for a list, or superfluous for named fields."""
+    """Missing order of a quaternion in a list, or superfluous order of a quaternion with named fields."""
 
 
 def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:

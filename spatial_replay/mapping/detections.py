@@ -254,6 +254,7 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
         element = BOX if kind == 6 else SPHERE
         return [Solid(element, position, quaternion, scale, (point,)) for point in points]
     if kind == 11 and len(points) >= 3:
+        # the points of a triangle list are in units of its scale
         scaled = [tuple(a * b for a, b in zip(point, scale, strict=True)) for point in points]
         return _triangles((position, quaternion), scaled)
     return []

@@ -39,6 +39,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     places[:, :, 2][np.isnan(places[:, :, 2])] = 0.0
     moves = np.diff(places, axis=1)
     steps = np.sqrt(np.einsum("ijk,ijk->ij", moves, moves))
+    # the longer of the steps before and after each step
     around = np.zeros_like(steps)
     around[:, 1:] = steps[:, :-1]
     around[:, :-1] = np.fmax(around[:, :-1], steps[:, 1:])

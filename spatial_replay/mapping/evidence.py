@@ -327,6 +327,7 @@ class Motions:
         self.speed.add(np.where(seconds > 0, distance / seconds, nan), times_ns)
         turn_step = np.fmax.reduce(np.abs(later[:, _TURN] - earlier[:, _TURN]))
         self.turn_step = max(self.turn_step, float(np.nan_to_num(turn_step)))
+        # by the shorter way round
         turn = np.abs((later[:, _YAW] - earlier[:, _YAW] + pi) % (2 * pi) - pi)
         self.turn_rate.add(np.where(seconds > 0, turn / seconds, nan), times_ns)
         at = int(np.nan_to_num(distance, nan=0.0).argmax())

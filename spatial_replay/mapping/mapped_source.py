@@ -334,7 +334,7 @@ def _foreign_channels(reader: MessageReader, topics: Collection[str]) -> Mapping
     """Return the channels of some topics, without channels that a replay writes from the samples."""
     channels = reader.channels(topics)
     ours = [number for number, channel in channels.items() if has_our_type(channel)]
-    # only in logs that we wrote; in other logs, channels with our types are foreign messages
+    # only logs that we wrote have channels of ours; elsewhere, channels with our types are foreign
     if ours and METADATA in dict(reader.metadata()):
         return {number: channel for number, channel in channels.items() if number not in ours}
     return channels

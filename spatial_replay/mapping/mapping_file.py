@@ -44,7 +44,7 @@ NO_TOPIC = "no topic was chosen: name one with objects or signals"
 NO_FEATURE = "no feature was chosen: name one with objects or signals"
 """Error of a mapping without features."""
 NO_FRAME = "no frame was chosen: name the one that coordinates are brought into"
-"""Error of a mapping with an open fixed frame."""
+"""Error of a mapping whose `fixed_frame` has no value."""
 
 Measure: TypeAlias = float | str
 """A number, or the path of a field that holds it."""

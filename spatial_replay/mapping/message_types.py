@@ -106,6 +106,7 @@ _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
 _KNOWN = ("pedestrian", "bike", "car", "truck", "motorcycle", "other_vehicle", "barrier", "sign")
 _OBJECT_CLASSES = MappingProxyType({str(i): name for i, name in enumerate((*_UNKNOWN, *_KNOWN))})
 
+# names in successive versions of vision_msgs
 _RESULT_CLASS = ("results[best].hypothesis.class_id", "results[best].id", "results[best].hypothesis.id")
 
 _POSE = MessageLayout(position=(("pose.position",),), orientation=("pose.orientation",))
@@ -164,11 +165,13 @@ BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
         "geometry_msgs/PolygonStamped": MessageLayout(polygon=("polygon.points",)),
         "geometry_msgs/TransformStamped": _TRANSFORM,
         "tf2_msgs/TFMessage": replace(_TRANSFORM, objects="transforms[*]"),
+        # the type of tf in ROS 1, before tf2
         "tf/tfMessage": replace(_TRANSFORM, objects="transforms[*]"),
         "visualization_msgs/Marker": _MARKER,
         "visualization_msgs/MarkerArray": replace(_MARKER, objects="markers[*]"),
         "vision_msgs/Detection2DArray": replace(
             _DETECTIONS,
+            # vision_msgs 4 has a point in the centre, earlier versions have x and y
             position=(
                 ("bbox.center.position.x", "bbox.center.position.y"),
                 ("bbox.center.x", "bbox.center.y"),

@@ -99,7 +99,7 @@ def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) ->
     """
     count = len(elements)
     if style == "attributes":
-        # faster than a list of tuples, but np.fromiter refuses None
+        # faster than an array from a list of tuples, but np.fromiter refuses None
         with suppress(TypeError):
             numbers = chain.from_iterable(map(get, elements))
             return np.fromiter(numbers, np.float64, count * width).reshape(count, width)

@@ -79,6 +79,7 @@ _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "d
 """Last parts of names of topics about programs instead of objects."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
 """Names of sensor frames, which are mounted on objects."""
+# PX4 publishes in this frame, see https://docs.px4.io/main/en/ros2/user_guide.html
 _NORTH_EAST_DOWN = re.compile(
     r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position|vehicle_odometry)(?![a-z0-9])", re.IGNORECASE
 )
@@ -746,6 +747,7 @@ def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, i
     topics = [suggestion.topic for suggestion in active]
     begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
     often = max(topic.count or 0 for topic in topics)
+    # topics with at least half as many messages as the most frequent one
     together = [
         (begin, topic)
         for begin, topic in zip(begins, topics, strict=True)

@@ -276,6 +276,7 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
         for start in range(width - 6)
     ]
     starts: list[int] = []
+    # the most exact quaternions first, because the seven numbers of two bodies do not overlap
     for start in np.argsort(errors, kind="stable").tolist():
         if errors[start] < _EXACT and all(abs(start - begin) >= 7 for begin in starts):
             starts.append(start)

@@ -775,7 +775,7 @@ class TopicReader:
                 self._time = bind_time(stamps, message, message)
                 self._is_time_bound = True
         except FieldError as error:
-            # before the first stamp the mapping is at fault, after it this message
+            # without any stamp so far, the mapping is wrong; otherwise only this message
             if self._is_time_bound or (self.extractor is not None and self.extractor.is_timed):
                 raise
             raise self._misfit_error(f"the clock is header, but {error}") from None
@@ -906,7 +906,7 @@ class PendingMessages:
         # sequence numbers of the log do not order messages on the clock of the sender
         is_sorted = self._has_own_clock or not (np.diff(sequences[order]) > 0).all()
         if is_sorted and len(back):
-            # only steps of messages that are taken now: all messages recorded before them have arrived
+            # steps of later messages wait, because messages recorded before them may still arrive
             back = back[times[back + 1] <= upto_ns]
             back = back[np.argsort(times[back + 1], kind="stable")]
         if not len(back):

@@ -118,6 +118,7 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     return np.asarray(weight[:, None] * first + next_weight[:, None] * second)
 
 
+# a buffer of tf2 keeps transforms for 10 s by default, too
 HISTORY_NS = 10 * 10**9
 """Longest time between two transforms that are interpolated, nanoseconds."""
 
